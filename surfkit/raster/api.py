@@ -1,0 +1,161 @@
+"""What every rasterizer takes and gives: plain tensors, no autograd graph through the kernels.
+
+Conventions, shared by `reference.py` (the definition of correct) and the native backends:
+
+- Letters: N splats, H x W pixels, K = (degree + 1)^2 coefficients of spherical harmonics.
+- Camera frame as in `scene.camera`; quaternions wxyz of any non-zero length; pixel (i, j) has its centre at
+  (j + 0.5, i + 0.5). Lengths are local units: the scene extent is 1.
+- Opacity times kernel gives alpha, at most ALPHA_MAX; below ALPHA_MIN it is skipped. A splat that would bring the
+  transmittance T below T_MIN is not blended and ends the ray. Splats are ordered by the depth of their centre.
+- The constants are the float32 roundings, in every precision, so that a float64 evaluation takes the same branches.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.scene.camera import Camera
+
+ALPHA_MAX = float(np.float32(0.99))
+ALPHA_MIN = float(np.float32(1 / 255))
+T_MIN = float(np.float32(1e-4))
+CUTOFF = math.sqrt(2 * math.log(255))
+"""Sigmas at which a splat of opacity 1 falls to ALPHA_MIN."""
+
+Kind = Literal["surfel", "gaussian"]
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N splats in activated values.
+
+    Attributes:
+        kind: "surfel" is a flat disc (2DGS), "gaussian" an ellipsoid (3DGS).
+        means: (N, 3) world.
+        quats: (N, 4) wxyz.
+        scales: (N, 2) for surfels, (N, 3) for gaussians; local units, positive.
+        opacities: (N,) in [0, 1].
+        sh: (N, K, 3) spherical harmonics with K in {1, 4, 9, 16}.
+        antialias: Gaussians only: lower the opacity by what the 0.3 px dilation adds to the footprint.
+    """
+
+    kind: Kind
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    antialias: bool = False
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The five tensors by name, in the order of the fields."""
+        return {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Images of a view, or the cotangents of such images; None where not asked for.
+
+    With weights w_i = alpha_i T_i and depths z_i along the ray (camera z, not distance):
+
+    Attributes:
+        color: (3, H, W) sum of w_i c_i over black.
+        alpha: (H, W) sum of w_i, which is 1 - T at the end.
+        depth: (H, W) sum of w_i z_i; divide by alpha for the expected depth.
+        median: (H, W) depth of the last splat met while T > 0.5; 0 where T never falls to 0.5.
+        normal: (3, H, W) sum of w_i n_i, camera frame, n_i facing the camera.
+        distortion: (H, W) sum over pairs j < i of w_i w_j (1 / z_i - 1 / z_j)^2.
+    """
+
+    color: Tensor | None = None
+    alpha: Tensor | None = None
+    depth: Tensor | None = None
+    median: Tensor | None = None
+    normal: Tensor | None = None
+    distortion: Tensor | None = None
+
+    def present(self) -> dict[str, Tensor]:
+        """The maps that are there, by name."""
+        return {f.name: v for f in fields(self) if (v := getattr(self, f.name)) is not None}
+
+    def expected_depth(self) -> Tensor:
+        """(H, W) depth / alpha; 0 where alpha is 0."""
+        return torch.where(self.alpha > 0, self.depth / self.alpha.clamp_min(1e-10), 0.0)
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """dL/d(splats) of one backward pass, and the densification signal.
+
+    The signal is the screen-space positional gradient in NDC units (pixels x half the image size), as the published
+    thresholds expect. Surfels: (dL/dT_u.z, dL/dT_v.z) T_w.z (2DGS), the low-pass centre included.
+
+    Attributes:
+        means, quats, scales, opacities, sh: Shapes of `Splats`.
+        signal: (N, 2) of the total loss.
+        chosen: (N, 2) of the chosen losses; None if no second cotangent was given.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    signal: Tensor
+    chosen: Tensor | None = None
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The five gradients by name, in the order of `Splats.tensors`."""
+        return {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+
+
+class Render(ABC):
+    """One rendered view, and the way back.
+
+    Attributes:
+        maps: Detached images; color and alpha always, the rest when geometry was asked for.
+        seen: (N,) bool, the splat may touch a pixel.
+        radii: (N,) pixels, half the larger side of the box around the splat's footprint; 0 where not seen.
+    """
+
+    maps: Maps
+    seen: Tensor
+    radii: Tensor
+
+    @abstractmethod
+    def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:
+        """Gradients from cotangents of the maps, in one pass; the signal of `chosen` comes beside them."""
+
+
+class Rasterizer(ABC):
+    """Draws splats."""
+
+    @abstractmethod
+    def render(self, splats: Splats, camera: Camera, near: float, geometry: bool = True) -> Render:
+        """Draw `splats`.
+
+        Args:
+            splats: Values are used, an autograd graph is not.
+            camera: World is the splats' frame.
+            near: Splats whose centre has z <= near are not drawn; depths are at least this. Local units.
+            geometry: Also make depth, median, normal and distortion.
+
+        Raises:
+            BadInput: A scale, opacity, mean or quaternion is not finite, or a shape is wrong.
+        """
+
+    @abstractmethod
+    def contribution(
+        self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
+    ) -> tuple[Tensor, Tensor]:
+        """Sum and count, each (N,), of alpha^a T^b over the pixels that each splat is blended into (paper eq. 4)."""

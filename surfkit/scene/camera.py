@@ -1,0 +1,50 @@
+"""A pinhole camera with a pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An undistorted pinhole camera: OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+
+    Attributes:
+        world_to_camera: (4, 4) float64; the world is the scene's local frame.
+        fx: Focal length along x, pixels.
+        fy: Focal length along y, pixels.
+        cx: Principal point, pixels from the left edge of the left-most pixel.
+        cy: Principal point, pixels from the upper edge of the upper-most pixel.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    world_to_camera: Tensor
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @property
+    def centre(self) -> Tensor:
+        """(3,) float64 position in the world."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with another image size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
+        x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=dtype) + 0.5 - self.cy) / self.fy
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        return torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])
