@@ -1,0 +1,754 @@
+// The per-pixel kernels. Compiled three times (AVX-512, AVX2, baseline) with SURFKIT_KERNELS naming the table to define.
+//
+// A tile of 16 x 16 pixels is cut into blocks of 4 x (lanes / 4), one vector each. For each splat the rows of its
+// footprint tell which blocks it can touch; blocks whose rays have all ended are left out.
+#include <vector>
+
+#include "simd.h"
+
+#define SPLAT_FN static inline
+#include "../splat_math.h"
+#include "kernels.h"
+
+namespace surfkit {
+namespace {
+
+using splat::kAlphaMax;
+using splat::kAlphaMin;
+using splat::kTransmittanceMin;
+
+constexpr int kBlockRows = kLanes / 4;         // pixel rows in a block
+constexpr int kBlocksDown = kTile / kBlockRows;
+constexpr int kBlocks = 4 * kBlocksDown;
+constexpr uint32_t kRowBits = kBlockRows == 4 ? 0x1111u : kBlockRows == 2 ? 0x5555u : 0xffffu;
+
+// Pixel centres of a block about the tile's first pixel centre.
+struct Lanes {
+    Floats x[kBlocks], y[kBlocks];
+    Floats count[kTile / kLanes];
+    Lanes() {
+        for (int b = 0; b < kBlocks; b++)
+            for (int l = 0; l < kLanes; l++) {
+                x[b][l] = (float)(b / kBlocksDown * 4 + l % 4);
+                y[b][l] = (float)(b % kBlocksDown * kBlockRows + l / 4);
+            }
+        for (int i = 0; i < kTile; i++) count[i / kLanes][i % kLanes] = (float)i;
+    }
+};
+const Lanes& lanes() {
+    static const Lanes table;
+    return table;
+}
+
+// One tile of an image: where its blocks lie in memory.
+struct Tile {
+    const Job& job;
+    int x0, y0;
+    float ox, oy;  // the first pixel centre
+    size_t plane;
+    int64_t begin, end;
+
+    Tile(const Job& j, int64_t index)
+        : job(j), x0((int)(index % j.tiles_x) * kTile), y0((int)(index / j.tiles_x) * kTile), ox(x0 + 0.5f), oy(y0 + 0.5f),
+          plane((size_t)j.width * j.height), begin(j.offsets[index]), end(j.offsets[index + 1]) {}
+
+    template <class T> void read(const T* from, int block, T* to) const {
+        each_row(block, [&](size_t at, int lane, int n) { std::memcpy(to + lane, from + at, n * sizeof(T)); });
+    }
+    template <class T> void write(T* to, int block, const T* from) const {
+        each_row(block, [&](size_t at, int lane, int n) { std::memcpy(to + at, from + lane, n * sizeof(T)); });
+    }
+    Floats read(const float* from, int block) const {
+        Floats v{};
+        if (from) read(from, block, (float*)&v);
+        return v;
+    }
+    // Per column of blocks, the blocks with a pixel inside the image, as bits at multiples of kBlockRows.
+    void inside(uint32_t alive[4]) const {
+        const int rows = job.height - y0 < kTile ? job.height - y0 : kTile;
+        for (int j = 0; j < 4; j++) alive[j] = x0 + 4 * j < job.width ? ((1u << rows) - 1) & kRowBits : 0;
+    }
+    Mask inside(int block) const {
+        int32_t on[kLanes] = {};
+        each_row(block, [&](size_t, int lane, int n) {
+            for (int i = 0; i < n; i++) on[lane + i] = 1;
+        });
+        Ints v;
+        std::memcpy(&v, on, sizeof v);
+        return equal(v, Ints{} + 1);
+    }
+
+  private:
+    template <class F> void each_row(int block, F f) const {
+        const int x = x0 + block / kBlocksDown * 4, y = y0 + block % kBlocksDown * kBlockRows;
+        const int n = job.width - x < 4 ? job.width - x : 4;
+        if (n <= 0) return;
+        for (int r = 0; r < kBlockRows && y + r < job.height; r++) f((size_t)(y + r) * job.width + x, 4 * r, n);
+    }
+};
+
+// The blocks a record's footprint touches, per column, as bits at multiples of kBlockRows. (sx, sy): tile less anchor.
+template <class Record> inline void touched_blocks(const Record& s, float sx, float sy, uint32_t out[4]) {
+    const Floats far = broadcast(1e30f);
+    uint32_t hit[4] = {0, 0, 0, 0};
+    for (int v = 0; v < kTile / kLanes; v++) {
+        const Floats y = lanes().count[v] + sy;
+        const Floats dy = y - s.my, left = madd(dy * dy, -s.flat, broadcast(1.0f));
+        const Floats half = root(higher(left, Floats{}) * s.wide), mid = madd(dy, s.tilt, broadcast(s.mx - sx));
+        const Mask on = less_equal(0.0f, left);
+        Floats low = select(on, mid - half, far), high = select(on, mid + half, -far);
+        if (s.disc_r2 > 0) {
+            const Floats dd = y - s.disc_y, rest = s.disc_r2 - dd * dd;
+            const Floats reach = root(higher(rest, Floats{}));
+            const Mask disc = less_equal(0.0f, rest);
+            low = lower(low, select(disc, (s.disc_x - sx) - reach, far));
+            high = higher(high, select(disc, (s.disc_x - sx) + reach, -far));
+        }
+        for (int j = 0; j < 4; j++) hit[j] |= bits(less_equal(low, 4.0f * j + 3) & less_equal(4.0f * j, high)) << (v * kLanes);
+    }
+    for (int j = 0; j < 4; j++) {
+        uint32_t m = hit[j];
+        if (kBlockRows > 1) m |= m >> 1;
+        if (kBlockRows > 2) m |= m >> 2;
+        out[j] = m & kRowBits;
+    }
+}
+
+// ------------------------------------------------------------------------------- the two kinds, at pixels of one tile
+
+struct LocalSurfel {
+    float a[3], b[3], c[3], det, low_x, low_y, z_low, z_high, opacity;
+    LocalSurfel(const SurfelRecord& s, float sx, float sy)
+        : det(s.det), low_x(s.low_x - sx), low_y(s.low_y - sy), z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {
+        for (int i = 0; i < 3; i++) {
+            a[i] = s.a[i];
+            b[i] = s.b[i];
+            c[i] = s.c[i] + sx * s.a[i] + sy * s.b[i];
+        }
+    }
+};
+struct LocalGaussian {
+    float x, y, l00, l01, l11, z, slope_x, slope_y, z_low, z_high, opacity;
+    LocalGaussian(const GaussianRecord& s, float sx, float sy)
+        : x(s.x - sx), y(s.y - sy), l00(s.l00), l01(s.l01), l11(s.l11), z(s.z), slope_x(s.slope_x), slope_y(s.slope_y),
+          z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {}
+};
+
+struct SurfelPixel {
+    splat::SurfelHit<Floats> hit;
+    Mask on_disc, free_z;
+    Floats half_rho, z;
+    inline void shape(const LocalSurfel& s, Floats x, Floats y) {
+        hit = splat::surfel_hit<Floats>(s, x, y, on_disc);
+        half_rho = 0.5f * hit.rho;
+    }
+    inline void depth(const LocalSurfel& s) { z = splat::surfel_depth<Floats>(s, hit, free_z); }
+};
+struct GaussianPixel {
+    Floats dx, dy;
+    Mask free_z;
+    Floats half_rho, z;
+    inline void shape(const LocalGaussian& s, Floats x, Floats y) {
+        dx = x - s.x;
+        dy = y - s.y;
+        const Floats p = madd(dx, s.l00, dy * s.l01), q = dy * s.l11;
+        half_rho = 0.5f * madd(p, p, q * q);
+    }
+    inline void depth(const LocalGaussian& s) {
+        const Floats plane = madd(dx, s.slope_x, madd(dy, s.slope_y, broadcast(s.z)));
+        free_z = less_equal(s.z_low, plane) & less_equal(plane, s.z_high);
+        z = select(free_z, plane, select(less_equal(s.z_high, plane), s.z_high, s.z_low));
+    }
+};
+
+struct Surfels {
+    using Record = SurfelRecord;
+    using Local = LocalSurfel;
+    using Pixel = SurfelPixel;
+    static constexpr int sums = kSurfelSums, sums_chosen = kSurfelSumsChosen;
+};
+struct Gaussians {
+    using Record = GaussianRecord;
+    using Local = LocalGaussian;
+    using Pixel = GaussianPixel;
+    static constexpr int sums = kGaussianSums, sums_chosen = kGaussianSumsChosen;
+};
+
+// The record of entry k; the one that comes `ahead` entries later is fetched meanwhile.
+template <class K, int ahead> inline const typename K::Record& record_of(const Tile& tile, int64_t k) {
+    const auto* records = (const typename K::Record*)tile.job.records;
+    const int64_t next = k + ahead;
+    if (next >= tile.begin && next < tile.end) {
+        const char* at = (const char*)(records + tile.job.entries[next].record);
+        __builtin_prefetch(at);
+        __builtin_prefetch(at + 64);
+        __builtin_prefetch(at + sizeof(typename K::Record) - 1);
+    }
+    return records[tile.job.entries[k].record];
+}
+
+// -------------------------------------------------------------------------------------------------------------- forward
+
+template <class K, int level> void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
+    Floats open[kBlocks], color[3][kBlocks], depth[kBlocks], median[kBlocks], normal[3][kBlocks];
+    Floats bend[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
+    Ints last[kBlocks], middle[kBlocks];
+    Mask alive[kBlocks];
+    uint32_t rays[4];
+    tile.inside(rays);
+    for (int b = 0; b < kBlocks; b++) {
+        open[b] = broadcast(1.0f);
+        color[0][b] = color[1][b] = color[2][b] = depth[b] = median[b] = normal[0][b] = normal[1][b] = normal[2][b] = Floats{};
+        bend[b] = shift[b] = m1[b] = m2[b] = Floats{};
+        last[b] = middle[b] = Ints{} - 1;
+        alive[b] = tile.inside(b);
+    }
+    for (int64_t k = tile.begin; k < tile.end; k++) {
+        const auto& s = record_of<K, 4>(tile, k);
+        const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
+        const typename K::Local local(s, sx, sy);
+        uint32_t touched[4];
+        touched_blocks(s, sx, sy, touched);
+        const Ints here = Ints{} + (int32_t)(k - tile.begin);
+        for (int j = 0; j < 4; j++)
+            for (uint32_t todo = touched[j] & rays[j]; todo; todo &= todo - 1) {
+                const int bit = __builtin_ctz(todo), b = j * kBlocksDown + bit / kBlockRows;
+                typename K::Pixel at;
+                at.shape(local, lanes().x[b], lanes().y[b]);
+                const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+                Mask m = less_equal(kAlphaMin, alpha) & alive[b];
+                if (!any(m)) continue;
+                const Floats before = open[b], after = before * (1.0f - alpha);
+                const Mask ends = m & lesser(after, kTransmittanceMin);
+                alive[b] = without(alive[b], ends);
+                if (!any(alive[b])) rays[j] &= ~(1u << bit);
+                m = without(m, ends);
+                const Floats w = keep(m, alpha * before);
+                for (int c = 0; c < 3; c++) color[c][b] = madd(w, s.color[c], color[c][b]);
+                if (level >= kGeometry) {
+                    at.depth(local);
+                    depth[b] = madd(w, at.z, depth[b]);
+                    for (int c = 0; c < 3; c++) normal[c][b] = madd(w, s.normal[c], normal[c][b]);
+                    const Mask half = m & lesser(0.5f, before);
+                    median[b] = select(half, at.z, median[b]);
+                    middle[b] = select(half, here, middle[b]);
+                }
+                if (level >= kDistortion) {
+                    const Floats m_z = reciprocal(at.z);
+                    shift[b] = select(m & equal(last[b], Ints{} - 1), m_z, shift[b]);
+                    const Floats d = m_z - shift[b], wd = w * d;
+                    bend[b] = bend[b] + w * madd(d * d, 1.0f - before, m2[b] - 2.0f * d * m1[b]);
+                    m1[b] = m1[b] + wd;
+                    m2[b] = madd(wd, d, m2[b]);
+                }
+                open[b] = select(m, after, before);
+                last[b] = select(m, here, last[b]);
+            }
+        if (!(rays[0] | rays[1] | rays[2] | rays[3])) break;
+    }
+    for (int b = 0; b < kBlocks; b++) {
+        const Floats alpha = 1.0f - open[b];
+        tile.write(out.alpha, b, (const float*)&alpha);
+        for (int c = 0; c < 3; c++) tile.write(out.color + c * tile.plane, b, (const float*)&color[c][b]);
+        tile.write(saved.open, b, (const float*)&open[b]);
+        tile.write(saved.last, b, (const int32_t*)&last[b]);
+        if (level >= kGeometry) {
+            const Mask opaque = less_equal(open[b], 0.5f);
+            median[b] = keep(opaque, median[b]);
+            middle[b] = select(opaque, middle[b], Ints{} - 1);
+            tile.write(out.depth, b, (const float*)&depth[b]);
+            tile.write(out.median, b, (const float*)&median[b]);
+            tile.write(saved.middle, b, (const int32_t*)&middle[b]);
+            for (int c = 0; c < 3; c++) tile.write(out.normal + c * tile.plane, b, (const float*)&normal[c][b]);
+        }
+        if (level >= kDistortion) {
+            tile.write(out.distortion, b, (const float*)&bend[b]);
+            tile.write(saved.m_shift, b, (const float*)&shift[b]);
+            tile.write(saved.m1, b, (const float*)&m1[b]);
+            tile.write(saved.m2, b, (const float*)&m2[b]);
+        }
+    }
+}
+
+// ------------------------------------------------------------------------------------------------------------- backward
+
+// The cotangents of one group of losses over a tile, and the running sum of what lies behind.
+template <int level> struct Cotangents {
+    Floats color[3][kBlocks], depth[kBlocks], median[kBlocks], normal[3][kBlocks], bend[kBlocks], behind[kBlocks];
+
+    void read(const Tile& tile, const Planes& p, const Floats* open, int b) {
+        for (int c = 0; c < 3; c++) color[c][b] = tile.read(p.color ? p.color + c * tile.plane : nullptr, b);
+        behind[b] = -(tile.read(p.alpha, b) * open[b]);  // alpha = 1 - T: it acts through what is left open
+        if (level >= kGeometry) {
+            depth[b] = tile.read(p.depth, b);
+            median[b] = tile.read(p.median, b);
+            for (int c = 0; c < 3; c++) normal[c][b] = tile.read(p.normal ? p.normal + c * tile.plane : nullptr, b);
+        }
+        if (level >= kDistortion) bend[b] = tile.read(p.distortion, b);
+    }
+    // dL/d(weight) of a splat with inverse depth d about the shift.
+    template <class Record>
+    inline Floats per_weight(const Record& s, int b, Floats z, Floats d, Floats all, Floats m1, Floats m2) const {
+        Floats dot = madd(color[0][b], s.color[0], madd(color[1][b], s.color[1], color[2][b] * s.color[2]));
+        if (level >= kGeometry) {
+            dot = madd(normal[0][b], s.normal[0], madd(normal[1][b], s.normal[1], madd(normal[2][b], s.normal[2], dot)));
+            dot = madd(depth[b], z, dot);
+        }
+        if (level >= kDistortion) dot = madd(bend[b], madd(d * d, all, m2 - 2.0f * d * m1), dot);
+        return dot;
+    }
+    // dL/dz of a splat with weight w, where it is the median's (`mid`) or not.
+    inline Floats per_depth(int b, Floats w, Mask mid, Floats m_z, Floats d, Floats all, Floats m1) const {
+        Floats g = madd(w, depth[b], keep(mid, median[b]));
+        if (level >= kDistortion) g = g - 2.0f * bend[b] * w * madd(d, all, -m1) * (m_z * m_z);
+        return g;
+    }
+};
+
+// Sums over the pixels of a tile for one splat; the order is that of the structs in splat_math.h.
+template <int level, int chosen> struct SurfelAdder {
+    Floats s[chosen ? kSurfelSumsChosen : kSurfelSums] = {};
+    inline void add(const SurfelPixel& at, Floats x, Floats y, Mask m, Floats e, Floats dz) {
+        const Mask disc = at.on_disc & m;
+        const Floats ei = e * at.hit.inv;
+        const Floats q0 = keep(disc, ei * at.hit.u), q1 = keep(disc, ei * at.hit.v);
+        Floats q2 = keep(disc, -madd(q0, at.hit.u, q1 * at.hit.v));
+        if (level >= kGeometry) {
+            const Floats t = keep(at.free_z & m, dz * at.hit.inv);
+            s[9] += t;
+            q2 = madd(-t, at.z, q2);
+        }
+        s[0] = madd(q0, x, s[0]);
+        s[1] = madd(q1, x, s[1]);
+        s[2] = madd(q2, x, s[2]);
+        s[3] = madd(q0, y, s[3]);
+        s[4] = madd(q1, y, s[4]);
+        s[5] = madd(q2, y, s[5]);
+        s[6] += q0;
+        s[7] += q1;
+        s[8] += q2;
+        const Floats f = keep(without(m, at.on_disc), -2.0f * e);
+        s[10] = madd(f, at.hit.dx, s[10]);
+        s[11] = madd(f, at.hit.dy, s[11]);
+    }
+    inline void add_chosen(const SurfelPixel& at, Floats x, Floats y, Mask m, Floats e, Floats dz) {
+        const Mask disc = at.on_disc & m;
+        const Floats ei = e * at.hit.inv;
+        const Floats q0 = keep(disc, ei * at.hit.u), q1 = keep(disc, ei * at.hit.v);
+        s[20] = madd(q0, x, s[20]);
+        s[21] = madd(q1, x, s[21]);
+        s[22] = madd(q0, y, s[22]);
+        s[23] = madd(q1, y, s[23]);
+        s[24] += q0;
+        s[25] += q1;
+        const Floats f = keep(without(m, at.on_disc), -2.0f * e);
+        s[26] = madd(f, at.hit.dx, s[26]);
+        s[27] = madd(f, at.hit.dy, s[27]);
+        if (chosen == kChosenAll) s[28] += keep(at.free_z & m, dz * at.hit.inv);
+    }
+    inline void add_normal(int c, Floats v) { s[12 + c] += v; }
+    inline void add_opacity(Floats v) { s[15] += v; }
+    inline void add_color(int c, Floats v) { s[16 + c] += v; }
+    // From sums about the tile's origin to sums about the anchor.
+    void finish(float sx, float sy, float* out) const {
+        sum_lanes(s, chosen ? kSurfelSumsChosen : kSurfelSums, out);
+        for (int i = 0; i < 3; i++) {
+            out[i] += sx * out[6 + i];
+            out[3 + i] += sy * out[6 + i];
+        }
+        if (chosen)
+            for (int i = 0; i < 2; i++) {
+                out[20 + i] += sx * out[24 + i];
+                out[22 + i] += sy * out[24 + i];
+            }
+    }
+};
+template <int level, int chosen> struct GaussianAdder {
+    Floats s[chosen ? kGaussianSumsChosen : kGaussianSums] = {};
+    // `e` is dL/d(rho / 2); the moments are of dL/d(power) = -e.
+    inline void add(const GaussianPixel& at, Floats, Floats, Mask m, Floats e, Floats dz) {
+        const Floats gx = -(e * at.dx), gy = -(e * at.dy);
+        s[0] += gx;
+        s[1] += gy;
+        s[2] = madd(gx, at.dx, s[2]);
+        s[3] = madd(gx, at.dy, s[3]);
+        s[4] = madd(gy, at.dy, s[4]);
+        if (level >= kGeometry) {
+            const Floats t = keep(at.free_z & m, dz);
+            s[5] += t;
+            s[6] = madd(t, at.dx, s[6]);
+            s[7] = madd(t, at.dy, s[7]);
+        }
+    }
+    inline void add_chosen(const GaussianPixel& at, Floats, Floats, Mask m, Floats e, Floats dz) {
+        s[16] = s[16] - e * at.dx;
+        s[17] = s[17] - e * at.dy;
+        if (chosen == kChosenAll) s[18] += keep(at.free_z & m, dz);
+    }
+    inline void add_normal(int c, Floats v) { s[8 + c] += v; }
+    inline void add_opacity(Floats v) { s[11] += v; }
+    inline void add_color(int c, Floats v) { s[12 + c] += v; }
+    void finish(float, float, float* out) const { sum_lanes(s, chosen ? kGaussianSumsChosen : kGaussianSums, out); }
+};
+template <class K, int level, int chosen> struct AdderOf {
+    using Type = SurfelAdder<level, chosen>;
+};
+template <int level, int chosen> struct AdderOf<Gaussians, level, chosen> {
+    using Type = GaussianAdder<level, chosen>;
+};
+
+template <class K, int level, int chosen>
+void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& chosen_planes, const Saved& saved,
+                   float* sums, uint8_t* touched_slots) {
+    constexpr int width = chosen ? K::sums_chosen : K::sums;
+    constexpr int chosen_level = chosen == kChosenAll ? level : kColor;
+    Floats open[kBlocks], all[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
+    Ints last[kBlocks], middle[kBlocks];
+    int block_last[kBlocks];
+    Cotangents<level> total;
+    Cotangents<chosen_level> part;
+    int latest = -1;
+    for (int b = 0; b < kBlocks; b++) {
+        open[b] = tile.read(saved.open, b);
+        last[b] = middle[b] = Ints{} - 1;
+        tile.read(saved.last, b, (int32_t*)&last[b]);
+        block_last[b] = -1;
+        for (int l = 0; l < kLanes; l++) block_last[b] = last[b][l] > block_last[b] ? last[b][l] : block_last[b];
+        latest = block_last[b] > latest ? block_last[b] : latest;
+        total.read(tile, total_planes, open, b);
+        if (chosen) part.read(tile, chosen_planes, open, b);
+        if (level >= kGeometry) tile.read(saved.middle, b, (int32_t*)&middle[b]);
+        if (level >= kDistortion) {
+            all[b] = 1.0f - open[b];
+            shift[b] = tile.read(saved.m_shift, b);
+            m1[b] = tile.read(saved.m1, b);
+            m2[b] = tile.read(saved.m2, b);
+        }
+    }
+    for (int64_t k = tile.begin + latest; k >= tile.begin; k--) {
+        const auto& s = record_of<K, -4>(tile, k);
+        const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
+        const typename K::Local local(s, sx, sy);
+        uint32_t touched[4];
+        touched_blocks(s, sx, sy, touched);
+        const int32_t index = (int32_t)(k - tile.begin);
+        const Ints here = Ints{} + index;
+        typename AdderOf<K, level, chosen>::Type adder;
+        bool hit = false;
+        for (int j = 0; j < 4; j++)
+            for (uint32_t todo = touched[j]; todo; todo &= todo - 1) {
+                const int b = j * kBlocksDown + __builtin_ctz(todo) / kBlockRows;
+                if (block_last[b] < index) continue;
+                const Floats x = lanes().x[b], y = lanes().y[b];
+                typename K::Pixel at;
+                at.shape(local, x, y);
+                const Floats fall = exp_negative(-at.half_rho), raw = local.opacity * fall;
+                const Floats alpha = lower(raw, broadcast(kAlphaMax));
+                const Mask m = less_equal(kAlphaMin, alpha) & less_equal(here, last[b]);
+                if (!any(m)) continue;
+                hit = true;
+                const Floats ra = reciprocal(1.0f - alpha), before = open[b] * ra, w = keep(m, alpha * before);
+                open[b] = select(m, before, open[b]);
+                Floats m_z{}, d{}, z{};
+                if (level >= kGeometry) {
+                    at.depth(local);
+                    z = at.z;
+                }
+                if (level >= kDistortion) {
+                    m_z = reciprocal(z);
+                    d = m_z - shift[b];
+                }
+                const Floats per_weight = total.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
+                const Mask smooth = m & lesser(raw, kAlphaMax);
+                const Floats da = keep(smooth, before * per_weight - total.behind[b] * ra);
+                total.behind[b] = madd(w, per_weight, total.behind[b]);
+                adder.add_opacity(da * fall);
+                for (int c = 0; c < 3; c++) adder.add_color(c, w * total.color[c][b]);
+                Floats dz{};
+                Mask mid = m;
+                if (level >= kGeometry) {
+                    mid = m & equal(here, middle[b]);
+                    dz = total.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
+                    for (int c = 0; c < 3; c++) adder.add_normal(c, w * total.normal[c][b]);
+                }
+                adder.add(at, x, y, m, -(da * raw), dz);
+                if (chosen) {
+                    const Floats pw = part.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
+                    const Floats pa = keep(smooth, before * pw - part.behind[b] * ra);
+                    part.behind[b] = madd(w, pw, part.behind[b]);
+                    Floats pz{};
+                    if (chosen_level >= kGeometry) pz = part.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
+                    adder.add_chosen(at, x, y, m, -(pa * raw), pz);
+                }
+            }
+        if (!hit) continue;
+        const uint32_t slot = tile.job.entries[k].slot;
+        float row[width];
+        adder.finish(sx, sy, row);
+        std::memcpy(sums + (size_t)slot * width, row, sizeof row);
+        touched_slots[slot] = 1;
+    }
+}
+
+// --------------------------------------------------------------------------------------------------------- contribution
+
+template <class K>
+void contribution_tile(const Tile& tile, float alpha_power, float open_power, float* sums, uint8_t* touched_slots) {
+    const bool root_mean = alpha_power == 0.5f && open_power == 0.5f;
+    Floats open[kBlocks];
+    Mask alive[kBlocks];
+    uint32_t rays[4];
+    tile.inside(rays);
+    for (int b = 0; b < kBlocks; b++) {
+        open[b] = broadcast(1.0f);
+        alive[b] = tile.inside(b);
+    }
+    for (int64_t k = tile.begin; k < tile.end; k++) {
+        const auto& s = record_of<K, 4>(tile, k);
+        const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
+        const typename K::Local local(s, sx, sy);
+        uint32_t touched[4];
+        touched_blocks(s, sx, sy, touched);
+        Floats sum[4] = {Floats{}, Floats{}, Floats{}, Floats{}};
+        for (int j = 0; j < 4; j++)
+            for (uint32_t todo = touched[j] & rays[j]; todo; todo &= todo - 1) {
+                const int bit = __builtin_ctz(todo), b = j * kBlocksDown + bit / kBlockRows;
+                typename K::Pixel at;
+                at.shape(local, lanes().x[b], lanes().y[b]);
+                const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+                Mask m = less_equal(kAlphaMin, alpha) & alive[b];
+                if (!any(m)) continue;
+                const Floats before = open[b], after = before * (1.0f - alpha);
+                const Mask ends = m & lesser(after, kTransmittanceMin);
+                alive[b] = without(alive[b], ends);
+                if (!any(alive[b])) rays[j] &= ~(1u << bit);
+                m = without(m, ends);
+                const Floats term = root_mean ? root(alpha * before)
+                                              : exp_negative(madd(log_positive(alpha), alpha_power, log_positive(before) * open_power));
+                sum[0] += keep(m, term);
+                sum[1] += keep(m, broadcast(1.0f));
+                open[b] = select(m, after, before);
+            }
+        float total[4];
+        sum_lanes(sum, 4, total);
+        if (total[1] > 0) {
+            const uint32_t slot = tile.job.entries[k].slot;
+            sums[2 * (size_t)slot] = total[0];
+            sums[2 * (size_t)slot + 1] = total[1];
+            touched_slots[slot] = 1;
+        }
+        if (!(rays[0] | rays[1] | rays[2] | rays[3])) break;
+    }
+}
+
+// ----------------------------------------------------------------------------------------------------------------- SSIM
+
+constexpr int kRadius = 5;  // of the 11 x 11 window
+
+struct Window {
+    float w[kRadius + 1];
+    Window() {
+        double sum = 0, v[kRadius + 1];
+        for (int i = 0; i <= kRadius; i++) {
+            v[i] = std::exp(-i * i / (2 * 1.5 * 1.5));
+            sum += i ? 2 * v[i] : v[i];
+        }
+        for (int i = 0; i <= kRadius; i++) w[i] = (float)(v[i] / sum);
+    }
+};
+const Window& window() {
+    static const Window table;
+    return table;
+}
+
+// Rows with zeros around them, rounded up to whole vectors; row i replaces row i - count.
+struct Rows {
+    static constexpr int margin = kLanes < kRadius ? 2 * kLanes : kLanes;
+    int stride, count;
+    std::vector<float> data;
+    Rows(int width, int rows)
+        : stride((width + kLanes - 1) / kLanes * kLanes + 2 * margin), count(rows), data((size_t)stride * rows) {}
+    float* row(int i) { return data.data() + (size_t)(i % count) * stride + margin; }
+};
+static_assert(kRadius <= Rows::margin, "the margin must hold the window");
+
+inline Floats across(const float* p) {
+    const float* w = window().w;
+    Floats v = load(p) * w[0];
+    for (int i = 1; i <= kRadius; i++) v = madd(load(p - i) + load(p + i), w[i], v);
+    return v;
+}
+inline Floats along(Rows& rows, int y, int x, int height) {
+    const float* w = window().w;
+    Floats v = load(rows.row(y) + x) * w[0];
+    for (int i = 1; i <= kRadius; i++) {
+        Floats both{};
+        if (y - i >= 0) both = load(rows.row(y - i) + x);
+        if (y + i < height) both += load(rows.row(y + i) + x);
+        v = madd(both, w[i], v);
+    }
+    return v;
+}
+
+double ssim_rows(const float* px, const float* py, int width, int height, int y0, int y1, float* d_mean, float* d_square,
+                 float* d_cross) {
+    const float c1 = 0.01f * 0.01f, c2 = 0.03f * 0.03f;
+    const int ring = 2 * kRadius + 1;
+    Rows x(width, 1), y(width, 1), square(width, 1), product(width, 1);
+    Rows mx(width, ring), my(width, ring), ms(width, ring), mp(width, ring);
+    double sum = 0;
+    int next = y0 - kRadius < 0 ? 0 : y0 - kRadius;
+    for (int row = y0; row < y1; row++) {
+        for (; next <= row + kRadius && next < height; next++) {
+            std::memcpy(x.row(0), px + (size_t)next * width, width * sizeof(float));
+            std::memcpy(y.row(0), py + (size_t)next * width, width * sizeof(float));
+            for (int i = 0; i < width; i += kLanes) {
+                const Floats a = load(x.row(0) + i), b = load(y.row(0) + i);
+                store(square.row(0) + i, madd(a, a, b * b));
+                store(product.row(0) + i, a * b);
+            }
+            for (int i = 0; i < width; i += kLanes) {
+                store(mx.row(next) + i, across(x.row(0) + i));
+                store(my.row(next) + i, across(y.row(0) + i));
+                store(ms.row(next) + i, across(square.row(0) + i));
+                store(mp.row(next) + i, across(product.row(0) + i));
+            }
+        }
+        Floats row_sum{};
+        for (int i = 0; i < width; i += kLanes) {
+            const Floats a = along(mx, row, i, height), b = along(my, row, i, height);
+            const Floats means = madd(a, a, b * b), ab = a * b;
+            const Floats p1 = 2.0f * ab + c1, q1 = means + c1;
+            const Floats p2 = 2.0f * (along(mp, row, i, height) - ab) + c2, q2 = along(ms, row, i, height) - means + c2;
+            const Floats inv = 1.0f / (q1 * q2), s = p1 * p2 * inv;
+            // S as a function of the blurred x, x^2 + y^2 and x y.
+            const Floats dm = 2.0f * inv * (b * (p2 - p1)) - 2.0f * s * a * (1.0f / q1 - 1.0f / q2);
+            const Floats ds = -(s / q2), dc = 2.0f * p1 * inv;
+            const int n = width - i < kLanes ? width - i : kLanes;
+            const size_t at = (size_t)row * width + i;
+            std::memcpy(d_mean + at, &dm, n * sizeof(float));
+            std::memcpy(d_square + at, &ds, n * sizeof(float));
+            std::memcpy(d_cross + at, &dc, n * sizeof(float));
+            Floats whole{};
+            std::memcpy(&whole, &s, n * sizeof(float));
+            row_sum += whole;
+        }
+        double total = 0;
+        for (int l = 0; l < kLanes; l++) total += row_sum[l];
+        sum += total;
+    }
+    return sum;
+}
+
+void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, const float* d_square, const float* d_cross,
+                        int width, int height, int y0, int y1, float scale, float* out) {
+    const int ring = 2 * kRadius + 1;
+    Rows line(width, 3);
+    Rows bm(width, ring), bs(width, ring), bc(width, ring);
+    int next = y0 - kRadius < 0 ? 0 : y0 - kRadius;
+    for (int row = y0; row < y1; row++) {
+        for (; next <= row + kRadius && next < height; next++) {
+            const size_t at = (size_t)next * width;
+            std::memcpy(line.row(0), d_mean + at, width * sizeof(float));
+            std::memcpy(line.row(1), d_square + at, width * sizeof(float));
+            std::memcpy(line.row(2), d_cross + at, width * sizeof(float));
+            for (int i = 0; i < width; i += kLanes) {
+                store(bm.row(next) + i, across(line.row(0) + i));
+                store(bs.row(next) + i, across(line.row(1) + i));
+                store(bc.row(next) + i, across(line.row(2) + i));
+            }
+        }
+        for (int i = 0; i < width; i += kLanes) {
+            const int n = width - i < kLanes ? width - i : kLanes;
+            const size_t at = (size_t)row * width + i;
+            Floats x{}, y{};
+            std::memcpy(&x, px + at, n * sizeof(float));
+            std::memcpy(&y, py + at, n * sizeof(float));
+            const Floats g = scale * madd(2.0f * x, along(bs, row, i, height), madd(y, along(bc, row, i, height), along(bm, row, i, height)));
+            std::memcpy(out + at, &g, n * sizeof(float));
+        }
+    }
+}
+
+// ----------------------------------------------------------------------------------------------------------------- Adam
+
+void adam(int64_t count, float* value, const float* gradient, float* first, float* second, float rate, float beta1,
+          float beta2, float second_correction, float epsilon) {
+    auto update = [&](Floats g, Floats& m, Floats& v, Floats& p) {
+        m = madd(g - m, 1.0f - beta1, m);
+        v = madd(madd(g, g, -v), broadcast(1.0f - beta2), v);
+        p = p - rate * m / (root(v) * second_correction + epsilon);
+    };
+    int64_t i = 0;
+    for (; i + kLanes <= count; i += kLanes) {
+        Floats m = load(first + i), v = load(second + i), p = load(value + i);
+        update(load(gradient + i), m, v, p);
+        store(first + i, m);
+        store(second + i, v);
+        store(value + i, p);
+    }
+    if (const int64_t n = count - i) {
+        Floats g{}, m{}, v{}, p{};
+        std::memcpy(&g, gradient + i, n * sizeof(float));
+        std::memcpy(&m, first + i, n * sizeof(float));
+        std::memcpy(&v, second + i, n * sizeof(float));
+        std::memcpy(&p, value + i, n * sizeof(float));
+        update(g, m, v, p);
+        std::memcpy(first + i, &m, n * sizeof(float));
+        std::memcpy(second + i, &v, n * sizeof(float));
+        std::memcpy(value + i, &p, n * sizeof(float));
+    }
+}
+
+// ------------------------------------------------------------------------------------------------------------- dispatch
+
+template <class K> void forward_of(Level level, const Tile& tile, const Planes& out, const Saved& saved) {
+    switch (level) {
+        case kColor: return forward_tile<K, kColor>(tile, out, saved);
+        case kGeometry: return forward_tile<K, kGeometry>(tile, out, saved);
+        case kDistortion: return forward_tile<K, kDistortion>(tile, out, saved);
+    }
+}
+template <class K, int level>
+void backward_of(Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved, float* sums, uint8_t* touched) {
+    switch (chosen) {
+        case kNone: return backward_tile<K, level, kNone>(tile, a, b, saved, sums, touched);
+        case kChosenColor: return backward_tile<K, level, kChosenColor>(tile, a, b, saved, sums, touched);
+        case kChosenAll: return backward_tile<K, level, kChosenAll>(tile, a, b, saved, sums, touched);
+    }
+}
+template <class K>
+void backward_of(Level level, Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved, float* sums, uint8_t* touched) {
+    switch (level) {
+        case kColor: return backward_of<K, kColor>(chosen, tile, a, b, saved, sums, touched);
+        case kGeometry: return backward_of<K, kGeometry>(chosen, tile, a, b, saved, sums, touched);
+        case kDistortion: return backward_of<K, kDistortion>(chosen, tile, a, b, saved, sums, touched);
+    }
+}
+
+void forward(Kind kind, Level level, const Job& job, int64_t tile, const Planes& out, const Saved& saved) {
+    kind == kSurfel ? forward_of<Surfels>(level, Tile(job, tile), out, saved) : forward_of<Gaussians>(level, Tile(job, tile), out, saved);
+}
+void backward(Kind kind, Level level, Chosen chosen, const Job& job, int64_t tile, const Planes& a, const Planes& b, const Saved& saved,
+              float* sums, uint8_t* touched) {
+    if (job.offsets[tile] == job.offsets[tile + 1]) return;
+    kind == kSurfel ? backward_of<Surfels>(level, chosen, Tile(job, tile), a, b, saved, sums, touched)
+                    : backward_of<Gaussians>(level, chosen, Tile(job, tile), a, b, saved, sums, touched);
+}
+void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, float open_power, float* sums, uint8_t* touched) {
+    kind == kSurfel ? contribution_tile<Surfels>(Tile(job, tile), alpha_power, open_power, sums, touched)
+                    : contribution_tile<Gaussians>(Tile(job, tile), alpha_power, open_power, sums, touched);
+}
+
+}  // namespace
+
+#define SURFKIT_NAME_(x) #x
+#define SURFKIT_NAME(x) SURFKIT_NAME_(x)
+#define SURFKIT_TABLE_(x) kernels_##x
+#define SURFKIT_TABLE(x) SURFKIT_TABLE_(x)
+const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
+    static const Kernels table{SURFKIT_NAME(SURFKIT_KERNELS), forward, backward, contribution, ssim_rows, ssim_gradient_rows, adam};
+    return table;
+}
+
+}  // namespace surfkit

@@ -1,0 +1,84 @@
+// What the per-pixel kernels read and write, and the table through which one of their compilations is chosen.
+#pragma once
+
+#include <cstdint>
+
+namespace surfkit {
+
+constexpr int kTile = 16;  // pixels
+
+// A tile's entry: which record it draws, and which slot its gradient goes to.
+struct Entry {
+    uint32_t record, slot;
+};
+
+// What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
+struct SurfelRecord {
+    float a[3], b[3], c[3], det;
+    float low_x, low_y, z_low, z_high;
+    float opacity, color[3], normal[3];
+    float ax, ay;
+    // the bound about the anchor, for rows: x = mx + tilt dy +- sqrt(wide (1 - dy^2 flat))
+    float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
+};
+
+struct GaussianRecord {
+    float x, y, l00, l01, l11;
+    float z, slope_x, slope_y, z_low, z_high;
+    float opacity, color[3], normal[3];
+    float ax, ay;
+    float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
+};
+
+// Images, row by row; null where not wanted. Planes of colour and normal follow one another.
+struct Planes {
+    float *color, *alpha, *depth, *median, *normal, *distortion;
+};
+
+// What the forward keeps for the backward, each a plane of H x W.
+struct Saved {
+    float* open;       // transmittance at the end
+    int32_t* last;     // index in the tile's list of the last splat blended, -1 if none
+    int32_t* middle;   // the same of the median depth
+    float *m_shift, *m1, *m2;  // inverse depth of the first splat, and moments about it
+};
+
+struct Job {
+    int width, height, tiles_x, tiles_y;
+    const void* records;
+    const Entry* entries;
+    const int64_t* offsets;  // tiles + 1
+};
+
+enum Kind { kSurfel = 0, kGaussian = 1 };
+// Which maps a pass has to do with.
+enum Level { kColor = 0, kGeometry = 1, kDistortion = 2 };
+// What is said of the chosen losses: nothing, cotangents of colour, cotangents of every map.
+enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2 };
+
+constexpr int kSurfelSums = 20, kSurfelSumsChosen = 32;
+constexpr int kGaussianSums = 16, kGaussianSumsChosen = 20;
+
+struct Kernels {
+    const char* name;
+    void (*forward)(Kind, Level, const Job&, int64_t tile, const Planes& out, const Saved&);
+    // `sums` has one row of floats per slot; `touched` one byte per slot, set where the row was written.
+    void (*backward)(Kind, Level, Chosen, const Job&, int64_t tile, const Planes& total, const Planes& chosen,
+                     const Saved&, float* sums, uint8_t* touched);
+    // Sum and count per slot of alpha^a T^b.
+    void (*contribution)(Kind, const Job&, int64_t tile, float alpha_power, float open_power, float* sums,
+                         uint8_t* touched);
+    // Rows [y0, y1) of one plane: SSIM summed, and its three partial-derivative planes.
+    double (*ssim_rows)(const float* x, const float* y, int width, int height, int y0, int y1, float* d_mean,
+                        float* d_square, float* d_cross);
+    void (*ssim_gradient_rows)(const float* x, const float* y, const float* d_mean, const float* d_square,
+                               const float* d_cross, int width, int height, int y0, int y1, float scale, float* out);
+    void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
+                 float beta1, float beta2, float second_correction, float epsilon);
+};
+
+const Kernels& kernels_avx512();
+const Kernels& kernels_avx2();
+const Kernels& kernels_baseline();
+
+}  // namespace surfkit

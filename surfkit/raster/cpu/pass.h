@@ -1,0 +1,73 @@
+// One rendered view: projection, tile lists, blending, and the way back.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+static inline double square_root(double x) { return std::sqrt(x); }
+static inline double natural_log(double x) { return std::log(x); }
+#include "../splat_math.h"
+#include "kernels.h"
+
+namespace surfkit {
+
+// Activated values of N splats, as in raster/api.py; `scales` has 2 or 3 columns by the kind.
+struct SplatArrays {
+    int64_t count;
+    int coefficients;  // of spherical harmonics, per channel
+    const float *means, *quats, *scales, *opacities, *sh;
+};
+
+struct GradientArrays {
+    float *means, *quats, *scales, *opacities, *sh, *signal, *chosen;  // chosen may be null
+};
+
+class Pass {
+  public:
+    // Projects and bins. `seen` and `radii` are written for every splat.
+    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, bool antialias, int threads,
+         bool* seen, float* radii);
+
+    void forward(Level level, const Planes& out, int threads);
+    void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out, int threads);
+    void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
+
+    int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
+    int64_t pairs() const { return (int64_t)entries_.size(); }
+
+  private:
+    template <class Record> void project(const SplatArrays& splats, int threads, bool* seen, float* radii);
+    void bin(int threads);
+    Job job() const;
+    template <class F> void each_seen(int threads, F f) const;
+
+    Kind kind_;
+    splat::CameraModel<double> camera_;
+    bool antialias_;
+    int64_t count_;
+    int tiles_x_, tiles_y_;
+    // Per projected splat; those of chunk c start at c * kChunk, their numbers are in seen_in_.
+    std::unique_ptr<char[]> records_;
+    std::unique_ptr<splat::Bound<double>[]> bounds_;
+    std::unique_ptr<int64_t[]> index_;
+    std::unique_ptr<float[]> depth_;
+    std::unique_ptr<uint32_t[]> slot_, tiles_;
+    std::vector<int32_t> seen_in_;
+    std::vector<Entry> entries_;
+    std::vector<int64_t> offsets_;
+    // Saved by forward.
+    Level level_ = kColor;
+    std::vector<float> open_, m_shift_, m1_, m2_;
+    std::vector<int32_t> last_, middle_;
+};
+
+// The compilation in use, and those that this machine can run (best first).
+const Kernels& kernels();
+std::vector<const Kernels*> runnable_kernels();
+void use_kernels(const Kernels& k);
+
+double ssim(const float* x, const float* y, int channels, int width, int height, float* gradient, int threads);
+
+}  // namespace surfkit

@@ -1,0 +1,94 @@
+#include "pool.h"
+
+#include <atomic>
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+#include <thread>
+#include <vector>
+#if defined(__unix__) || defined(__APPLE__)
+#include <pthread.h>
+#endif
+
+namespace surfkit {
+namespace {
+
+struct Job {
+    const std::function<void(int64_t)>* body;
+    int64_t count;
+    std::atomic<int64_t> next{0};
+    std::atomic<int> running{0};
+    int wanted = 0;  // helpers still to join, guarded by the pool's lock
+
+    void work() {
+        for (int64_t i; (i = next.fetch_add(1)) < count;) (*body)(i);
+    }
+};
+
+class Pool {
+  public:
+    void run(int64_t count, int helpers, const std::function<void(int64_t)>& body) {
+        std::lock_guard<std::mutex> one_at_a_time(caller_);
+        Job job;
+        job.body = &body;
+        job.count = count;
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            while ((int)threads_.size() < helpers) threads_.emplace_back([this] { serve(); });
+            job.wanted = helpers;
+            job_ = &job;
+        }
+        wake_.notify_all();
+        job.work();
+        std::unique_lock<std::mutex> lock(mutex_);
+        job_ = nullptr;  // whoever has not joined yet need not
+        done_.wait(lock, [&] { return job.running.load() == 0; });
+    }
+
+  private:
+    void serve() {
+        std::unique_lock<std::mutex> lock(mutex_);
+        for (;;) {
+            wake_.wait(lock, [&] { return job_ && job_->wanted > 0; });
+            Job* job = job_;
+            job->wanted--;
+            job->running++;
+            lock.unlock();
+            job->work();
+            lock.lock();
+            if (--job->running == 0) done_.notify_all();
+        }
+    }
+
+    std::mutex caller_, mutex_;
+    std::condition_variable wake_, done_;
+    std::vector<std::thread> threads_;
+    Job* job_ = nullptr;
+};
+
+// Never destroyed: its threads may outlive static destructors. A forked child has no threads, so it gets a new pool.
+Pool* pool = nullptr;
+
+Pool& the_pool() {
+    static const bool once = [] {
+        pool = new Pool;
+#if defined(__unix__) || defined(__APPLE__)
+        pthread_atfork(nullptr, nullptr, [] { pool = new Pool; });
+#endif
+        return true;
+    }();
+    (void)once;
+    return *pool;
+}
+
+}  // namespace
+
+void parallel(int64_t count, int threads, const std::function<void(int64_t)>& body) {
+    if (threads <= 1 || count <= 1) {
+        for (int64_t i = 0; i < count; i++) body(i);
+        return;
+    }
+    the_pool().run(count, (int)(threads - 1 < count - 1 ? threads - 1 : count - 1), body);
+}
+
+}  // namespace surfkit

@@ -1,0 +1,114 @@
+"""The CPU rasterizer: the compiled kernels behind the contract of `raster.api`."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.validate import validate
+from surfkit.scene.camera import Camera
+
+MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
+
+
+@cache
+def module() -> ModuleType | None:
+    """The compiled extension, or None where surfkit was installed without a compiler.
+
+    SURFKIT_KERNELS=avx512|avx2|baseline picks one compilation of the kernels; by default the best that runs is used.
+    """
+    try:
+        from surfkit.raster.cpu import _native
+    except ImportError:
+        return None
+    if wanted := os.environ.get("SURFKIT_KERNELS"):
+        if wanted not in _native.kernels():
+            raise BadInput(f"SURFKIT_KERNELS={wanted}: this machine can run {', '.join(_native.kernels())}")
+        _native.use_kernels(wanted)
+    return _native
+
+
+class NativeRasterizer(Rasterizer):
+    """Draws on the CPU with SIMD on `torch.get_num_threads()` threads; their number does not change a bit."""
+
+    def render(self, splats: Splats, camera: Camera, near: float, geometry: bool = True) -> Render:
+        return NativeRender(splats, camera, near, geometry)
+
+    def contribution(
+        self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
+    ) -> tuple[Tensor, Tensor]:
+        drawn = _Pass(splats, camera, near)
+        total = torch.zeros(len(splats), dtype=torch.float32)
+        count = torch.zeros(len(splats), dtype=torch.int64)
+        drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())
+        return total, count
+
+
+class _Pass:
+    """Splats projected onto one camera and sorted into tiles."""
+
+    def __init__(self, splats: Splats, camera: Camera, near: float) -> None:
+        self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
+        validate(splats, values=False)
+        self.seen = torch.empty(len(splats), dtype=torch.bool)
+        self.radii = torch.empty(len(splats), dtype=torch.float32)
+        self.native = module().Pass(
+            splats.kind == "surfel",
+            self.arrays,
+            camera.world_to_camera.double().flatten().tolist(),
+            [camera.fx, camera.fy, camera.cx, camera.cy],
+            camera.width,
+            camera.height,
+            near,
+            splats.antialias,
+            self.seen,
+            self.radii,
+            torch.get_num_threads(),
+        )
+        if self.native.first_invalid >= 0:
+            validate(splats)
+            raise BadInput(f"splats: row {self.native.first_invalid} is out of the range of float32")
+
+
+class NativeRender(Render):
+    """A view drawn by the native kernels; keeps what the backward needs."""
+
+    def __init__(self, splats: Splats, camera: Camera, near: float, geometry: bool) -> None:
+        self._pass = _Pass(splats, camera, near)
+        self.seen, self.radii = self._pass.seen, self._pass.radii
+        self._size = (camera.height, camera.width)
+        shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
+        made = MAPS if geometry else MAPS[:2]
+        maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in made}
+        self._pass.native.forward(2 if geometry else 0, [maps.get(name) for name in MAPS], torch.get_num_threads())
+        self.maps = Maps(**maps)
+
+    def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:
+        arrays = self._pass.arrays
+        grads = [torch.zeros_like(a) for a in arrays]
+        signal = torch.zeros(len(arrays[0]), 2)
+        chosen_signal = None if chosen is None else torch.zeros(len(arrays[0]), 2)
+        self._pass.native.backward(
+            arrays,
+            self._cotangents(total),
+            [] if chosen is None else self._cotangents(chosen),
+            grads,
+            signal,
+            chosen_signal,
+            torch.get_num_threads(),
+        )
+        return Gradients(*grads, signal, chosen_signal)
+
+    def _cotangents(self, maps: Maps) -> list[Tensor | None]:
+        given = maps.present()
+        for name, value in given.items():
+            made = getattr(self.maps, name)
+            if made is None or made.shape != value.shape:
+                raise BadInput(f"cotangent of {name}: shape {tuple(value.shape)} does not fit the maps rendered")
+        return [given[name].to(torch.float32).contiguous() if name in given else None for name in MAPS]

@@ -1,0 +1,546 @@
+// The formulas of splatting, once, for every backend. Plain C++17, no includes: the CPU backend instantiates them with
+// double (per splat) and SIMD vectors (per pixel); a CUDA backend can instantiate them with float.
+//
+// Per pixel, V is a float or a vector of floats and the including file provides, for V and its mask type:
+//   madd(a, b, c) = a b + c rounded once where the machine can, reciprocal(a), lesser(a, b), less_equal(a, b),
+//   select(mask, a, b), operator& on masks.
+// Per splat, R is float or double and `square_root`, `natural_log` are given for it.
+#pragma once
+
+#ifndef SPLAT_FN
+#define SPLAT_FN static inline
+#endif
+
+namespace splat {
+
+constexpr double kPi = 3.14159265358979323846;
+constexpr float kAlphaMax = 0.99f;
+constexpr float kAlphaMin = 1.0f / 255.0f;
+constexpr float kTransmittanceMin = 1e-4f;
+constexpr double kCutoffSquared = 11.082527090316832;  // 2 ln 255: opacity 1 falls to kAlphaMin at this many sigmas^2
+constexpr double kDilation = 0.3;                       // px^2, added to a gaussian's footprint
+constexpr double kAntialiasFloor = 2.5e-5;
+
+// ---------------------------------------------------------------------------------------------------- small vectors
+
+template <class R> struct Vec {
+    R x, y, z;
+};
+template <class R> SPLAT_FN Vec<R> operator+(Vec<R> a, Vec<R> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+template <class R> SPLAT_FN Vec<R> operator-(Vec<R> a, Vec<R> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+template <class R> SPLAT_FN Vec<R> operator*(R s, Vec<R> a) { return {s * a.x, s * a.y, s * a.z}; }
+template <class R> SPLAT_FN Vec<R> times(Vec<R> a, Vec<R> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+template <class R> SPLAT_FN R dot(Vec<R> a, Vec<R> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class R> SPLAT_FN Vec<R> cross(Vec<R> a, Vec<R> b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class R> SPLAT_FN R largest(R a, R b) { return a > b ? a : b; }
+template <class R> SPLAT_FN R smallest(R a, R b) { return a < b ? a : b; }
+template <class R> SPLAT_FN R magnitude(R a) { return a < 0 ? -a : a; }
+
+// A 3 x 3 matrix by columns.
+template <class R> struct Mat {
+    Vec<R> c0, c1, c2;
+};
+template <class R> SPLAT_FN Vec<R> mul(const Mat<R>& m, Vec<R> v) { return v.x * m.c0 + v.y * m.c1 + v.z * m.c2; }
+template <class R> SPLAT_FN Vec<R> mul_transposed(const Mat<R>& m, Vec<R> v) {
+    return {dot(m.c0, v), dot(m.c1, v), dot(m.c2, v)};
+}
+
+// ------------------------------------------------------------------------------------------------------------- camera
+
+template <class R> struct CameraModel {
+    Mat<R> turn;    // world to camera
+    Vec<R> shift;   // world to camera
+    Vec<R> centre;  // in the world
+    R fx, fy, cx, cy;
+    R near;
+    int width, height;
+};
+
+// ----------------------------------------------------------------------------------------------------------- rotation
+
+// Columns of the rotation of a unit quaternion w, x, y, z.
+template <class R> SPLAT_FN Mat<R> rotation(R w, R x, R y, R z) {
+    return {{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
+            {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
+            {2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)}};
+}
+
+// dL/d(quaternion of any length) from dL/d(rotation), g by columns.
+template <class R> SPLAT_FN void rotation_backward(const R q[4], R length, const Mat<R>& g, R out[4]) {
+    const R w = q[0] / length, x = q[1] / length, y = q[2] / length, z = q[3] / length;
+    const R g00 = g.c0.x, g10 = g.c0.y, g20 = g.c0.z, g01 = g.c1.x, g11 = g.c1.y, g21 = g.c1.z, g02 = g.c2.x,
+            g12 = g.c2.y, g22 = g.c2.z;
+    const R dw = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01));
+    const R dx = 2 * (y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12) - 2 * x * (g11 + g22));
+    const R dy = 2 * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - 2 * y * (g00 + g22));
+    const R dz = 2 * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - 2 * z * (g00 + g11));
+    const R along = w * dw + x * dx + y * dy + z * dz;
+    out[0] = (dw - w * along) / length;
+    out[1] = (dx - x * along) / length;
+    out[2] = (dy - y * along) / length;
+    out[3] = (dz - z * along) / length;
+}
+
+// ------------------------------------------------------------------------------------------------ spherical harmonics
+
+// Real spherical harmonics of degree <= 3 at a unit direction; `count` is 1, 4, 9 or 16.
+template <class R> SPLAT_FN void sh_basis(Vec<R> d, int count, R b[16]) {
+    const R x = d.x, y = d.y, z = d.z;
+    b[0] = R(0.28209479177387814);
+    if (count < 4) return;
+    b[1] = R(-0.4886025119029199) * y;
+    b[2] = R(0.4886025119029199) * z;
+    b[3] = R(-0.4886025119029199) * x;
+    if (count < 9) return;
+    const R xx = x * x, yy = y * y, zz = z * z;
+    b[4] = R(1.0925484305920792) * x * y;
+    b[5] = R(-1.0925484305920792) * y * z;
+    b[6] = R(0.31539156525252005) * (2 * zz - xx - yy);
+    b[7] = R(-1.0925484305920792) * x * z;
+    b[8] = R(0.5462742152960396) * (xx - yy);
+    if (count < 16) return;
+    b[9] = R(-0.5900435899266435) * y * (3 * xx - yy);
+    b[10] = R(2.890611442640554) * x * y * z;
+    b[11] = R(-0.4570457994644658) * y * (4 * zz - xx - yy);
+    b[12] = R(0.3731763325901154) * z * (2 * zz - 3 * xx - 3 * yy);
+    b[13] = R(-0.4570457994644658) * x * (4 * zz - xx - yy);
+    b[14] = R(1.445305721320277) * z * (xx - yy);
+    b[15] = R(-0.5900435899266435) * x * (xx - 3 * yy);
+}
+
+// sum over k of w[k] d(basis k)/d(direction): the gradient of the polynomials above.
+template <class R> SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
+    Vec<R> g{0, 0, 0};
+    if (count < 4) return g;
+    const R x = d.x, y = d.y, z = d.z;
+    g.y += R(-0.4886025119029199) * w[1];
+    g.z += R(0.4886025119029199) * w[2];
+    g.x += R(-0.4886025119029199) * w[3];
+    if (count < 9) return g;
+    const R c2 = R(1.0925484305920792), c20 = R(0.31539156525252005), c22 = R(0.5462742152960396);
+    g.x += c2 * (y * w[4] - z * w[7]) - 2 * c20 * x * w[6] + 2 * c22 * x * w[8];
+    g.y += c2 * (x * w[4] - z * w[5]) - 2 * c20 * y * w[6] - 2 * c22 * y * w[8];
+    g.z += c2 * (-y * w[5] - x * w[7]) + 4 * c20 * z * w[6];
+    if (count < 16) return g;
+    const R xx = x * x, yy = y * y, zz = z * z;
+    const R k9 = R(-0.5900435899266435) * w[9], k10 = R(2.890611442640554) * w[10], k11 = R(-0.4570457994644658) * w[11],
+            k12 = R(0.3731763325901154) * w[12], k13 = R(-0.4570457994644658) * w[13],
+            k14 = R(1.445305721320277) * w[14], k15 = R(-0.5900435899266435) * w[15];
+    g.x += 6 * x * y * k9 + y * z * k10 - 2 * x * y * k11 - 6 * x * z * k12 + (4 * zz - 3 * xx - yy) * k13 +
+           2 * x * z * k14 + 3 * (xx - yy) * k15;
+    g.y += 3 * (xx - yy) * k9 + x * z * k10 + (4 * zz - xx - 3 * yy) * k11 - 6 * y * z * k12 - 2 * x * y * k13 -
+           2 * y * z * k14 - 6 * x * y * k15;
+    g.z += x * y * k10 + 8 * y * z * k11 + 3 * (2 * zz - xx - yy) * k12 + 8 * x * z * k13 + (xx - yy) * k14;
+    return g;
+}
+
+// ------------------------------------------------------------------------------------------------- one splat, its parts
+
+template <class R> struct SplatIn {
+    Vec<R> mean;
+    R quat[4];
+    R scale[3];  // the third is unused by surfels
+    R opacity;
+};
+
+template <class R> struct SplatGrad {
+    Vec<R> mean{0, 0, 0};
+    R quat[4]{0, 0, 0, 0};
+    R scale[3]{0, 0, 0};
+    R opacity = 0;
+    R signal[2]{0, 0};
+    R chosen[2]{0, 0};
+};
+
+// The region of the image in which alpha >= kAlphaMin: an ellipse about (mx, my) with the matrix (hxx, hxy, hyy), and a
+// disc about (dx, dy) (surfels' low-pass filter; r2 < 0 if there is none). Pixels.
+template <class R> struct Bound {
+    R mx, my, hxx, hxy, hyy;
+    R dx, dy, r2;
+};
+
+// Camera-frame quantities that the forward and the backward of both kinds share.
+template <class R> struct Posed {
+    Vec<R> c;      // centre
+    Mat<R> axes;   // columns of the rotation
+    R length;      // of the quaternion
+};
+
+template <class R> SPLAT_FN Posed<R> pose(const SplatIn<R>& s, const CameraModel<R>& cam) {
+    Posed<R> p;
+    p.c = mul(cam.turn, s.mean) + cam.shift;
+    p.length = square_root(s.quat[0] * s.quat[0] + s.quat[1] * s.quat[1] + s.quat[2] * s.quat[2] + s.quat[3] * s.quat[3]);
+    const Mat<R> r = rotation(s.quat[0] / p.length, s.quat[1] / p.length, s.quat[2] / p.length, s.quat[3] / p.length);
+    p.axes = {mul(cam.turn, r.c0), mul(cam.turn, r.c1), mul(cam.turn, r.c2)};
+    return p;
+}
+
+// dL/d(mean, quaternion) from dL/d(camera-frame centre and axes).
+template <class R>
+SPLAT_FN void pose_backward(const SplatIn<R>& s, const CameraModel<R>& cam, R length, Vec<R> dc, const Mat<R>& daxes,
+                            SplatGrad<R>& out) {
+    out.mean = mul_transposed(cam.turn, dc);
+    const Mat<R> dr{mul_transposed(cam.turn, daxes.c0), mul_transposed(cam.turn, daxes.c1),
+                    mul_transposed(cam.turn, daxes.c2)};
+    rotation_backward(s.quat, length, dr, out.quat);
+}
+
+// ------------------------------------------------------------------------------------------------------------- surfels
+
+// Rows of the homography from the disc's (u, v, 1) to (x w, y w, w) (2DGS, eq. 7 f.).
+template <class R> struct Homography {
+    Vec<R> u, v, w;
+};
+
+template <class R>
+SPLAT_FN Homography<R> homography(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam) {
+    const Vec<R> a = s.scale[0] * p.axes.c0, b = s.scale[1] * p.axes.c1, c = p.c;
+    return {{cam.fx * a.x + cam.cx * a.z, cam.fx * b.x + cam.cx * b.z, cam.fx * c.x + cam.cx * c.z},
+            {cam.fy * a.y + cam.cy * a.z, cam.fy * b.y + cam.cy * b.z, cam.fy * c.y + cam.cy * c.z},
+            {a.z, b.z, c.z}};
+}
+
+// The box of the k-sigma contour: its centre, and f with centre = (f.(Tu Tw), f.(Tv Tw)). False if it meets the camera
+// plane.
+template <class R> struct Contour {
+    Vec<R> t, f;
+    R d, x, y;
+};
+template <class R> SPLAT_FN bool contour(const Homography<R>& h, R k_squared, Contour<R>& out) {
+    out.t = {k_squared, k_squared, R(-1)};
+    out.d = dot(out.t, times(h.w, h.w));
+    if (!(out.d < 0)) return false;
+    out.f = (1 / out.d) * out.t;
+    out.x = dot(out.f, times(h.u, h.w));
+    out.y = dot(out.f, times(h.v, h.w));
+    return true;
+}
+
+template <class R> struct Surfel {
+    Homography<R> h;
+    Contour<R> low;        // 3 sigma: its centre is the low-pass filter's
+    Vec<R> a, b, c;        // p = x a + y b + c about the anchor, divided by `unit`
+    R unit, det;           // det of the homography / unit: z = det / p.z
+    R ax, ay;              // anchor: a pixel centre near the splat, so that offsets stay small
+    R z_low, z_high;
+    R flip;                // sign that turns the normal to the camera
+    Bound<R> bound;
+};
+
+// Project a surfel; false if nothing of it can be drawn. `whole(x)` rounds down.
+template <class R, class Floor>
+SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, Floor whole,
+                             Surfel<R>& o) {
+    if (!(p.c.z > cam.near) || !(s.opacity > R(kAlphaMin))) return false;
+    o.h = homography(s, p, cam);
+    Contour<R> edge;
+    if (!contour(o.h, R(kCutoffSquared), edge) || !contour(o.h, R(9), o.low)) return false;
+    const R k2 = smallest(2 * natural_log(s.opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5), R(kCutoffSquared));
+    if (!contour(o.h, k2, edge)) return false;
+    o.bound = {edge.x, edge.y, edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
+               edge.x * edge.y - dot(edge.f, times(o.h.u, o.h.v)),
+               edge.y * edge.y - dot(edge.f, times(o.h.v, o.h.v)), o.low.x, o.low.y, k2 / 2};
+    const R limit = R(1 << 22);
+    o.ax = whole(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
+    o.ay = whole(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
+    const Vec<R> u = o.h.u - o.ax * o.h.w, v = o.h.v - o.ay * o.h.w;
+    const Vec<R> a = cross(v, o.h.w), b = cross(o.h.w, u), c = cross(u, v);
+    R size = 0;
+    for (const Vec<R>& q : {a, b, c})
+        size = largest(size, largest(magnitude(q.x), largest(magnitude(q.y), magnitude(q.z))));
+    if (!(size > 0)) return false;
+    o.unit = size;
+    o.a = (1 / size) * a;
+    o.b = (1 / size) * b;
+    o.c = (1 / size) * c;
+    o.det = dot(u, a) / size;
+    const R reach = square_root(R(kCutoffSquared) * (o.h.w.x * o.h.w.x + o.h.w.y * o.h.w.y));
+    o.z_low = largest(p.c.z - reach, cam.near);
+    o.z_high = p.c.z + reach;
+    o.flip = dot(p.axes.c2, p.c) > 0 ? R(-1) : R(1);
+    return true;
+}
+
+// What the pixels hand back for a surfel: cotangents of a, b, c, det, the low-pass centre, colour, normal, opacity.
+template <class R> struct SurfelSums {
+    Vec<R> a, b, c;
+    R det;
+    R low[2];
+    Vec<R> normal;
+    R opacity;
+    // The same of the chosen losses, as far as the signal needs them: x and y of a, b, c.
+    R chosen_a[2], chosen_b[2], chosen_c[2], chosen_low[2], chosen_det;
+};
+
+template <class R>
+SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const Surfel<R>& o,
+                              const SurfelSums<R>& g, SplatGrad<R>& out) {
+    // u, v, w, a, b, c do not depend on `unit` up to a common factor, and the image does not depend on that factor.
+    const R inv = 1 / o.unit;
+    const Vec<R> w = o.h.w, u = o.h.u - o.ax * w, v = o.h.v - o.ay * w;
+    const Vec<R> ga = inv * g.a, gb = inv * g.b, gc = inv * g.c;
+    const R gdet = inv * g.det;
+    Vec<R> du = cross(gb, w) + cross(v, gc) + gdet * cross(v, w);
+    Vec<R> dv = cross(w, ga) + cross(gc, u) + gdet * cross(w, u);
+    Vec<R> dw = cross(ga, v) + cross(u, gb) + gdet * cross(u, v) - o.ax * du - o.ay * dv;
+    const Vec<R> df = g.low[0] * times(o.h.u, w) + g.low[1] * times(o.h.v, w);
+    du = du + g.low[0] * times(o.low.f, w);
+    dv = dv + g.low[1] * times(o.low.f, w);
+    dw = dw + g.low[0] * times(o.low.f, o.h.u) + g.low[1] * times(o.low.f, o.h.v) -
+         (2 * dot(df, o.low.f) / o.low.d) * times(o.low.t, w);
+    const R half_w = w.z * R(0.5) * R(cam.width), half_h = w.z * R(0.5) * R(cam.height);
+    out.signal[0] = du.z * half_w;
+    out.signal[1] = dv.z * half_h;
+    const R cu = inv * (g.chosen_b[0] * w.y - g.chosen_b[1] * w.x + v.x * g.chosen_c[1] - v.y * g.chosen_c[0] +
+                        g.chosen_det * (v.x * w.y - v.y * w.x));
+    const R cv = inv * (w.x * g.chosen_a[1] - w.y * g.chosen_a[0] + g.chosen_c[0] * u.y - g.chosen_c[1] * u.x +
+                        g.chosen_det * (w.x * u.y - w.y * u.x));
+    out.chosen[0] = (cu + g.chosen_low[0] * o.low.f.z * w.z) * half_w;
+    out.chosen[1] = (cv + g.chosen_low[1] * o.low.f.z * w.z) * half_h;
+    const Vec<R> da{cam.fx * du.x, cam.fy * dv.x, cam.cx * du.x + cam.cy * dv.x + dw.x};
+    const Vec<R> db{cam.fx * du.y, cam.fy * dv.y, cam.cx * du.y + cam.cy * dv.y + dw.y};
+    const Vec<R> dc{cam.fx * du.z, cam.fy * dv.z, cam.cx * du.z + cam.cy * dv.z + dw.z};
+    out.scale[0] = dot(da, p.axes.c0);
+    out.scale[1] = dot(db, p.axes.c1);
+    out.scale[2] = 0;
+    out.opacity = g.opacity;
+    pose_backward(s, cam, p.length, dc, Mat<R>{s.scale[0] * da, s.scale[1] * db, o.flip * g.normal}, out);
+}
+
+// ----------------------------------------------------------------------------------------------------------- gaussians
+
+template <class R> struct Gaussian {
+    R x, y;                // projected centre, pixels
+    R l00, l01, l11;       // rho = (l00 dx + l01 dy)^2 + (l11 dy)^2
+    R compensation;        // factor on the opacity (antialias)
+    R slope_x, slope_y;    // depth per pixel
+    R z, z_low, z_high;
+    Vec<R> normal;
+    int thin;              // the axis of the smallest scale
+    R flip;
+    Bound<R> bound;
+    // for the backward
+    R cov[3], raw[2];      // footprint xx, xy, yy; xx and yy before dilation
+    R jx, jy;              // x / z and y / z as the Jacobian sees them
+    bool clamped_x, clamped_y;
+};
+
+template <class R> SPLAT_FN R axis_scale(const SplatIn<R>& s, int k) { return s.scale[k]; }
+template <class R> SPLAT_FN Vec<R> column(const Mat<R>& m, int k) { return k == 0 ? m.c0 : k == 1 ? m.c1 : m.c2; }
+
+template <class R>
+SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, bool antialias,
+                               Gaussian<R>& o) {
+    const Vec<R> c = p.c;
+    if (!(c.z > cam.near)) return false;
+    const R tan_x = R(0.5) * cam.width / cam.fx, tan_y = R(0.5) * cam.height / cam.fy;
+    const R dx = c.x / c.z, dy = c.y / c.z;
+    o.x = cam.fx * dx + cam.cx;
+    o.y = cam.fy * dy + cam.cy;
+    // Far outside the image the affine approximation explodes: the Jacobian is taken at the edge of a wider view.
+    o.jx = smallest(largest(dx, -(cam.cx / cam.fx + R(0.3) * tan_x)), (cam.width - cam.cx) / cam.fx + R(0.3) * tan_x);
+    o.jy = smallest(largest(dy, -(cam.cy / cam.fy + R(0.3) * tan_y)), (cam.height - cam.cy) / cam.fy + R(0.3) * tan_y);
+    o.clamped_x = o.jx != dx;
+    o.clamped_y = o.jy != dy;
+    R xx = 0, xy = 0, yy = 0, smin = s.scale[0], smax = s.scale[0];
+    o.thin = 0;
+    for (int k = 0; k < 3; k++) {
+        const Vec<R> r = column(p.axes, k);
+        const R mx = s.scale[k] * cam.fx / c.z * (r.x - o.jx * r.z), my = s.scale[k] * cam.fy / c.z * (r.y - o.jy * r.z);
+        xx += mx * mx;
+        xy += mx * my;
+        yy += my * my;
+        if (s.scale[k] < smin) smin = s.scale[k], o.thin = k;
+        smax = largest(smax, s.scale[k]);
+    }
+    o.raw[0] = xx;
+    o.raw[1] = yy;
+    const R raw_det = largest(xx * yy - xy * xy, R(0));
+    xx += R(kDilation);
+    yy += R(kDilation);
+    o.cov[0] = xx;
+    o.cov[1] = xy;
+    o.cov[2] = yy;
+    // The dilation keeps the determinant away from 0; summing it apart avoids the cancellation in xx yy - xy xy.
+    const R det = raw_det + R(kDilation) * (o.raw[0] + o.raw[1]) + R(kDilation) * R(kDilation);
+    if (!(det > 0)) return false;
+    o.compensation = antialias ? square_root(largest(raw_det / det, R(kAntialiasFloor))) : R(1);
+    const R opacity = s.opacity * o.compensation;
+    if (!(opacity > R(kAlphaMin))) return false;
+    o.l00 = square_root(yy / det);
+    o.l01 = -xy / det / o.l00;
+    o.l11 = 1 / square_root(yy);
+    const R k2 = 2 * natural_log(opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5);
+    o.bound = {o.x, o.y, k2 * xx, k2 * xy, k2 * yy, o.x, o.y, R(-1)};
+    // Depth of the largest density along the ray, to first order about the centre (RaDe-GS).
+    R q = 0;
+    Vec<R> g{0, 0, 0};
+    const Vec<R> d0{dx, dy, R(1)};
+    for (int k = 0; k < 3; k++) {
+        const R e = (smin / s.scale[k]) * (smin / s.scale[k]), h = dot(column(p.axes, k), d0);
+        q += e * h * h;
+        g = g + (e * h) * column(p.axes, k);
+    }
+    o.slope_x = q > 0 ? -c.z * g.x / q / cam.fx : R(0);
+    o.slope_y = q > 0 ? -c.z * g.y / q / cam.fy : R(0);
+    const R reach = square_root(R(kCutoffSquared)) * smax;
+    o.z = c.z;
+    o.z_low = largest(c.z - reach, cam.near);
+    o.z_high = c.z + reach;
+    o.normal = column(p.axes, o.thin);
+    o.flip = dot(o.normal, c) > 0 ? R(-1) : R(1);
+    o.normal = o.flip * o.normal;
+    return true;
+}
+
+// What the pixels hand back for a gaussian: moments of e = dL/d(power) about the centre, and the rest.
+template <class R> struct GaussianSums {
+    R e_x, e_y, e_xx, e_xy, e_yy;
+    R z, z_x, z_y;  // sums of dL/dz, and of it times the offset
+    Vec<R> normal;
+    R opacity;      // of the compensated opacity
+    R chosen_x, chosen_y, chosen_z;
+};
+
+template <class R>
+SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, bool antialias,
+                                const Gaussian<R>& o, const GaussianSums<R>& g, SplatGrad<R>& out) {
+    const Vec<R> c = p.c;
+    const R qa = o.l00 * o.l00, qb = o.l00 * o.l01, qc = o.l01 * o.l01 + o.l11 * o.l11;
+    const R mean_x = qa * g.e_x + qb * g.e_y - o.slope_x * g.z, mean_y = qb * g.e_x + qc * g.e_y - o.slope_y * g.z;
+    out.signal[0] = mean_x * R(0.5) * cam.width;
+    out.signal[1] = mean_y * R(0.5) * cam.height;
+    out.chosen[0] = (qa * g.chosen_x + qb * g.chosen_y - o.slope_x * g.chosen_z) * R(0.5) * cam.width;
+    out.chosen[1] = (qb * g.chosen_x + qc * g.chosen_y - o.slope_y * g.chosen_z) * R(0.5) * cam.height;
+    // dL/d(footprint) = -Q G Q with G = -1/2 sum e d d^T.
+    const R gxx = R(-0.5) * g.e_xx, gxy = R(-0.5) * g.e_xy, gyy = R(-0.5) * g.e_yy;
+    const R txx = qa * gxx + qb * gxy, txy = qa * gxy + qb * gyy, tyx = qb * gxx + qc * gxy, tyy = qb * gxy + qc * gyy;
+    R dxx = -(txx * qa + txy * qb), dxy = -(txx * qb + txy * qc), dyy = -(tyx * qb + tyy * qc);
+    out.opacity = g.opacity * o.compensation;
+    if (antialias) {
+        const R det = qa > 0 ? o.cov[2] / qa : R(1), raw_det = largest(o.raw[0] * o.raw[1] - o.cov[1] * o.cov[1], R(0));
+        if (raw_det / det > R(kAntialiasFloor)) {
+            const R dratio = g.opacity * s.opacity / (2 * o.compensation), d0 = dratio / det, d1 = -dratio * raw_det / det / det;
+            dxx += d0 * o.raw[1] + d1 * o.cov[2];
+            dyy += d0 * o.raw[0] + d1 * o.cov[0];
+            dxy += -(d0 + d1) * o.cov[1];
+        }
+    }
+    Vec<R> dc{0, 0, 0};
+    Mat<R> daxes{{0, 0, 0}, {0, 0, 0}, {0, 0, 0}};
+    Vec<R>* columns[3] = {&daxes.c0, &daxes.c1, &daxes.c2};
+    const R fz_x = cam.fx / c.z, fz_y = cam.fy / c.z;
+    R dj00 = 0, dj02 = 0, dj11 = 0, dj12 = 0;
+    for (int k = 0; k < 3; k++) {
+        const Vec<R> r = column(p.axes, k);
+        const R vx = fz_x * (r.x - o.jx * r.z), vy = fz_y * (r.y - o.jy * r.z);
+        const R gx = 2 * s.scale[k] * (dxx * vx + dxy * vy), gy = 2 * s.scale[k] * (dxy * vx + dyy * vy);
+        out.scale[k] = gx * vx + gy * vy;
+        const R hx = s.scale[k] * gx, hy = s.scale[k] * gy;
+        *columns[k] = {hx * fz_x, hy * fz_y, -hx * fz_x * o.jx - hy * fz_y * o.jy};
+        dj00 += hx * r.x;
+        dj02 += hx * r.z;
+        dj11 += hy * r.y;
+        dj12 += hy * r.z;
+    }
+    const R zz = c.z * c.z;
+    dc.z += -cam.fx / zz * dj00 - cam.fy / zz * dj11;
+    // J02 = -fx jx / z with jx = x / z, or a constant where clamped.
+    dc.z += cam.fx * o.jx / zz * dj02 + cam.fy * o.jy / zz * dj12;
+    if (!o.clamped_x) dc.x += -cam.fx / zz * dj02, dc.z += cam.fx * o.jx / zz * dj02;
+    if (!o.clamped_y) dc.y += -cam.fy / zz * dj12, dc.z += cam.fy * o.jy / zz * dj12;
+    dc.x += fz_x * mean_x;
+    dc.y += fz_y * mean_y;
+    dc.z += -(fz_x * c.x * mean_x + fz_y * c.y * mean_y) / c.z + g.z;
+    // The depth plane.
+    R smin = s.scale[o.thin], q = 0;
+    const Vec<R> d0{c.x / c.z, c.y / c.z, R(1)};
+    R e[3], h[3];
+    Vec<R> G{0, 0, 0};
+    for (int k = 0; k < 3; k++) {
+        e[k] = (smin / s.scale[k]) * (smin / s.scale[k]);
+        h[k] = dot(column(p.axes, k), d0);
+        q += e[k] * h[k] * h[k];
+        G = G + (e[k] * h[k]) * column(p.axes, k);
+    }
+    if (q > 0) {
+        G = (1 / q) * G;
+        const Vec<R> dG{-c.z / cam.fx * g.z_x, -c.z / cam.fy * g.z_y, 0};
+        dc.z += -(G.x / cam.fx * g.z_x + G.y / cam.fy * g.z_y);
+        const R phi = dot(G, dG);
+        Vec<R> dd0{0, 0, 0};
+        for (int k = 0; k < 3; k++) {
+            const Vec<R> r = column(p.axes, k);
+            const R along = dot(r, dG), dh = e[k] * (along - 2 * phi * h[k]) / q, de = h[k] * (along - phi * h[k]) / q;
+            out.scale[k] += -2 * e[k] / s.scale[k] * de;
+            *columns[k] = *columns[k] + (e[k] * h[k] / q) * dG + dh * d0;
+            dd0 = dd0 + dh * r;
+        }
+        dc.x += dd0.x / c.z;
+        dc.y += dd0.y / c.z;
+        dc.z += -(dd0.x * c.x + dd0.y * c.y) / zz;
+    }
+    *columns[o.thin] = *columns[o.thin] + o.flip * g.normal;
+    pose_backward(s, cam, p.length, dc, daxes, out);
+}
+
+// ------------------------------------------------------------------------------------------------------- tiles and rows
+
+// The pixels x in [low, high] of the bound on the lines y0 <= y <= y1; false if there are none.
+template <class R> SPLAT_FN bool bound_span(const Bound<R>& b, R y0, R y1, R& low, R& high) {
+    bool any = false;
+    const R hx = square_root(b.hxx), hy = square_root(b.hyy);
+    const R a = largest(y0 - b.my, -hy), z = smallest(y1 - b.my, hy);
+    if (a <= z) {
+        const R tilt = b.hxy / b.hyy, wide = largest(b.hxx - b.hxy * tilt, R(0));
+        const R turn = b.hxy / hx;  // the ordinate of the right-most point
+        const R right = smallest(largest(turn, a), z), left = smallest(largest(-turn, a), z);
+        high = b.mx + tilt * right + square_root(largest(wide * (1 - right * right / b.hyy), R(0)));
+        low = b.mx + tilt * left - square_root(largest(wide * (1 - left * left / b.hyy), R(0)));
+        any = true;
+    }
+    if (b.r2 > 0) {
+        const R near_y = smallest(largest(b.dy, y0), y1) - b.dy, left = b.r2 - near_y * near_y;
+        if (left >= 0) {
+            const R half = square_root(left);
+            low = any ? smallest(low, b.dx - half) : b.dx - half;
+            high = any ? largest(high, b.dx + half) : b.dx + half;
+            any = true;
+        }
+    }
+    return any;
+}
+
+// ----------------------------------------------------------------------------------------------------------- per pixel
+
+// rho of a surfel and its depth at (x, y) about the anchor. `on_disc` where the ray meets the disc nearer than the
+// low-pass filter, `free_z` where the depth is not clamped. u, v, inv are only meaningful on the disc, inv where free_z.
+template <class V> struct SurfelHit {
+    V u, v, inv, rho, z, dx, dy;
+};
+template <class V, class S, class M>
+SPLAT_FN SurfelHit<V> surfel_hit(const S& s, V x, V y, M& on_disc) {
+    SurfelHit<V> o;
+    const V px = madd(x, s.a[0], madd(y, s.b[0], s.c[0])), py = madd(x, s.a[1], madd(y, s.b[1], s.c[1])),
+            pz = madd(x, s.a[2], madd(y, s.b[2], s.c[2]));
+    o.inv = reciprocal(pz);
+    o.u = px * o.inv;
+    o.v = py * o.inv;
+    const V disc = madd(o.u, o.u, o.v * o.v);
+    o.dx = x - s.low_x;
+    o.dy = y - s.low_y;
+    const V low = madd(o.dx, o.dx, o.dy * o.dy);
+    const V low_rho = low + low;
+    on_disc = less_equal(disc, low_rho);
+    o.rho = select(on_disc, disc, low_rho);
+    return o;
+}
+template <class V, class S, class M> SPLAT_FN V surfel_depth(const S& s, const SurfelHit<V>& hit, M& free_z) {
+    const V z = s.det * hit.inv;
+    free_z = less_equal(s.z_low, z) & less_equal(z, s.z_high);
+    return select(free_z, z, select(less_equal(s.z_high, z), s.z_high, s.z_low));
+}
+
+}  // namespace splat
