@@ -1,0 +1,48 @@
+"""Surface reconstruction of large scenes with Gaussian splatting, out of parts that plugins can add to.
+
+The names below are the public surface. Each is imported when it is first used, so `import surfkit` loads no torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_HOME = {
+    "surfkit.core.check": ("BadInput", "expect"),
+    "surfkit.core.codec": ("dump", "load", "read_json", "write_json"),
+    "surfkit.core.registry": ("Component", "choice", "components", "find", "hookimpl"),
+    "surfkit.core.schedule": ("Interval", "StepCount", "Steps", "log_linear", "rescale"),
+    "surfkit.core.tree": ("evolve",),
+    "surfkit.core.events": (
+        "FileWritten",
+        "PointsEdited",
+        "StageBegan",
+        "StageEnded",
+        "StepDone",
+        "Warned",
+    ),
+    "surfkit.primitives.base": ("Primitive",),
+    "surfkit.primitives.points": ("Edit", "Points"),
+    "surfkit.losses.base": ("Loss",),
+    "surfkit.densify.base": ("Densify", "Filter", "Policy", "Prune", "Signal", "Step", "Views"),
+    "surfkit.train.stage": ("Stage",),
+    "surfkit.recipe": ("Recipe",),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from surfkit.core.registry import own_version
+
+        return own_version()
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'surfkit' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

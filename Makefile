@@ -1,0 +1,30 @@
+# Two commands set everything up: `make demo` and `make test`.
+VENV ?= .venv
+PYTHON ?= python3
+PY = $(VENV)/bin/python
+STEPS ?= 2000
+OUT ?= runs/demo
+
+.PHONY: demo test lint bench clean
+
+demo: $(VENV)/.installed
+	$(VENV)/bin/surfkit train recipe:2dgs --steps $(STEPS) --out $(OUT)
+
+test: $(VENV)/.installed
+	$(PY) -m pytest
+
+lint: $(VENV)/.installed
+	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
+
+bench: $(VENV)/.installed
+	$(PY) bench/raster.py
+
+# Reinstalled when what is compiled or declared changes; the Python files are used in place.
+$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/raster/*.h surfkit/raster/cpu/*.h surfkit/raster/cpu/*.cpp)
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --quiet --upgrade pip
+	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev]"
+	touch $@
+
+clean:
+	rm -rf build $(VENV)

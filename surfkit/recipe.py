@@ -1,0 +1,33 @@
+"""What a run is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from surfkit.core.check import BadInput
+from surfkit.core.registry import choice
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.train.stage import Stage
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides a result, and nothing that does not."""
+
+    about: str = ""
+    """What the recipe is, in one line."""
+
+    primitive: Annotated[Primitive, choice(Primitive)] = Surfel2D()
+    """What the scene is made of."""
+
+    pretrain: Stage = field(default_factory=Stage)
+    """Optimisation of the whole scene."""
+
+    seed: int = 0
+    """Of every random draw."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**63:
+            raise BadInput(f"seed is {self.seed}; it must be 0 or more and below 2^63")
