@@ -36,7 +36,7 @@ __all__ = ["__version__", *_MODULE_OF]  # noqa: PLE0604
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from surfkit.core.registry import own_version
+        from surfkit.core.version import own_version
 
         return own_version()
     if name not in _MODULE_OF:

@@ -1,0 +1,13 @@
+"""What adds and removes points while a scene is optimised."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+from surfkit.densify.adc import ADC
+from surfkit.densify.signal import LossGradient
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """Policies and signals, by name."""
+    return {"adc": ADC, "loss-gradient": LossGradient}

@@ -6,9 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
+
+MARGIN = 1.1
+"""The scene extent is this times the largest distance of a training camera to their mean centre."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,43 @@ class Frame:
 
     origin: np.ndarray
     scale: float
+
+    @classmethod
+    def around(cls, poses: np.ndarray, points: np.ndarray) -> Frame:
+        """The frame of the training cameras; where they stand in one place, the points give the extent.
+
+        Args:
+            poses: (V, 4, 4) float64 world_to_camera of the training cameras, input frame.
+            points: (P, 3) float64 input units; their median distance replaces that of the cameras.
+        """
+        centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+        origin = centres.mean(0)
+        reach = MARGIN * np.linalg.norm(centres - origin, axis=1).max()
+        spread = np.median(np.linalg.norm(points - origin, axis=1)) if len(points) else 0.0
+        extent = reach if reach > 1e-6 * spread else spread
+        if not 0 < extent < np.inf:
+            raise BadInput("all training cameras and points lie in one place; a scene needs views from several places")
+        return cls(origin, float(1 / extent))
+
+    def to_local(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 local positions of positions in the input frame."""
+        return (np.asarray(xyz, np.float64) - self.origin) * self.scale
+
+    def to_input(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 positions in the input frame of local positions."""
+        return np.asarray(xyz, np.float64) / self.scale + self.origin
+
+    def local_pose(self, pose: np.ndarray) -> Tensor:
+        """(4, 4) float64 world_to_camera for `Camera`, of one in the input frame; camera units become local too."""
+        local = np.array(pose, np.float64)
+        local[:3, 3] = self.scale * (local[:3, :3] @ self.origin + local[:3, 3])
+        return torch.from_numpy(local)
+
+    def input_pose(self, pose: Tensor) -> np.ndarray:
+        """(4, 4) float64 world_to_camera in the input frame, of a local one."""
+        result = pose.to(torch.float64).cpu().numpy().copy()
+        result[:3, 3] = result[:3, 3] / self.scale - result[:3, :3] @ self.origin
+        return result
 
 
 @dataclass(frozen=True)

@@ -20,19 +20,20 @@ using splat::kTransmittanceMin;
 constexpr int kBlockRows = kLanes / 4;         // pixel rows in a block
 constexpr int kBlocksDown = kTile / kBlockRows;
 constexpr int kBlocks = 4 * kBlocksDown;
-constexpr uint32_t kRowBits = kBlockRows == 4 ? 0x1111u : kBlockRows == 2 ? 0x5555u : 0xffffu;
+constexpr float kMiddle = (kTile - 1) / 2.0f;
+constexpr uint64_t kRowBits = 0x0001000100010001ull * (kBlockRows == 4 ? 0x1111 : kBlockRows == 2 ? 0x5555 : 0xffff);
 
-// Pixel centres of a block about the tile's first pixel centre.
+// Pixel centres of a block about the tile's centre, where they are smallest and so most exact in a product.
 struct Lanes {
     Floats x[kBlocks], y[kBlocks];
     Floats count[kTile / kLanes];
     Lanes() {
         for (int b = 0; b < kBlocks; b++)
             for (int l = 0; l < kLanes; l++) {
-                x[b][l] = (float)(b / kBlocksDown * 4 + l % 4);
-                y[b][l] = (float)(b % kBlocksDown * kBlockRows + l / 4);
+                x[b][l] = (float)(b / kBlocksDown * 4 + l % 4) - kMiddle;
+                y[b][l] = (float)(b % kBlocksDown * kBlockRows + l / 4) - kMiddle;
             }
-        for (int i = 0; i < kTile; i++) count[i / kLanes][i % kLanes] = (float)i;
+        for (int i = 0; i < kTile; i++) count[i / kLanes][i % kLanes] = (float)i - kMiddle;
     }
 };
 const Lanes& lanes() {
@@ -44,12 +45,12 @@ const Lanes& lanes() {
 struct Tile {
     const Job& job;
     int x0, y0;
-    float ox, oy;  // the first pixel centre
+    float ox, oy;  // the centre
     size_t plane;
     int64_t begin, end;
 
     Tile(const Job& j, int64_t index)
-        : job(j), x0((int)(index % j.tiles_x) * kTile), y0((int)(index / j.tiles_x) * kTile), ox(x0 + 0.5f), oy(y0 + 0.5f),
+        : job(j), x0((int)(index % j.tiles_x) * kTile), y0((int)(index / j.tiles_x) * kTile), ox(x0 + kTile / 2.0f), oy(y0 + kTile / 2.0f),
           plane((size_t)j.width * j.height), begin(j.offsets[index]), end(j.offsets[index + 1]) {}
 
     template <class T> void read(const T* from, int block, T* to) const {
@@ -63,10 +64,13 @@ struct Tile {
         if (from) read(from, block, (float*)&v);
         return v;
     }
-    // Per column of blocks, the blocks with a pixel inside the image, as bits at multiples of kBlockRows.
-    void inside(uint32_t alive[4]) const {
+    // The blocks with a pixel inside the image, as bits of `touched_blocks`.
+    uint64_t inside() const {
         const int rows = job.height - y0 < kTile ? job.height - y0 : kTile;
-        for (int j = 0; j < 4; j++) alive[j] = x0 + 4 * j < job.width ? ((1u << rows) - 1) & kRowBits : 0;
+        uint64_t in = 0;
+        for (int j = 0; j < 4; j++)
+            if (x0 + 4 * j < job.width) in |= ((1ull << rows) - 1) << (16 * j);
+        return in & kRowBits;
     }
     Mask inside(int block) const {
         int32_t on[kLanes] = {};
@@ -87,43 +91,43 @@ struct Tile {
     }
 };
 
-// The blocks a record's footprint touches, per column, as bits at multiples of kBlockRows. (sx, sy): tile less anchor.
-template <class Record> inline void touched_blocks(const Record& s, float sx, float sy, uint32_t out[4]) {
-    const Floats far = broadcast(1e30f);
-    uint32_t hit[4] = {0, 0, 0, 0};
+// The blocks a record's footprint touches, bit 16 * column + row of pixels. (sx, sy): the tile's centre less the anchor.
+template <class Record> inline uint64_t touched_blocks(const Record& s, float sx, float sy) {
+    const Floats far = broadcast(1e30f), tiny = broadcast(1e-20f);
+    const float more = 1.0005f;  // the roots are rough
+    uint64_t hit = 0;
     for (int v = 0; v < kTile / kLanes; v++) {
         const Floats y = lanes().count[v] + sy;
         const Floats dy = y - s.my, left = madd(dy * dy, -s.flat, broadcast(1.0f));
-        const Floats half = root(higher(left, Floats{}) * s.wide), mid = madd(dy, s.tilt, broadcast(s.mx - sx));
+        const Floats half = rough_root(higher(left * (s.wide * more), tiny)), mid = madd(dy, s.tilt, broadcast(s.mx - sx));
         const Mask on = less_equal(0.0f, left);
         Floats low = select(on, mid - half, far), high = select(on, mid + half, -far);
         if (s.disc_r2 > 0) {
             const Floats dd = y - s.disc_y, rest = s.disc_r2 - dd * dd;
-            const Floats reach = root(higher(rest, Floats{}));
+            const Floats reach = rough_root(higher(rest * more, tiny));
             const Mask disc = less_equal(0.0f, rest);
             low = lower(low, select(disc, (s.disc_x - sx) - reach, far));
             high = higher(high, select(disc, (s.disc_x - sx) + reach, -far));
         }
-        for (int j = 0; j < 4; j++) hit[j] |= bits(less_equal(low, 4.0f * j + 3) & less_equal(4.0f * j, high)) << (v * kLanes);
+        for (int j = 0; j < 4; j++)
+            hit |= (uint64_t)bits(less_equal(low, 4.0f * j + 3 - kMiddle) & less_equal(4.0f * j - kMiddle, high)) << (16 * j + v * kLanes);
     }
-    for (int j = 0; j < 4; j++) {
-        uint32_t m = hit[j];
-        if (kBlockRows > 1) m |= m >> 1;
-        if (kBlockRows > 2) m |= m >> 2;
-        out[j] = m & kRowBits;
-    }
+    if (kBlockRows > 1) hit |= hit >> 1;
+    if (kBlockRows > 2) hit |= hit >> 2;
+    return hit & kRowBits;
 }
+inline int block_at(int bit) { return bit / 16 * kBlocksDown + bit % 16 / kBlockRows; }
 
 // ------------------------------------------------------------------------------- the two kinds, at pixels of one tile
 
 struct LocalSurfel {
-    float a[3], b[3], c[3], det, low_x, low_y, z_low, z_high, opacity;
+    float a[4], b[4], c[4], det, low_x, low_y, z_low, z_high, opacity;
     LocalSurfel(const SurfelRecord& s, float sx, float sy)
         : det(s.det), low_x(s.low_x - sx), low_y(s.low_y - sy), z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {
-        for (int i = 0; i < 3; i++) {
-            a[i] = s.a[i];
-            b[i] = s.b[i];
-            c[i] = s.c[i] + sx * s.a[i] + sy * s.b[i];
+        for (int i = 0; i < 4; i++) {
+            a[i] = (float)s.a[i];
+            b[i] = (float)s.b[i];
+            c[i] = (float)(s.c[i] + sx * s.a[i] + sy * s.b[i]);
         }
     }
 };
@@ -174,17 +178,15 @@ struct Gaussians {
     static constexpr int sums = kGaussianSums, sums_chosen = kGaussianSumsChosen;
 };
 
-// The record of entry k; the one that comes `ahead` entries later is fetched meanwhile.
-template <class K, int ahead> inline const typename K::Record& record_of(const Tile& tile, int64_t k) {
-    const auto* records = (const typename K::Record*)tile.job.records;
+// Fetches into the cache what the entry `ahead` of k will need: records lie in the order of the splats, not of the tile.
+template <class K, int ahead> inline void fetch(const Tile& tile, int64_t k) {
     const int64_t next = k + ahead;
-    if (next >= tile.begin && next < tile.end) {
-        const char* at = (const char*)(records + tile.job.entries[next].record);
-        __builtin_prefetch(at);
-        __builtin_prefetch(at + 64);
-        __builtin_prefetch(at + sizeof(typename K::Record) - 1);
-    }
-    return records[tile.job.entries[k].record];
+    if (next < tile.begin || next >= tile.end) return;
+    const char* at = (const char*)((const typename K::Record*)tile.job.records + tile.job.entries[next].record);
+    for (size_t line = 0; line < sizeof(typename K::Record); line += 64) __builtin_prefetch(at + line);
+}
+template <class K> inline const typename K::Record& record_of(const Tile& tile, int64_t k) {
+    return ((const typename K::Record*)tile.job.records)[tile.job.entries[k].record];
 }
 
 // -------------------------------------------------------------------------------------------------------------- forward
@@ -194,8 +196,7 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
     Floats bend[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
     Ints last[kBlocks], middle[kBlocks];
     Mask alive[kBlocks];
-    uint32_t rays[4];
-    tile.inside(rays);
+    uint64_t rays = tile.inside();  // blocks with a ray that has not ended
     for (int b = 0; b < kBlocks; b++) {
         open[b] = broadcast(1.0f);
         color[0][b] = color[1][b] = color[2][b] = depth[b] = median[b] = normal[0][b] = normal[1][b] = normal[2][b] = Floats{};
@@ -204,15 +205,14 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
         alive[b] = tile.inside(b);
     }
     for (int64_t k = tile.begin; k < tile.end; k++) {
-        const auto& s = record_of<K, 4>(tile, k);
+        fetch<K, 4>(tile, k);
+        const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
-        uint32_t touched[4];
-        touched_blocks(s, sx, sy, touched);
         const Ints here = Ints{} + (int32_t)(k - tile.begin);
-        for (int j = 0; j < 4; j++)
-            for (uint32_t todo = touched[j] & rays[j]; todo; todo &= todo - 1) {
-                const int bit = __builtin_ctz(todo), b = j * kBlocksDown + bit / kBlockRows;
+        uint64_t blended = 0;
+        for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
+                const int bit = __builtin_ctzll(todo), b = block_at(bit);
                 typename K::Pixel at;
                 at.shape(local, lanes().x[b], lanes().y[b]);
                 const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
@@ -221,8 +221,9 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
                 const Floats before = open[b], after = before * (1.0f - alpha);
                 const Mask ends = m & lesser(after, kTransmittanceMin);
                 alive[b] = without(alive[b], ends);
-                if (!any(alive[b])) rays[j] &= ~(1u << bit);
+                if (!any(alive[b])) rays &= ~(1ull << bit);
                 m = without(m, ends);
+                blended |= (uint64_t)any(m) << bit;
                 const Floats w = keep(m, alpha * before);
                 for (int c = 0; c < 3; c++) color[c][b] = madd(w, s.color[c], color[c][b]);
                 if (level >= kGeometry) {
@@ -244,7 +245,8 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
                 open[b] = select(m, after, before);
                 last[b] = select(m, here, last[b]);
             }
-        if (!(rays[0] | rays[1] | rays[2] | rays[3])) break;
+        saved.blocks[k] = blended;
+        if (!rays) break;
     }
     for (int b = 0; b < kBlocks; b++) {
         const Floats alpha = 1.0f - open[b];
@@ -404,17 +406,12 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
     constexpr int chosen_level = chosen == kChosenAll ? level : kColor;
     Floats open[kBlocks], all[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
     Ints last[kBlocks], middle[kBlocks];
-    int block_last[kBlocks];
     Cotangents<level> total;
     Cotangents<chosen_level> part;
-    int latest = -1;
     for (int b = 0; b < kBlocks; b++) {
         open[b] = tile.read(saved.open, b);
         last[b] = middle[b] = Ints{} - 1;
         tile.read(saved.last, b, (int32_t*)&last[b]);
-        block_last[b] = -1;
-        for (int l = 0; l < kLanes; l++) block_last[b] = last[b][l] > block_last[b] ? last[b][l] : block_last[b];
-        latest = block_last[b] > latest ? block_last[b] : latest;
         total.read(tile, total_planes, open, b);
         if (chosen) part.read(tile, chosen_planes, open, b);
         if (level >= kGeometry) tile.read(saved.middle, b, (int32_t*)&middle[b]);
@@ -425,28 +422,25 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
             m2[b] = tile.read(saved.m2, b);
         }
     }
-    for (int64_t k = tile.begin + latest; k >= tile.begin; k--) {
-        const auto& s = record_of<K, -4>(tile, k);
+    for (int64_t k = tile.end - 1; k >= tile.begin; k--) {
+        const uint64_t blended = saved.blocks[k];
+        fetch<K, -4>(tile, k);
+        if (!blended) continue;
+        float* const out = sums + (size_t)tile.job.entries[k].slot * width;
+        for (int i = 0; i < width; i += 16) __builtin_prefetch(out + i, 1);
+        const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
-        uint32_t touched[4];
-        touched_blocks(s, sx, sy, touched);
-        const int32_t index = (int32_t)(k - tile.begin);
-        const Ints here = Ints{} + index;
+        const Ints here = Ints{} + (int32_t)(k - tile.begin);
         typename AdderOf<K, level, chosen>::Type adder;
-        bool hit = false;
-        for (int j = 0; j < 4; j++)
-            for (uint32_t todo = touched[j]; todo; todo &= todo - 1) {
-                const int b = j * kBlocksDown + __builtin_ctz(todo) / kBlockRows;
-                if (block_last[b] < index) continue;
+        for (uint64_t todo = blended; todo; todo &= todo - 1) {
+                const int b = block_at(__builtin_ctzll(todo));
                 const Floats x = lanes().x[b], y = lanes().y[b];
                 typename K::Pixel at;
                 at.shape(local, x, y);
                 const Floats fall = exp_negative(-at.half_rho), raw = local.opacity * fall;
                 const Floats alpha = lower(raw, broadcast(kAlphaMax));
                 const Mask m = less_equal(kAlphaMin, alpha) & less_equal(here, last[b]);
-                if (!any(m)) continue;
-                hit = true;
                 const Floats ra = reciprocal(1.0f - alpha), before = open[b] * ra, w = keep(m, alpha * before);
                 open[b] = select(m, before, open[b]);
                 Floats m_z{}, d{}, z{};
@@ -481,11 +475,10 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
                     adder.add_chosen(at, x, y, m, -(pa * raw), pz);
                 }
             }
-        if (!hit) continue;
         const uint32_t slot = tile.job.entries[k].slot;
         float row[width];
         adder.finish(sx, sy, row);
-        std::memcpy(sums + (size_t)slot * width, row, sizeof row);
+        std::memcpy(out, row, sizeof row);
         touched_slots[slot] = 1;
     }
 }
@@ -497,22 +490,19 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
     const bool root_mean = alpha_power == 0.5f && open_power == 0.5f;
     Floats open[kBlocks];
     Mask alive[kBlocks];
-    uint32_t rays[4];
-    tile.inside(rays);
+    uint64_t rays = tile.inside();  // blocks with a ray that has not ended
     for (int b = 0; b < kBlocks; b++) {
         open[b] = broadcast(1.0f);
         alive[b] = tile.inside(b);
     }
     for (int64_t k = tile.begin; k < tile.end; k++) {
-        const auto& s = record_of<K, 4>(tile, k);
+        fetch<K, 4>(tile, k);
+        const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
-        uint32_t touched[4];
-        touched_blocks(s, sx, sy, touched);
         Floats sum[4] = {Floats{}, Floats{}, Floats{}, Floats{}};
-        for (int j = 0; j < 4; j++)
-            for (uint32_t todo = touched[j] & rays[j]; todo; todo &= todo - 1) {
-                const int bit = __builtin_ctz(todo), b = j * kBlocksDown + bit / kBlockRows;
+        for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
+                const int bit = __builtin_ctzll(todo), b = block_at(bit);
                 typename K::Pixel at;
                 at.shape(local, lanes().x[b], lanes().y[b]);
                 const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
@@ -521,7 +511,7 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
                 const Floats before = open[b], after = before * (1.0f - alpha);
                 const Mask ends = m & lesser(after, kTransmittanceMin);
                 alive[b] = without(alive[b], ends);
-                if (!any(alive[b])) rays[j] &= ~(1u << bit);
+                if (!any(alive[b])) rays &= ~(1ull << bit);
                 m = without(m, ends);
                 const Floats term = root_mean ? root(alpha * before)
                                               : exp_negative(madd(log_positive(alpha), alpha_power, log_positive(before) * open_power));
@@ -537,7 +527,7 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
             sums[2 * (size_t)slot + 1] = total[1];
             touched_slots[slot] = 1;
         }
-        if (!(rays[0] | rays[1] | rays[2] | rays[3])) break;
+        if (!rays) break;
     }
 }
 

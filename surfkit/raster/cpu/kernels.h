@@ -14,7 +14,8 @@ struct Entry {
 
 // What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
 struct SurfelRecord {
-    float a[3], b[3], c[3], det;
+    double a[4], b[4], c[4];  // three and a zero, double so that the origin moves to each tile without loss
+    float det;
     float low_x, low_y, z_low, z_high;
     float opacity, color[3], normal[3];
     float ax, ay;
@@ -41,6 +42,7 @@ struct Saved {
     int32_t* last;     // index in the tile's list of the last splat blended, -1 if none
     int32_t* middle;   // the same of the median depth
     float *m_shift, *m1, *m2;  // inverse depth of the first splat, and moments about it
+    uint64_t* blocks;          // per entry, the blocks of the tile that it was blended into; zero to begin with
 };
 
 struct Job {

@@ -83,14 +83,17 @@ Bound<double> widened(Bound<double> b) {
     b.hxx = b.hxx * more + pad;
     b.hxy *= more;
     b.hyy = b.hyy * more + pad;
-    if (b.r2 > 0) b.r2 = b.r2 * more + pad;
+    if (b.r2 > 0) {
+        b.r2 = b.r2 * more + pad;
+        // A disc inside the ellipse says nothing new.
+        const double half = (b.hxx + b.hyy) / 2, spread = std::hypot((b.hxx - b.hyy) / 2, b.hxy);
+        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::hypot(b.dx - b.mx, b.dy - b.my)) b.r2 = -1;
+    }
     return b;
 }
 
-template <class Record> void fill_bound(Record& r, const Bound<double>& b, double ax, double ay) {
-    const double tilt = b.hxy / b.hyy;
-    r.ax = (float)ax;
-    r.ay = (float)ay;
+template <class Record> void fill_bound(Record& r, const Bound<double>& b) {
+    const double tilt = b.hxy / b.hyy, ax = r.ax, ay = r.ay;
     r.mx = (float)(b.mx - ax);
     r.my = (float)(b.my - ay);
     r.tilt = (float)tilt;
@@ -114,20 +117,22 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     const Posed<double> p = splat::pose(in, cam);
     Surfel<double> s;
     if (!splat::surfel_project(in, p, cam, whole, s)) return false;
-    bound = widened(s.bound);
+    bound = s.bound;
+    r.ax = (float)s.ax;
+    r.ay = (float)s.ay;
     const Vec<double> m[3] = {s.a, s.b, s.c};
-    float* to[3] = {r.a, r.b, r.c};
+    double* to[3] = {r.a, r.b, r.c};
     for (int k = 0; k < 3; k++) {
-        to[k][0] = (float)m[k].x;
-        to[k][1] = (float)m[k].y;
-        to[k][2] = (float)m[k].z;
+        to[k][0] = m[k].x;
+        to[k][1] = m[k].y;
+        to[k][2] = m[k].z;
+        to[k][3] = 0;
     }
     r.det = (float)s.det;
     r.low_x = (float)(s.low.x - s.ax);
     r.low_y = (float)(s.low.y - s.ay);
     r.z_low = (float)s.z_low;
     r.z_high = (float)s.z_high;
-    fill_bound(r, bound, s.ax, s.ay);
     fill_look(r, in.opacity, Shade{}, s.flip * p.axes.c2);
     return true;
 }
@@ -135,7 +140,7 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     const Posed<double> p = splat::pose(in, cam);
     Gaussian<double> g;
     if (!splat::gaussian_project(in, p, cam, antialias, g)) return false;
-    bound = widened(g.bound);
+    bound = g.bound;
     const double limit = 1 << 22, ax = whole(std::clamp(g.x, -limit, limit)) + 0.5, ay = whole(std::clamp(g.y, -limit, limit)) + 0.5;
     r.x = (float)(g.x - ax);
     r.y = (float)(g.y - ay);
@@ -147,7 +152,8 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     r.slope_y = (float)g.slope_y;
     r.z_low = (float)g.z_low;
     r.z_high = (float)g.z_high;
-    fill_bound(r, bound, ax, ay);
+    r.ax = (float)ax;
+    r.ay = (float)ay;
     fill_look(r, in.opacity * g.compensation, Shade{}, g.normal);
     return true;
 }
@@ -230,6 +236,9 @@ template <class Record> void Pass::project(const SplatArrays& splats, int thread
             Record r;
             Bound<double> b;
             if (!project_one(in, camera_, antialias_, r, b)) continue;
+            const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
+            b = widened(b);
+            fill_bound(r, b);
             uint32_t tiles = 0;
             each_tile_row(b, tiles_x_, tiles_y_, [&](int, int x0, int x1) { tiles += (uint32_t)(x1 - x0); });
             if (!tiles) continue;
@@ -242,7 +251,7 @@ template <class Record> void Pass::project(const SplatArrays& splats, int thread
             depth_[at] = (float)(splat::mul(camera_.turn, in.mean) + camera_.shift).z;
             tiles_[at] = tiles;
             seen[i] = true;
-            radii[i] = (float)std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
+            radii[i] = (float)radius;
             at++;
         }
         seen_in_[c] = (int32_t)(at - c * kChunk);
@@ -307,6 +316,8 @@ void Pass::bin(int threads) {
 
 Job Pass::job() const { return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.data(), offsets_.data()}; }
 
+Saved Pass::saved() { return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data(), blocks_.data()}; }
+
 void Pass::forward(Level level, const Planes& out, int threads) {
     const size_t pixels = (size_t)camera_.width * camera_.height;
     level_ = level;
@@ -315,10 +326,11 @@ void Pass::forward(Level level, const Planes& out, int threads) {
     if (level >= kGeometry) middle_.resize(pixels);
     if (level >= kDistortion)
         for (auto* plane : {&m_shift_, &m1_, &m2_}) plane->resize(pixels);
-    const Saved saved{open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data()};
+    blocks_.assign(entries_.size(), 0);
+    const Saved kept = saved();
     const Job work = job();
     const Kernels& k = kernels();
-    parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) { k.forward(kind_, level, work, tile, out, saved); });
+    parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) { k.forward(kind_, level, work, tile, out, kept); });
 }
 
 namespace {
@@ -334,7 +346,6 @@ splat::GaussianSums<double> gaussian_sums(const double* s) {
 }  // namespace
 
 void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out, int threads) {
-    const Saved saved{open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data()};
     // Only what has a cotangent costs time.
     const Planes part = chosen ? *chosen : Planes{};
     Level level = kColor;
@@ -347,10 +358,11 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     const int color_at = kind_ == kSurfel ? 16 : 12;
     std::unique_ptr<float[]> sums(new float[(size_t)pairs() * width]);
     std::vector<uint8_t> touched(pairs(), 0);
+    const Saved kept = saved();
     const Job work = job();
     const Kernels& k = kernels();
     parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
-        k.backward(kind_, level, what, work, tile, total, part, saved, sums.get(), touched.data());
+        k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
     });
     const int columns = scale_columns(kind_);
     each_seen(threads, [&](int64_t r) {

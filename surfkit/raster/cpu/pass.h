@@ -41,6 +41,7 @@ class Pass {
     template <class Record> void project(const SplatArrays& splats, int threads, bool* seen, float* radii);
     void bin(int threads);
     Job job() const;
+    Saved saved();
     template <class F> void each_seen(int threads, F f) const;
 
     Kind kind_;
@@ -61,6 +62,7 @@ class Pass {
     Level level_ = kColor;
     std::vector<float> open_, m_shift_, m1_, m2_;
     std::vector<int32_t> last_, middle_;
+    std::vector<uint64_t> blocks_;
 };
 
 // The compilation in use, and those that this machine can run (best first).

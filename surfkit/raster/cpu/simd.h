@@ -49,6 +49,9 @@ static inline Ints select(Mask m, Ints a, Ints b) { return (Ints)_mm512_mask_ble
 static inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m.m, (__m512)a); }
 static inline Floats madd(Floats a, Floats b, Floats c) { return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
 static inline Floats root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
+static inline Floats rough_root(Floats a) {  // within 1e-4, a > 0
+    return a * (Floats)_mm512_rsqrt14_ps((__m512)a);
+}
 static inline Floats lower(Floats a, Floats b) { return (Floats)_mm512_min_ps((__m512)a, (__m512)b); }
 static inline Floats higher(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512)a, (__m512)b); }
 static inline Floats reciprocal(Floats a) {  // one Newton step on the 14-bit estimate: within 1 ulp
@@ -95,6 +98,7 @@ static inline Floats root(Floats a) {
 }
 #endif
 static inline Floats reciprocal(Floats a) { return 1.0f / a; }
+static inline Floats rough_root(Floats a) { return root(a); }
 
 #endif
 
@@ -107,28 +111,36 @@ static inline Floats select(Mask m, float a, float b) { return select(m, broadca
 static inline Floats madd(Floats a, float b, Floats c) { return madd(a, broadcast(b), c); }
 static inline Floats madd(Floats a, float b, float c) { return madd(a, broadcast(b), broadcast(c)); }
 
-// e^x for x <= 0, within 1e-7 of the true value relatively; 0 below -87.
+// e^x for x <= 0, within 4e-7 of the true value relatively; about 0 below -87.
 static inline Floats exp_negative(Floats x) {
+#if !defined(__AVX512F__)
     x = higher(x, broadcast(-87.0f));
+#endif
+    const float log2_e = 1.44269504f;
+#if defined(__AVX512F__)
+    const Floats n = (Floats)_mm512_roundscale_ps((__m512)(x * log2_e), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+#else
     const Floats magic = broadcast(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
-    const Floats t = madd(x, 1.44269504f, magic);
-    const Floats n = t - magic;
-    Floats r = madd(n, -0.693359375f, x);
-    r = madd(n, 2.12194440e-4f, r);
-    Floats p = broadcast(1.9875691e-4f);
-    p = madd(p, r, broadcast(1.3981999e-3f));
-    p = madd(p, r, broadcast(8.3334519e-3f));
-    p = madd(p, r, broadcast(4.1665796e-2f));
-    p = madd(p, r, broadcast(1.6666665e-1f));
-    p = madd(p, r, broadcast(5.0000001e-1f));
-    p = madd(p, r * r, r) + 1.0f;
-    Ints shift;
+    const Floats t = madd(x, log2_e, magic), n = t - magic;
+#endif
+    const Floats f = madd(x, log2_e, -n);
+    Floats p = broadcast(1.5403530e-4f);  // 2^f on [-1/2, 1/2]
+    p = madd(p, f, broadcast(1.3333558e-3f));
+    p = madd(p, f, broadcast(9.6181291e-3f));
+    p = madd(p, f, broadcast(5.5504109e-2f));
+    p = madd(p, f, broadcast(2.4022651e-1f));
+    p = madd(p, f, broadcast(6.9314718e-1f));
+    p = madd(p, f, broadcast(1.0f));
+#if defined(__AVX512F__)
+    return (Floats)_mm512_scalef_ps((__m512)p, (__m512)n);
+#else
+    Ints shift, out;
     std::memcpy(&shift, &t, sizeof shift);
-    Ints out;
     std::memcpy(&out, &p, sizeof out);
     out += (shift - 0x4B400000) << 23;
     std::memcpy(&p, &out, sizeof p);
     return p;
+#endif
 }
 
 // ln x for x > 0, within 1e-6 absolutely for x in [1e-6, 1].

@@ -1,0 +1,56 @@
+"""What a result was measured on, and how it is kept."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import time
+from pathlib import Path
+
+import torch
+
+from surfkit.raster import native
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def processor() -> str:
+    """The processor's name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def commit() -> str:
+    """The commit that was measured, with a mark if files had changed."""
+    result = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    return result.stdout.strip() or "unknown"
+
+
+def save(name: str, figures: dict) -> Path:
+    """Keep figures as bench/results/NAME.json with the machine, the commit and the date."""
+    RESULTS.mkdir(exist_ok=True)
+    about = {
+        "machine": f"{processor()}, {torch.get_num_threads()} threads",
+        "kernels": native.module().kernels_in_use() if native.module() else "reference",
+        "torch": torch.__version__,
+        "commit": commit(),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({**about, "figures": figures}, indent=2) + "\n")
+    return path
+
+
+def cpu_seconds(action, rounds: int, warm: int = 1) -> float:
+    """Median process CPU seconds of calling `action`, all threads together, after a warm-up."""
+    times = []
+    for index in range(warm + rounds):
+        began = time.process_time()
+        action()
+        if index >= warm:
+            times.append(time.process_time() - began)
+    return sorted(times)[len(times) // 2]

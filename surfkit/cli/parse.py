@@ -1,0 +1,152 @@
+"""From words to a command: tyro parses, and what it objects to becomes one line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
+
+import tyro
+
+from surfkit.cli.recipes import ARGV
+from surfkit.cli.slots import choices_first, explain_choice, slots
+from surfkit.core.check import BadInput
+
+T = TypeVar("T")
+
+_CONFIG = (tyro.conf.CascadeSubcommandArgs,)
+_FLAG = re.compile(r"--[\w.\-]+")
+_REWORDED = {
+    r"^Error parsing (recipe\.)?": "",
+    r"no type matching (.*) could be instantiated from \[(.*?)\]\. Got errors:.*": r"expected \1, got \2",
+    r"invalid literal for int\(\) with base 10: (.*)": r"expected a whole number, got \1",
+    r"could not convert string to float: (.*)": r"expected a number, got \1",
+    r"^invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)\.$": r"\2: expected one of \3, got '\1'",
+    r"^Missing value for argument '(.*)'\. Expected 1 values\.$": r"\1: a value must follow",
+    r"^Missing value for argument '(.*)'\. Expected (\d+) values\.$": r"\1: \2 values must follow",
+}
+"""What Python and tyro say, and how a user would want it said."""
+
+
+def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
+    """The command that the words ask for.
+
+    Args:
+        command: A dataclass; its fields become flags, and choices of components `field:NAME` in any order.
+        argv: Words after the command's name.
+        prog: How the user called it, such as "surfkit train".
+
+    Raises:
+        BadInput: One line about the words that do not fit, or about the values they give.
+        SystemExit: After `--help` was printed.
+    """
+    token = ARGV.set(tuple(argv))
+    said = io.StringIO()
+    try:
+        with _wide_boxes(argv), contextlib.redirect_stderr(said):
+            return tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG)
+    except SystemExit as stop:
+        if stop.code != 2:
+            raise
+        box = said.getvalue()
+        said.truncate(0)
+        raise BadInput(_condensed(box, command, argv, prog)) from None
+    finally:
+        ARGV.reset(token)
+        sys.stderr.write(said.getvalue())  # what was not tyro's box: warnings
+
+
+def _condensed(text: str, command: type, argv: Sequence[str], prog: str) -> str:
+    """One line for the box that tyro prints: a title, then sections between rules."""
+    if (known := slots(command, argv).get("recipe")) and not any(word.startswith("recipe:") for word in argv):
+        return f"no recipe chosen: add one of {', '.join(f'recipe:{name}' for name in known)}"
+    title, sections = _sections(text)
+    message = _reworded(" ".join(" ".join(sections[0]).split())) if sections else ""
+    if title == "Unrecognized options" and (found := _unrecognised(message, sections[1:], command, argv, prog)):
+        return found
+    if title == "Missing subcommand" and (names := re.search(r"\{(.*)\}", message)):
+        return f"nothing chosen: add one of {names[1]}"
+    if title == "Required options":
+        return f"{' and '.join(_outermost(sections[0]))} missing; see {prog} --help"
+    if title in ("Value error", "Invalid choice", "Missing argument"):
+        return message
+    return f"{': '.join(filter(None, [title, message])) or 'these words do not fit'}; see {prog} --help"
+
+
+def _reworded(message: str) -> str:
+    for said, meant in _REWORDED.items():
+        message = re.sub(said, meant, message)
+    return message
+
+
+def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequence[str], prog: str) -> str | None:
+    """What to do about words that have no place. Only the first is named; the next may be its value."""
+    message = re.sub(r"\(applied to [^)]*\)", "", message.partition("Arguments are applied")[0])
+    unplaced = [word for word in argv if re.search(rf"(?<!\S){re.escape(word)}(?=[\s,]|$)", message)]
+    if not unplaced:
+        return None
+    word = unplaced[0]
+    if not word.startswith("-"):
+        return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
+    flag = word.partition("=")[0]
+    similar = [line.strip() for section in more if _about(flag, section[0].strip()) for line in section[1:]]
+    near = list(dict.fromkeys(found[0] for line in similar if (found := _FLAG.match(line))))
+    owners = dict.fromkeys(re.findall(r"(\S+:\S+) --help", " ".join(_entry(flag, similar))))
+    if owners:
+        return f"{flag} does not apply here; it belongs to {' or '.join(list(owners)[:3])}, which is not chosen"
+    return f"no option {flag}; " + (f"perhaps you meant {' or '.join(near[:3])}" if near else f"see {prog} --help")
+
+
+def _outermost(lines: list[str]) -> list[str]:
+    """The least indented of the indented lines: what is missing, without its help."""
+    depths = [len(line) - len(line.lstrip()) for line in lines]
+    least = min((depth for depth, line in zip(depths, lines, strict=True) if not line.endswith(":")), default=0)
+    return [line.strip() for depth, line in zip(depths, lines, strict=True) if depth == least]
+
+
+def _about(flag: str, head: str) -> bool:
+    """Whether a section lists flags similar to this one."""
+    return head.startswith(("Perhaps you meant", f"Arguments similar to {flag}"))
+
+
+def _entry(flag: str, lines: list[str]) -> list[str]:
+    """The lines about one flag in a list of similar ones."""
+    found, inside = [], False
+    for line in lines:
+        if name := _FLAG.match(line):
+            inside = name[0] == flag
+        if inside:
+            found.append(line)
+    return found
+
+
+def _sections(text: str) -> tuple[str, list[list[str]]]:
+    """Title of a box and the lines between its rules; drawn with lines, or with hyphens where UTF-8 is not at hand."""
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines() or [""]
+    sections: list[list[str]] = [[]]
+    for line in lines[1:]:
+        inside = re.sub(r"^│ ?|\s*│?\s*$", "", line)
+        if re.fullmatch(r"\W*[─-]{3,}\W*", inside):
+            sections.append([])
+        elif inside.strip():
+            sections[-1].append(inside)
+    return re.sub(r"^\W+|\W+$", "", lines[0]), [section for section in sections if section]
+
+
+@contextlib.contextmanager
+def _wide_boxes(argv: Sequence[str]) -> Iterator[None]:
+    """Let tyro write each sentence on one line; help keeps the width of the terminal."""
+    before = os.environ.get("COLUMNS")
+    if not {"-h", "--help"} & set(argv):
+        os.environ["COLUMNS"] = "10000"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("COLUMNS", None)
+        else:
+            os.environ["COLUMNS"] = before

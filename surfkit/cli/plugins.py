@@ -1,0 +1,36 @@
+"""`surfkit plugins`: what is installed beside surfkit itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from surfkit.cli.table import print_table
+from surfkit.core.registry import Plugin, offered, records
+
+
+@dataclass(frozen=True)
+class Plugins:
+    """List the plugins: where each comes from, what it offers, why it failed.
+
+    The variable SURFKIT_PLUGINS narrows the installed ones: "none", or names with commas between them.
+    """
+
+    def run(self) -> None:
+        """Print one line per plugin."""
+        offers: dict[str, list[str]] = {}
+        for hook in ("surfkit_components", "surfkit_recipes"):  # before `records`, which then knows what failed here
+            for owner, name, _ in offered(hook):
+                offers.setdefault(owner, []).append("recipe:" * (hook == "surfkit_recipes") + name)
+        known = records()
+        rows = [(p.name, p.distribution, p.version, _shown(p, offers.get(p.name, []))) for p in known]
+        failed = [i for i, plugin in enumerate(known) if plugin.error]
+        print_table(("plugin", "package", "version", "offers"), rows, alarming=failed)
+
+
+COMMAND = Plugins
+
+
+def _shown(plugin: Plugin, offers: list[str]) -> str:
+    if plugin.error:
+        return f"not in use: {plugin.error}"
+    return ", ".join([*offers, *["listens to events"] * ("surfkit_event" in plugin.hooks)]) or "nothing"

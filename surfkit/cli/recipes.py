@@ -1,0 +1,86 @@
+"""Recipes on the command line: which there are, and how a command takes one.
+
+A command that needs a recipe declares the field
+
+    recipe: Annotated[Recipe, chosen_recipe]
+
+and the user writes `recipe:NAME` or `recipe:FILE.json`; settings inside follow as `--pretrain.steps 7000`, without a
+leading "recipe.", and parts as `pretrain.densify:none`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.registry import offered
+
+ARGV: ContextVar[tuple[str, ...]] = ContextVar("argv", default=())
+"""The words being parsed. tyro builds unions without telling for which command line; `parse` sets this."""
+
+
+def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
+    """Offered recipes by name, and every FILE.json that `argv` names as recipe:FILE.json."""
+    found: dict[str, tuple[str, Any]] = {}
+    for owner, name, recipe in offered("surfkit_recipes"):
+        if name in found:
+            raise BadInput(
+                f"two packages offer a recipe named {name!r}: {found[name][0]} and {owner}; uninstall one, or leave it "
+                "out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
+            )
+        found[name] = (owner, recipe)
+    named = {name: recipe for name, (_, recipe) in found.items()}
+    return named | {file: _read(file) for file in _files(argv)}
+
+
+def recipe_choice(argv: Sequence[str] = ()) -> Any:
+    """The union of all recipes as tyro subcommands `recipe:NAME`, whose values are the defaults of the flags."""
+    known = recipes(argv)
+    if not known:
+        raise BadInput("no plugin in use offers a recipe; name a file instead: recipe:FILE.json")
+    members = tuple(_subcommand(name, recipe) for name, recipe in known.items())
+    return Union[members]  # noqa: UP007 (made at run time)
+
+
+chosen_recipe = tyro.conf.arg(constructor_factory=lambda: recipe_choice(ARGV.get()), name="")
+"""Marks the field of a command that takes a recipe."""
+
+
+@dataclass(frozen=True)
+class Recipes:
+    """List the recipes that `surfkit train recipe:NAME` accepts."""
+
+    def run(self) -> None:
+        """Print one line per recipe."""
+        print_table(("recipe", "what it is"), [(name, about(recipe)) for name, recipe in recipes().items()])
+
+
+COMMAND = Recipes
+
+
+def about(recipe: Any) -> str:
+    """What a recipe says of itself, in one line."""
+    return " ".join(recipe.about.split())
+
+
+def _subcommand(name: str, recipe: Any) -> Any:
+    return Annotated[type(recipe), tyro.conf.subcommand(f"recipe:{name}", default=recipe, description=about(recipe))]
+
+
+def _files(argv: Sequence[str]) -> list[str]:
+    names = [word.removeprefix("recipe:") for word in argv if word.startswith("recipe:")]
+    return [name for name in names if name.endswith(".json")]
+
+
+def _read(file: str) -> Any:
+    from surfkit.recipe import Recipe
+
+    return read_json(Path(file), Recipe)

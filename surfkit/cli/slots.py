@@ -1,0 +1,102 @@
+"""The slots of a command: the places whose part the user chooses, as in `pretrain.densify:adc`."""
+
+from __future__ import annotations
+
+import difflib
+import types
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from surfkit.cli.recipes import chosen_recipe, recipes
+from surfkit.core.registry import Component, components, kebab, unknown
+
+Slots = dict[str, tuple[str, ...]]
+
+
+def slots(command: type, argv: Sequence[str]) -> Slots:
+    """The names that may follow each slot, by slot; of the recipe that `argv` chooses, if the command takes one."""
+    found: Slots = {}
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        if get_origin(hint) is Annotated and chosen_recipe in get_args(hint):
+            known = recipes(argv)
+            found["recipe"] = tuple(known)
+            chosen = next((known[word[7:]] for word in argv if word.startswith("recipe:") and word[7:] in known), None)
+            if chosen is not None:
+                found |= _below(type(chosen), chosen, "")
+        else:
+            found |= _below(hint, getattr(command, name, None), _flag(name))
+    return found
+
+
+def choices_first(command: type, argv: Sequence[str]) -> list[str]:
+    """The same words in the order that tyro needs: the recipe, choices from the outside in, then the rest.
+
+    A setting before the choice it belongs to would choose the default part. A choice without alternatives is left out:
+    tyro sees no choice there.
+    """
+    known = slots(command, argv)
+    names = {word: known.get(word.partition(":")[0], ()) for word in argv}
+    choices = [word for word in argv if word.partition(":")[2] in names[word]]
+    others = [word for word in argv if word.partition(":")[2] not in names[word]]
+    choices.sort(key=lambda word: (not word.startswith("recipe:"), word.partition(":")[0].count(".")))
+    return [word for word in choices if len(names[word]) > 1] + others
+
+
+def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
+    """Why `SLOT:NAME` does not fit, in one line; None if the word is not of that form."""
+    slot, colon, name = word.partition(":")
+    if not colon:
+        return None
+    known = slots(command, argv)
+    if slot not in known:
+        near = difflib.get_close_matches(slot, known, n=1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        return f"nothing to choose at {slot!r}; {hint}choices are made at {', '.join(known) or 'no place'}"
+    if name not in known[slot]:
+        files = "; or name a file, recipe:FILE.json" if slot == "recipe" else ""
+        return unknown(slot, name, known[slot]) + files
+    return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
+
+
+def _below(hint: Any, value: Any, path: str) -> Slots:
+    """Slots at and below a setting, given its type and its value."""
+    members = list(_members(hint))
+    classes = [m for m in members if isinstance(m, type) and get_origin(m) is None]  # tuple[int] is a type in 3.10
+    bases = [cls for cls in classes if issubclass(cls, Component)]
+    optional = type(None) in members
+    found: Slots = {}
+    if bases and path:
+        found[path] = (*components(bases[0]), *["none"] * optional)
+    elif optional and (plain := [cls for cls in classes if is_dataclass(cls)]):
+        found[path] = (kebab(plain[0].__name__), "none")
+    if is_dataclass(value) and not isinstance(value, type):
+        hints = get_type_hints(type(value), include_extras=True)
+        for field in fields(value):
+            found |= _below(hints[field.name], getattr(value, field.name), _join(path, _flag(field.name)))
+    elif isinstance(value, tuple) and (inner := [get_args(m)[0] for m in members if get_origin(m) is tuple]):
+        for at, item in enumerate(value):
+            found |= _below(inner[0], item, _join(path, str(at)))
+    elif isinstance(value, dict):  # an entry keeps its class, but there may be slots inside
+        for key, item in value.items():
+            found |= _below(Any, item, _join(path, _flag(key)))
+    return found
+
+
+def _members(hint: Any) -> Iterator[Any]:
+    """The types in a hint, marks and unions taken apart."""
+    if get_origin(hint) is Annotated:
+        yield from _members(get_args(hint)[0])
+    elif get_origin(hint) in (Union, types.UnionType):
+        for arg in get_args(hint):
+            yield from _members(arg)
+    else:
+        yield hint
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")

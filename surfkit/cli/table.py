@@ -1,0 +1,29 @@
+"""Tables for people and for pipes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], alarming: Sequence[int] = ()) -> None:
+    """Print rows under a head: coloured and fitted to a terminal, else aligned text with one line per row.
+
+    Args:
+        head: Names of the columns.
+        rows: Texts, as many in each row as in the head.
+        alarming: Positions of the rows shown in red.
+    """
+    if sys.stdout.isatty():
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(*head, box=None, header_style="bold", padding=(0, 2, 0, 0))
+        for i, row in enumerate(rows):
+            table.add_row(*map(Text, row), style="red" if i in alarming else None)
+        Console().print(table)
+        return
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    for row in [head, *rows]:
+        print("  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip())

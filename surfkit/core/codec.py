@@ -1,0 +1,211 @@
+"""Recipes to plain data and back. A component carries its registered name under `use`."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import types
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from surfkit.core.check import BadInput
+from surfkit.core.registry import Component, components, find, name_of
+
+_JSON_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+_NON_FINITE = ("inf", "-inf", "nan")
+"""How floats that JSON lacks are written."""
+
+
+def dump(value: Any) -> Any:
+    """Plain data (what JSON has) for dataclasses, dicts, tuples, paths and scalars; every default is written out."""
+    if is_dataclass(value) and not isinstance(value, type):
+        tag = {"use": name_of(value)} if isinstance(value, Component) else {}
+        return tag | {field.name: dump(getattr(value, field.name)) for field in fields(value) if field.init}
+    if isinstance(value, dict):
+        return {str(key): dump(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [dump(item) for item in value]
+    if isinstance(value, Path):
+        return value.as_posix()
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"{type(value).__name__} cannot be saved; settings are dataclasses, tuples, dicts and plain values")
+
+
+def load(hint: Any, data: Any, at: str = "") -> Any:
+    """The value that `dump` gave `data` for, checked against a type hint.
+
+    Args:
+        hint: What the value must be.
+        data: From JSON.
+        at: Dotted path of `data` in its file, for messages; "" at the top.
+    """
+    kind, args = get_origin(hint), get_args(hint)
+    if kind is Annotated:
+        return load(args[0], data, at)
+    if kind in (Union, types.UnionType):
+        return _load_union(args, data, at)
+    if kind is Literal:
+        if any(data == arg and type(data) is type(arg) for arg in args):
+            return data
+        raise _unfit(at, " or ".join(map(repr, args)), data)
+    if kind is tuple:
+        return _load_tuple(args, data, at)
+    if kind is dict:
+        _require(dict, data, at)
+        return {key: load(args[1], item, _join(at, key)) for key, item in data.items()}
+    if isinstance(hint, type) and issubclass(hint, Component):
+        return _load_component(hint, data, at)
+    if is_dataclass(hint):
+        return _load_dataclass(hint, data, at)
+    return _load_scalar(hint, data, at)
+
+
+def read_json(path: Path, hint: Any) -> Any:
+    """The value in a JSON file, checked against a type hint; `Any` takes it as it is.
+
+    Raises:
+        BadInput: Names the file, the place in it, what came and what is allowed.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_object)
+    except FileNotFoundError as error:
+        raise BadInput(f"{path}: no such file") from error
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    except json.JSONDecodeError as error:
+        raise BadInput(f"{path}: not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
+    except (BadInput, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: not JSON: {error}") from error
+    try:
+        return load(hint, data)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Save a value as JSON; the file is whole or not there, also when the process dies."""
+    text = json.dumps(dump(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _load_union(args: tuple[Any, ...], data: Any, at: str) -> Any:
+    if data is None and type(None) in args:
+        return None
+    members = [arg for arg in args if arg is not type(None)]
+    if len(members) == 1:
+        return load(members[0], data, at)
+    errors = []
+    for member in members:
+        try:
+            return load(member, data, at)
+        except BadInput as error:
+            errors.append(str(error))
+    raise BadInput("; or ".join(errors))
+
+
+def _load_tuple(args: tuple[Any, ...], data: Any, at: str) -> tuple[Any, ...]:
+    _require(list, data, at)
+    hints = args[:1] * len(data) if args[1:] == (...,) else args
+    if len(hints) != len(data):
+        raise BadInput(f"{_place(at)}expected a list of {len(hints)}, got {len(data)} elements")
+    return tuple(load(hint, item, _join(at, i)) for i, (hint, item) in enumerate(zip(hints, data, strict=True)))
+
+
+def _load_component(base: type[Component], data: Any, at: str) -> Any:
+    _require(dict, data, at)
+    rest = dict(data)
+    name = rest.pop("use", None)
+    if not isinstance(name, str):
+        came = "without" if name is None else f"with {name!r} as"
+        raise BadInput(
+            f'{_place(at)}a {base.__name__} {came} its name; add "use": one of {", ".join(components(base)) or "none"}'
+        )
+    try:
+        cls = find(base, name)
+    except BadInput as error:
+        raise BadInput(f"{_place(at)}{error}") from error
+    return _load_dataclass(cls, rest, at)
+
+
+def _load_dataclass(cls: type, data: Any, at: str) -> Any:
+    _require(dict, data, at)
+    known = {field.name: field for field in fields(cls) if field.init}
+    if wrong := [key for key in data if key not in known]:
+        raise BadInput(
+            f"{_join(at, wrong[0])}: unknown setting; {cls.__name__} has {', '.join(known) or 'no settings'}"
+        )
+    needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
+    if missing := [name for name in needed if name not in data]:
+        raise BadInput(f"{_place(at)}{', '.join(missing)} missing; {cls.__name__} needs {', '.join(needed)}")
+    hints = get_type_hints(cls, include_extras=True)
+    values = {key: load(hints[key], item, _join(at, key)) for key, item in data.items()}
+    try:
+        return cls(**values)
+    except ValueError as error:
+        raise BadInput(f"{_place(at)}{error}") from error
+
+
+def _load_scalar(hint: Any, data: Any, at: str) -> Any:
+    if hint is Any:
+        return data
+    if hint is type(None):
+        if data is None:
+            return None
+        raise _unfit(at, "null", data)
+    if hint is float:
+        if isinstance(data, (int, float)) and not isinstance(data, bool):
+            return float(data)
+        if data in _NON_FINITE:
+            return float(data)
+        raise _unfit(at, "a number", data)
+    if hint is Path:
+        return Path(_require(str, data, at))
+    if hint is int:
+        if isinstance(data, int) and not isinstance(data, bool):
+            return data
+        raise _unfit(at, "a whole number", data)
+    if hint in (str, bool):
+        return _require(hint, data, at)
+    raise TypeError(f"{_place(at)}settings of type {hint} cannot be loaded from JSON")
+
+
+def _require(kind: type, data: Any, at: str) -> Any:
+    """`data` if it is of a JSON kind; tuples pass for lists."""
+    if isinstance(data, (list, tuple) if kind is list else kind):
+        return data
+    raise _unfit(at, _JSON_NAMES[kind], data)
+
+
+def _unfit(at: str, wanted: str, data: Any) -> BadInput:
+    shown = json.dumps(data, default=repr)
+    return BadInput(f"{_place(at)}expected {wanted}, got {shown if len(shown) <= 60 else shown[:57] + '...'}")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object, refused if a key is there twice: one of the two would be lost without a word."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise BadInput(f"{key!r} is there twice in one object")
+        found[key] = value
+    return found
+
+
+def _place(at: str) -> str:
+    return f"{at}: " if at else ""
+
+
+def _join(at: str, key: object) -> str:
+    return f"{at}.{key}" if at else str(key)

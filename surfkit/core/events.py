@@ -1,0 +1,131 @@
+"""What happens in a run, told to whoever listens: progress displays, loggers, viewers.
+
+Events are frozen and hold plain values only. Plugins see them through the `surfkit_event` hook.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.registry import plugins
+
+
+@dataclass(frozen=True)
+class StageBegan:
+    """An optimisation run begins, or goes on after an interruption.
+
+    Attributes:
+        stage: Its name in the recipe, such as "pretrain".
+        steps: How many it will have made at its end.
+        points: At this moment.
+        first: Index of the first step to come; above 1 when the run goes on from a checkpoint.
+    """
+
+    stage: str
+    steps: int
+    points: int
+    first: int = 1
+
+
+@dataclass(frozen=True)
+class StepDone:
+    """One optimisation step is done.
+
+    Attributes:
+        index: Counted from 1.
+        steps: How many the stage has.
+        losses: Weighted value of each loss, by its name in the recipe.
+        points: After the step.
+    """
+
+    index: int
+    steps: int
+    losses: Mapping[str, float]
+    points: int
+
+
+@dataclass(frozen=True)
+class PointsEdited:
+    """Points were dropped, cloned or split.
+
+    Attributes:
+        index: Of the step.
+        dropped: How many went.
+        cloned: How many were copied once.
+        split: How many were replaced by their children.
+        points: After the edit.
+    """
+
+    index: int
+    dropped: int
+    cloned: int
+    split: int
+    points: int
+
+
+@dataclass(frozen=True)
+class FileWritten:
+    """A file of the run folder is complete.
+
+    Attributes:
+        path: Where it is.
+        what: What it is, in a few words.
+    """
+
+    path: Path
+    what: str
+
+
+@dataclass(frozen=True)
+class Warned:
+    """Something the user should know that does not stop the run.
+
+    Attributes:
+        text: One sentence.
+    """
+
+    text: str
+
+
+@dataclass(frozen=True)
+class StageEnded:
+    """An optimisation run is complete.
+
+    Attributes:
+        stage: Its name in the recipe.
+        steps: How many were made.
+        points: At the end.
+        seconds: Wall time since it began or went on.
+    """
+
+    stage: str
+    steps: int
+    points: int
+    seconds: float
+
+
+Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | StageEnded
+
+_silenced: set[tuple[str, int]] = set()
+"""Observers that raised, by plugin name and identity of the plugin."""
+
+
+def emit(event: Any) -> None:
+    """Tell every plugin what happened. One that raises is reported on stderr and not asked again: logs kill no run."""
+    for impl in plugins().hook.surfkit_event.get_hookimpls():
+        key = (impl.plugin_name, id(impl.plugin))
+        if key in _silenced:
+            continue
+        try:
+            impl.function(*[event] * len(impl.argnames))
+        except Exception as error:
+            _silenced.add(key)
+            print(
+                f"surfkit: plugin {impl.plugin_name} failed at {type(event).__name__} and gets no more events: "
+                f"{type(error).__name__}: {' '.join(str(error).split())}",
+                file=sys.stderr,
+            )

@@ -1,0 +1,101 @@
+"""Settings that change over a run, and settings that count its steps."""
+
+from __future__ import annotations
+
+import math
+import types
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from surfkit.core.check import BadInput
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StepCount:
+    """Marks an int setting that counts steps, so that a shorter run is the whole schedule made smaller.
+
+    Attributes:
+        floor: Scaling down stops here: a count above 0 does not fall below it.
+    """
+
+    floor: int = 0
+
+
+Steps = Annotated[int, StepCount()]
+"""A position in the schedule, in steps."""
+Interval = Annotated[int, StepCount(floor=1)]
+"""A number of steps between two events; at least 1 after scaling."""
+
+
+def rescale(value: T, factor: float) -> T:
+    """A copy in which every step count, at any depth, is multiplied by `factor` and rounded.
+
+    Args:
+        value: Frozen dataclasses, tuples and dicts of them. Counts of 0 (never, or at once) stay 0; None stays None.
+        factor: New length over old length of the run, above 0.
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise BadInput(f"steps can be scaled by a factor above 0, got {factor}")
+    return _rescale(type(value), value, factor)
+
+
+def log_linear(start: float, end: float, share: float) -> float:
+    """From `start` to `end`, both above 0, evenly in the logarithm, at a share of the way held within [0, 1]."""
+    if not (start > 0 and end > 0):
+        raise BadInput(f"a log-linear schedule needs a start and an end above 0, got {start} and {end}")
+    share = min(max(share, 0.0), 1.0)
+    return start ** (1 - share) * end**share
+
+
+def _rescale(hint: Any, value: Any, factor: float) -> Any:
+    marker = _marker(hint)
+    if marker is not None and isinstance(value, int) and value > 0:
+        return max(math.floor(value * factor + 0.5), min(marker.floor, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        hints = get_type_hints(type(value), include_extras=True)
+        old = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+        new = {name: _rescale(hints[name], item, factor) for name, item in old.items()}
+        try:
+            return replace(value, **{name: item for name, item in new.items() if item is not old[name]})
+        except ValueError as error:
+            raise BadInput(f"scaling the steps by {factor:g}: {error}") from error
+    inner = _element_hints(hint, value)
+    if isinstance(value, tuple):
+        return tuple(_rescale(hint, item, factor) for hint, item in zip(inner, value, strict=True))
+    if isinstance(value, dict):
+        return {key: _rescale(inner[0], item, factor) for key, item in value.items()}
+    return value
+
+
+def _alternatives(hint: Any) -> list[Any]:
+    """The members of a hint with unions taken apart; their marks stay on them."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return [member for arg in get_args(hint) for member in _alternatives(arg)]
+    if get_origin(hint) is Annotated and get_origin(get_args(hint)[0]) in (Union, types.UnionType):
+        inner, *marks = get_args(hint)
+        return [Annotated[(member, *marks)] for member in _alternatives(inner)]
+    return [hint]
+
+
+def _marker(hint: Any) -> StepCount | None:
+    for member in _alternatives(hint):
+        if get_origin(member) is Annotated:
+            for mark in get_args(member)[1:]:
+                if isinstance(mark, StepCount):
+                    return mark
+    return None
+
+
+def _element_hints(hint: Any, value: Any) -> list[Any]:
+    """A hint for each element of a tuple, or one for all values of a dict."""
+    count = len(value) if isinstance(value, tuple) else 1
+    for member in _alternatives(hint):
+        bare = get_args(member)[0] if get_origin(member) is Annotated else member
+        args = get_args(bare)
+        if get_origin(bare) is dict and isinstance(value, dict):
+            return [args[1]]
+        if get_origin(bare) is tuple and isinstance(value, tuple):
+            return [args[0]] * count if args[1:] == (...,) else list(args)
+    return [Any] * count

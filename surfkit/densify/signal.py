@@ -1,0 +1,35 @@
+"""The gradient that drives densification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.densify.base import Signal
+
+
+@dataclass(frozen=True)
+class LossGradient(Signal):
+    """Screen-space gradient of the chosen losses, raised towards the size of the total (CityGaussianV2, eq. 3)."""
+
+    terms: tuple[str, ...] | None = None
+    """Losses, by name, that drive densification; all of them if unset."""
+
+    boost: float = 0.0
+    """Raise the chosen gradient to this share of the total, on average (omega, 0.9 in the paper); 0 does not."""
+
+    def __post_init__(self) -> None:
+        if self.boost < 0:
+            raise BadInput(f"signal.boost is {self.boost}; it must be 0 or more")
+        if self.terms == ():
+            raise BadInput("signal.terms is empty; name a loss, or leave it unset for all of them")
+
+    def combine(self, chosen: Tensor, total: Tensor) -> Tensor:
+        """The chosen gradient times max(boost x mean |total| / mean |chosen|, 1), means over the seen points."""
+        if self.boost == 0 or self.terms is None:
+            return chosen
+        # unseen points have no gradient and both means have the same count, so sums will do, and none seen is no NaN
+        ratio = total.norm(dim=-1).sum() / chosen.norm(dim=-1).sum().clamp_min(1e-30)
+        return chosen * (self.boost * ratio).clamp_min(1)

@@ -1,0 +1,62 @@
+"""Ellipsoids pressed flat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.init import facing, seeds
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Splats
+from surfkit.scene.scene import Cloud
+
+
+@dataclass(frozen=True)
+class Flat3D(Primitive):
+    """Ellipsoids whose third axis stays thin (the flat 3DGS of the CityGaussianV2 figure on convergence).
+
+    Only two scales are trained. The third follows the smaller of them and has no gradient, so that it always is the
+    thinnest axis and gives the normal.
+    """
+
+    thickness: float = 1e-3
+    """Third scale as a share of the smaller of the other two."""
+
+    antialias: bool = False
+    """Dim splats smaller than a pixel by what the 0.3 px blur adds to them."""
+
+    def __post_init__(self) -> None:
+        Primitive.__post_init__(self)
+        if not 0 < self.thickness < 1:
+            raise BadInput(f"primitive.thickness is {self.thickness}; it must lie between 0 and 1")
+
+    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+        """Thin discs facing along the cloud's normals, or any way when it has none."""
+        params = seeds(cloud, axes=2, sh_degree=self.sh_degree)
+        anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)
+        return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
+
+    def shape(self, params: Columns, degree: int) -> Splats:
+        """Gaussians."""
+        return Splats(
+            kind="gaussian",
+            means=params["means"],
+            quats=params["quats"],
+            scales=self._three(params["scales"]),
+            opacities=params["opacities"].sigmoid(),
+            sh=harmonics(params, degree),
+            antialias=self.antialias,
+        )
+
+    def split(self, params: Columns, generator: torch.Generator) -> Columns:
+        """Children inside the parent."""
+        return children(params, self._three(params["scales"]), generator)
+
+    def _three(self, raw: Tensor) -> Tensor:
+        """(N, 3) scales from two raw ones."""
+        two = raw.exp()
+        return torch.cat([two, self.thickness * two.detach().amin(-1, keepdim=True)], dim=-1)

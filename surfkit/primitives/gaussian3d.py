@@ -1,0 +1,42 @@
+"""Ellipsoids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.init import seeds
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Splats
+from surfkit.scene.scene import Cloud
+
+
+@dataclass(frozen=True)
+class Gaussian3D(Primitive):
+    """Ellipsoids: sharpest pictures, fuzzy surfaces (3DGS, Kerbl et al. 2023)."""
+
+    antialias: bool = False
+    """Dim splats smaller than a pixel by what the 0.3 px blur adds to them."""
+
+    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+        """Balls."""
+        quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
+        return seeds(cloud, axes=3, sh_degree=self.sh_degree) | {"quats": quats}
+
+    def shape(self, params: Columns, degree: int) -> Splats:
+        """Gaussians."""
+        return Splats(
+            kind="gaussian",
+            means=params["means"],
+            quats=params["quats"],
+            scales=params["scales"].exp(),
+            opacities=params["opacities"].sigmoid(),
+            sh=harmonics(params, degree),
+            antialias=self.antialias,
+        )
+
+    def split(self, params: Columns, generator: torch.Generator) -> Columns:
+        """Children inside the parent."""
+        return children(params, params["scales"].exp(), generator)

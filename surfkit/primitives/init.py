@@ -1,0 +1,58 @@
+"""Where points begin: at the sparse cloud, as large as the gaps between its points."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.primitives.points import Columns
+from surfkit.scene.scene import Cloud
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic."""
+OPACITY = 0.1
+"""Opacity of a new point."""
+SMALLEST = 1e-5
+"""Smallest size of a new point, local units: 1 cm in a scene of 1 km."""
+ALONE = 0.01
+"""Size of a new point without neighbours, local units."""
+
+
+def seeds(cloud: Cloud, axes: int, sh_degree: int) -> Columns:
+    """Every raw column but the rotations: one point per cloud point, round, of its colour, opacity 0.1."""
+    count = len(cloud.xyz)
+    if count == 0:
+        raise BadInput("the scene has no sparse points to start from; triangulate some (COLMAP point_triangulator)")
+    sizes = gaps(cloud.xyz)
+    return {
+        "means": cloud.xyz.float().clone(),
+        "scales": sizes.log()[:, None].repeat(1, axes),
+        "opacities": torch.full((count,), math.log(OPACITY / (1 - OPACITY))),
+        "sh0": ((cloud.rgb.float() / 255 - 0.5) / SH_C0)[:, None],
+        "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+    }
+
+
+def gaps(xyz: Tensor) -> Tensor:
+    """(N,) root mean square distance to the 3 nearest points at other places, local units, at least SMALLEST."""
+    from scipy.spatial import cKDTree
+
+    places, back = np.unique(xyz.double().cpu().numpy(), axis=0, return_inverse=True)
+    near = min(3, len(places) - 1)
+    if near == 0:
+        return torch.full((len(xyz),), ALONE)
+    distances, _ = cKDTree(places).query(places, k=near + 1)
+    sizes = np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
+    return torch.from_numpy(sizes[back.reshape(-1)]).float().clamp_min(SMALLEST)
+
+
+def facing(normals: Tensor) -> Tensor:
+    """(N, 4) quaternions wxyz that turn the z axis to unit normals (N, 3)."""
+    x, y, z = normals.unbind(-1)
+    turn = torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=-1)
+    flipped = normals.new_tensor([0.0, 1.0, 0.0, 0.0])  # half a turn about x where the normal is -z
+    return torch.where((z > -1 + 1e-6)[:, None], turn, flipped)

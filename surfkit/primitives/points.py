@@ -1,0 +1,99 @@
+"""The points being optimised, and the changes policies may ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+Columns = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Points:
+    """N points as columns: whatever is kept per point lives here, so all of it moves together.
+
+    Attributes:
+        params: Trainable raw values, each (N, ...).
+        first: Adam's running mean of each parameter's gradient, same shapes.
+        second: Adam's running mean of the squared gradient, same shapes.
+        stats: What policies accumulate between edits, each (N,).
+    """
+
+    params: Columns
+    first: Columns
+    second: Columns
+    stats: Columns = field(default_factory=dict)
+
+    @classmethod
+    def fresh(cls, params: Columns) -> Points:
+        """Points that have not been optimised yet."""
+        zeros = [{name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2)]
+        return cls(params, *zeros)
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+    def stat(self, name: str) -> Tensor:
+        """(N,) a policy's own column, zeros the first time it is asked for."""
+        if name not in self.stats:
+            self.stats[name] = self.params["means"].new_zeros(len(self))
+        return self.stats[name]
+
+    def take(self, rows: Tensor) -> Points:
+        """The points of a mask or of indices, copied."""
+        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        return Points(*({name: value[rows] for name, value in group.items()} for group in vars(self).values()))
+
+    def append(self, params: Columns) -> Points:
+        """These points and new rows, whose moments and statistics start at zero."""
+        count = len(params["means"])
+
+        def padded(group: Columns) -> Columns:
+            return {name: torch.cat([v, v.new_zeros(count, *v.shape[1:])]) for name, v in group.items()}
+
+        joined = {name: torch.cat([value, params[name]]) for name, value in self.params.items()}
+        return Points(joined, padded(self.first), padded(self.second), padded(self.stats))
+
+    def to(self, device: torch.device | str) -> Points:
+        """These points on another device."""
+        return Points(*({name: value.to(device) for name, value in group.items()} for group in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change of N points; None asks for nothing.
+
+    Attributes:
+        drop: (N,) bool, points to remove.
+        clone: (N,) bool, points to copy.
+        split: (N,) bool, points to replace by two smaller ones.
+        max_opacity: Lower every opacity to this and let the optimiser forget its past; in (0, 1).
+    """
+
+    drop: Tensor | None = None
+    clone: Tensor | None = None
+    split: Tensor | None = None
+    max_opacity: float | None = None
+
+
+def merge(edits: Sequence[Edit | None]) -> Edit | None:
+    """One edit from several: a dropped point is neither cloned nor split, a split one not cloned; None if none asks."""
+    asked = [edit for edit in edits if edit is not None]
+    if not asked:
+        return None
+
+    def any_of(name: str) -> Tensor | None:
+        masks = [mask for edit in asked if (mask := getattr(edit, name)) is not None]
+        return torch.stack(masks).any(0) if masks else None
+
+    def without(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
+        return mask if mask is None or other is None else mask & ~other
+
+    drop = any_of("drop")
+    split = without(any_of("split"), drop)
+    clone = without(without(any_of("clone"), drop), split)
+    caps = [edit.max_opacity for edit in asked if edit.max_opacity is not None]
+    return Edit(drop, clone, split, min(caps, default=None))

@@ -1,0 +1,40 @@
+"""Flat discs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.init import facing, seeds
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Splats
+from surfkit.scene.scene import Cloud
+
+
+@dataclass(frozen=True)
+class Surfel2D(Primitive):
+    """Flat discs with exact ray intersection: clean surfaces (2DGS, Huang et al. 2024)."""
+
+    def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
+        """Discs facing along the cloud's normals, or any way when it has none."""
+        params = seeds(cloud, axes=2, sh_degree=self.sh_degree)
+        anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)  # uniform over all rotations
+        return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
+
+    def shape(self, params: Columns, degree: int) -> Splats:
+        """Surfels."""
+        return Splats(
+            kind="surfel",
+            means=params["means"],
+            quats=params["quats"],
+            scales=params["scales"].exp(),
+            opacities=params["opacities"].sigmoid(),
+            sh=harmonics(params, degree),
+        )
+
+    def split(self, params: Columns, generator: torch.Generator) -> Columns:
+        """Children in the parent's plane."""
+        scales = params["scales"].exp()
+        return children(params, torch.cat([scales, torch.zeros_like(scales[:, :1])], dim=1), generator)

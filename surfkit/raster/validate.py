@@ -1,0 +1,40 @@
+"""Refuse splats that no rasterizer can draw."""
+
+from __future__ import annotations
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.raster.api import Splats
+
+
+def validate(splats: Splats, values: bool = True) -> None:
+    """Check shapes and, with `values`, that numbers are finite, scales positive and quaternions not zero.
+
+    Raises:
+        BadInput: Naming the tensor, the first wrong row and what is allowed.
+    """
+    count = len(splats)
+    columns = 2 if splats.kind == "surfel" else 3
+    wanted = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": (), "sh": None}
+    for name, tensor in splats.tensors().items():
+        shape = tuple(tensor.shape)
+        if name == "sh":
+            if len(shape) != 3 or shape[0] != count or shape[1] not in (1, 4, 9, 16) or shape[2] != 3:
+                raise BadInput(f"splats.sh: shape {shape}; it must be ({count}, 1, 4, 9 or 16, 3)")
+        elif shape != (count, *wanted[name]):
+            raise BadInput(f"splats.{name}: shape {shape}; a {splats.kind} needs {(count, *wanted[name])}")
+    if not values:
+        return
+    for name, tensor in splats.tensors().items():
+        rows = tensor.detach().reshape(count, -1)
+        _refuse(~torch.isfinite(rows).all(1), name, "not finite")
+        if name == "scales":
+            _refuse(~(rows > 0).all(1), name, "not positive")
+        if name == "quats":
+            _refuse(~(rows != 0).any(1), name, "zero, which is no rotation")
+
+
+def _refuse(bad: torch.Tensor, name: str, what: str) -> None:
+    if bad.any():
+        raise BadInput(f"splats.{name}: {int(bad.sum())} of {len(bad)} rows are {what}; the first is row {int(bad.int().argmax())}")

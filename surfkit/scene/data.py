@@ -1,0 +1,84 @@
+"""Which data set, at which size, and which of its photographs are kept from training."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from surfkit.core.check import BadInput
+
+LONGEST = 1600
+"""Default for the longest side of a photograph, pixels."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """A data set and how to use it."""
+
+    path: Path
+    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse."""
+
+    scale: float | None = None
+    """Divide the size of every photograph by this."""
+
+    longest: int | None = None
+    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
+
+    test_every: int = 8
+    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none."""
+
+    test_list: Path | None = None
+    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
+
+    images: Path | None = None
+    """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not 1 <= self.scale < float("inf"):
+            raise BadInput(f"--scale {self.scale:g}: it divides the size, so it must be 1 or more")
+        if self.longest is not None and self.longest < 1:
+            raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
+        if self.test_every < 0:
+            raise BadInput(f"--test-every {self.test_every}: it must be 0 (keep no photograph from training) or more")
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height to use, for a photograph of `width` x `height` pixels; never larger than it is."""
+        longest = self.longest or (LONGEST if self.scale is None else max(width, height))
+        by = max(self.scale or 1.0, max(width, height) / longest)
+        return max(1, round(width / by)), max(1, round(height / by))
+
+    def held_out(self, names: Sequence[str]) -> set[str]:
+        """Which of the sorted `names` are kept from training."""
+        chosen = set(names[:: self.test_every]) if self.test_every else set()
+        if self.test_list is not None:
+            chosen = _listed(self.test_list, names)
+        if len(chosen) == len(names):
+            what = f"--test-list {self.test_list}" if self.test_list else f"--test-every {self.test_every}"
+            raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
+        return chosen
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """A question to add to a message, such as "; did you mean 'a.jpg'?", or "" when nothing is near."""
+    lower = {other.lower(): other for other in known}
+    close = difflib.get_close_matches(name.lower(), lower, n=1)
+    return f"; did you mean {lower[close[0]]!r}?" if close else ""
+
+
+def _listed(path: Path, names: Sequence[str]) -> set[str]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"--test-list {path}: cannot be read as text: {_reason(error)}") from error
+    chosen = {line.strip() for line in lines} - {""}
+    if not chosen:
+        raise BadInput(f"--test-list {path}: names no photograph; write one name a line")
+    for name in sorted(chosen - set(names)):
+        raise BadInput(f"--test-list {path}: no photograph {name!r} in the model{nearest(name, names)}")
+    return chosen
+
+
+def _reason(error: OSError | UnicodeDecodeError) -> str:
+    return (error.strerror or str(error)) if isinstance(error, OSError) else "it is not UTF-8"

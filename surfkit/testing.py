@@ -1,0 +1,194 @@
+"""Checks for the tests of plugins: what any component, built in or third party, must keep to.
+
+Each check returns nothing and raises AssertionError with a sentence that says what is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from surfkit.core.check import expect
+from surfkit.core.codec import dump, load
+from surfkit.core.describe import settings, summary
+from surfkit.core.registry import Component, kind_of
+
+if TYPE_CHECKING:
+    from torch import Generator, Tensor
+
+    from surfkit.densify.base import Policy, Step
+    from surfkit.losses.base import Loss, Sample
+    from surfkit.primitives.base import Primitive
+    from surfkit.primitives.points import Points
+    from surfkit.raster.api import Maps
+
+
+def check_component(part: Component) -> None:
+    """A component survives the way to JSON and back, and tells what it and each of its settings is for."""
+    cls = type(part)
+    assert summary(cls), f"{cls.__name__} needs a docstring: it is the line that `surfkit components` shows"
+    for setting in settings(cls):
+        assert setting.help, (
+            f"{cls.__name__}.{setting.name} needs a docstring under it: it is the help text of the flag"
+        )
+    text = json.dumps(dump(part), allow_nan=False)
+    again = load(kind_of(cls), json.loads(text))
+    assert again == part, f"{cls.__name__} came back from JSON as {again!r} instead of {part!r}"
+
+
+def check_policy(policy: Policy, points: Points, step: Step) -> None:
+    """A policy asks for masks of the right shape, changes no parameter, keeps its statistics whole and repeats itself.
+
+    Args:
+        policy: With settings that make it act at `step`, or the check says little.
+        points: N points.
+        step: About those N points.
+    """
+    import torch
+
+    name = type(policy).__name__
+    before = {key: value.clone() for key, value in points.params.items()}
+    policy.watch(points, step)
+    stats = {key: value.clone() for key, value in points.stats.items()}
+    first, second = policy.edit(points, step), policy.edit(points, step)
+    for key, value in points.params.items():
+        assert torch.equal(value, before[key]), f"{name} changed the parameter {key!r}; return an Edit instead"
+    for key, value in points.stats.items():
+        assert value.shape == (len(points),), f"{name}: the statistic {key!r} has shape {tuple(value.shape)}, not (N,)"
+        assert key not in stats or torch.equal(value, stats[key]), f"{name}.edit changed {key!r}; only watch may"
+    assert (first is None) == (second is None), f"{name}.edit is not repeatable"
+    if first is None:
+        return
+    assert first.max_opacity == second.max_opacity, f"{name}.edit is not repeatable"
+    assert first.max_opacity is None or 0 < first.max_opacity < 1, f"{name}: max_opacity must lie between 0 and 1"
+    for key in ("drop", "clone", "split"):
+        _check_mask(f"{name}: {key}", getattr(first, key), getattr(second, key), len(points))
+
+
+def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
+    """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered; it uses
+    no map but those it says it reads, and its weight is 0 or more at any step.
+
+    Args:
+        loss: To check.
+        size: (H, W) pixels of the pictures it is given.
+    """
+    import torch
+
+    name = type(loss).__name__
+    for index in (1, 500, 1_000):
+        weight = loss.weight_at(index, 1_000)
+        assert math.isfinite(weight) and weight >= 0, f"{name}: the weight at step {index} of 1000 is {weight}"
+    draw = torch.Generator().manual_seed(0)
+    sample = _sample(size, draw)
+    for what, alpha in (("", torch.rand(size, generator=draw)), (" of an empty render", torch.zeros(size))):
+        maps = _maps(alpha, loss.reads, draw)
+        leaves = {key: value.requires_grad_() for key, value in maps.present().items()}
+        value, again = loss(maps, sample), loss(maps, sample)
+        assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
+        assert torch.isfinite(value), f"{name}{what} is {value.item()}"
+        assert torch.equal(value, again), f"{name} is not repeatable"
+        assert value.requires_grad, f"{name}{what} does not depend on {', '.join(loss.reads)}"
+        grads = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
+        for key, grad in zip(leaves, grads, strict=True):
+            assert grad is None or torch.isfinite(grad).all(), f"{name}{what}: the gradient of {key!r} is not finite"
+
+
+def check_primitive(primitive: Primitive, count: int = 50) -> None:
+    """A primitive starts from a cloud, gives splats of the right shapes, splits a point in two within its size,
+    and does both again from the same seed.
+
+    Args:
+        primitive: To check.
+        count: Points in the cloud it starts from.
+    """
+    import torch
+
+    from surfkit.scene.scene import Cloud
+
+    name = type(primitive).__name__
+    seeded = torch.Generator().manual_seed(0)
+    xyz = torch.rand(count, 3, generator=seeded)
+    cloud = Cloud(xyz, torch.randint(0, 256, (count, 3), generator=seeded, dtype=torch.uint8))
+    params = primitive.init(cloud, torch.Generator().manual_seed(1))
+    _check_same(f"{name}.init", params, primitive.init(cloud, torch.Generator().manual_seed(1)))
+    for key, value in params.items():
+        assert len(value) == count, f"{name}.init: {key!r} has {len(value)} rows for {count} points"
+        assert torch.isfinite(value).all(), f"{name}.init: {key!r} is not finite"
+    for degree in range(primitive.sh_degree + 1):
+        _check_splats(primitive, params, degree)
+    rows = {key: value[: count // 2] for key, value in params.items()}
+    twins = primitive.split(rows, torch.Generator().manual_seed(2))
+    _check_same(f"{name}.split", twins, primitive.split(rows, torch.Generator().manual_seed(2)))
+    assert twins.keys() == params.keys(), f"{name}.split gives {sorted(twins)}, not {sorted(params)}"
+    for key, value in twins.items():
+        assert value.shape == (2 * (count // 2), *params[key].shape[1:]), f"{name}.split: {key!r} is not 2 M rows"
+    parents, children = primitive.shape(rows, 0).scales, primitive.shape(twins, 0).scales
+    assert (children <= torch.cat([parents, parents]) + 1e-6).all(), f"{name}.split: a child is larger than its parent"
+
+
+def _sample(size: tuple[int, int], draw: Generator) -> Sample:
+    import torch
+
+    from surfkit.losses.base import Sample
+    from surfkit.scene.camera import Camera
+    from surfkit.scene.scene import View
+
+    height, width = size
+    camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, width / 2, height / 2, width, height)
+    return Sample(View("random.png", camera, Path("random.png")), torch.rand(3, *size, generator=draw))
+
+
+def _maps(alpha: Tensor, reads: Iterable[str], draw: Generator) -> Maps:
+    """Random maps that fit together, of the names in `reads`; all 0 where `alpha` is."""
+    import torch
+
+    from surfkit.raster.api import Maps
+
+    depth = 1 + torch.rand(alpha.shape, generator=draw)
+    normal = torch.nn.functional.normalize(torch.randn(3, *alpha.shape, generator=draw), dim=0)
+    everything = {
+        "color": alpha * torch.rand(3, *alpha.shape, generator=draw),
+        "alpha": alpha,
+        "depth": alpha * depth,
+        "median": torch.where(alpha > 0.5, depth, 0.0),
+        "normal": alpha * normal,
+        "distortion": alpha**2 * 0.01,
+    }
+    return Maps(**{name: everything[name].detach().clone() for name in reads})
+
+
+def _check_splats(primitive: Primitive, params: dict[str, Tensor], degree: int) -> None:
+    import torch
+
+    name = f"{type(primitive).__name__}.shape"
+    splats = primitive.shape(params, degree)
+    sizes = {"N": len(params["means"])}
+    expect(f"{name}: means", splats.means, ("N", 3), sizes)
+    expect(f"{name}: quats", splats.quats, ("N", 4), sizes)
+    expect(f"{name}: scales", splats.scales, ("N", 2 if splats.kind == "surfel" else 3), sizes)
+    expect(f"{name}: opacities", splats.opacities, ("N",), sizes)
+    expect(f"{name}: sh", splats.sh, ("N", (degree + 1) ** 2, 3), sizes)
+    assert (splats.scales > 0).all(), f"{name}: scales must be positive"
+    assert ((splats.opacities >= 0) & (splats.opacities <= 1)).all(), f"{name}: opacities must lie in [0, 1]"
+    assert torch.isfinite(splats.means).all() and torch.isfinite(splats.sh).all(), f"{name}: values are not finite"
+
+
+def _check_mask(what: str, mask: Tensor | None, again: Tensor | None, count: int) -> None:
+    import torch
+
+    assert (mask is None) == (again is None), f"{what} is not repeatable"
+    if mask is not None and again is not None:
+        assert mask.dtype == torch.bool, f"{what} is {mask.dtype}, not bool"
+        assert mask.shape == (count,), f"{what} has shape {tuple(mask.shape)}, not ({count},)"
+        assert torch.equal(mask, again), f"{what} is not repeatable"
+
+
+def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
+    import torch
+
+    for key, value in first.items():
+        assert torch.equal(value, second[key]), f"{what}: {key!r} differs for the same seed; draw from the generator"

@@ -1,0 +1,49 @@
+"""The optimiser, over the columns of `Points`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import log_linear
+from surfkit.primitives.points import Columns, Points
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate."""
+
+    start: float
+    """At the first step."""
+
+    end: float | None = None
+    """At the last step, reached along a straight line in the logarithm; constant if unset."""
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or (self.end is not None and (self.end <= 0 or self.start == 0)):
+            raise BadInput(f"a rate goes from {self.start} to {self.end}; rates must be positive (a constant may be 0)")
+
+    def at(self, index: int, steps: int) -> float:
+        """The rate of step `index` of 1..`steps`."""
+        return self.start if self.end is None else log_linear(self.start, self.end, index / steps)
+
+
+@torch.no_grad()
+def adam_step(points: Points, grads: Columns, rates: Mapping[str, float], index: int) -> None:
+    """Take step `index` (from 1) of Adam on every column that has a gradient, in place."""
+    for name, grad in grads.items():
+        update(points.params[name], grad, points.first[name], points.second[name], rates[name], index)
+
+
+def update(value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, index: int) -> None:
+    """Take one step of Adam on a tensor and its moments, in place. The seam for a native kernel."""
+    first.lerp_(grad, 1 - BETA1)
+    second.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+    root = second.sqrt().mul_((1 - BETA2**index) ** -0.5).add_(EPSILON)
+    value.addcdiv_(first, root, value=-rate / (1 - BETA1**index))

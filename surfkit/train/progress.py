@@ -1,0 +1,117 @@
+"""What a person sees while a stage runs."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from torch import Tensor
+
+from surfkit.train.stage import Done
+
+PLAIN_EVERY_S = 5.0
+"""Between two lines where there is no terminal to draw on."""
+DRAW_EVERY_S = 0.1
+PSNR_EVERY = 10
+"""Steps between two looks at the PSNR of the training view at hand."""
+MEMORY = 0.95
+"""Share of the past in a smoothed number."""
+
+
+class Display:
+    """Step, speed, time left, points, loss, PSNR and memory: a live bar on a terminal, else a line every few seconds.
+
+    Loss and PSNR are running means over the training views just shown.
+    """
+
+    def __init__(self, stage: str, steps: int, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self.stage, self.steps = stage, steps
+        self.loss, self.psnr = Mean(), Mean()
+        self.began, self.first, self.drawn = time.perf_counter(), 0, 0.0
+        self.bar: Progress | None = None
+        self.task: TaskID | None = None
+
+    def __enter__(self) -> Display:
+        if self.console.is_terminal:
+            columns = TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[line]}")
+            self.bar = Progress(*columns, console=self.console, auto_refresh=False)
+            self.task = self.bar.add_task(self.stage, total=self.steps, line="")
+            self.bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+    def show(self, done: Done) -> None:
+        """Take in one step; draw when it is time."""
+        self.first = self.first or done.index
+        self.loss.add(sum(done.losses.values()))
+        last = done.index == self.steps
+        if done.index % PSNR_EVERY == 0 or last:
+            self.psnr.add(psnr(done.maps.color, done.sample.photo))
+        now = time.perf_counter()
+        if now - self.drawn < (DRAW_EVERY_S if self.bar else PLAIN_EVERY_S) and not last:
+            return
+        self.drawn = now
+        line = self.line(done, now)
+        if self.bar is None:
+            self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True)
+        else:
+            self.bar.update(self.task, completed=done.index, line=line)
+            self.bar.refresh()
+
+    def line(self, done: Done, now: float) -> str:
+        """The numbers of a step, in words."""
+        speed = (done.index - self.first + 1) / max(now - self.began, 1e-9)
+        parts = [
+            f"step {done.index}/{self.steps}",
+            f"{speed:.1f} it/s",
+            f"{clock((self.steps - done.index) / speed)} left",
+            f"{done.points:,} points",
+            f"loss {self.loss.value:.4f}",
+        ]
+        parts += [f"PSNR {self.psnr.value:.2f} dB"] * (self.psnr.count > 0)
+        parts += [f"{memory / 2**30:.1f} GiB" for memory in [peak_memory_bytes()] if memory is not None]
+        return "  ".join(parts)
+
+
+class Mean:
+    """A running mean that forgets; exact over its first values."""
+
+    def __init__(self) -> None:
+        self.value, self.count = 0.0, 0
+
+    def add(self, value: float) -> None:
+        """Take in a value."""
+        self.count += 1
+        self.value += (value - self.value) * max(1 - MEMORY, 1 / self.count)
+
+
+def psnr(image: Tensor, photo: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB, of images (3, H, W) with peak 1; the first is clamped."""
+    error = torch.mean((image.clamp(0, 1) - photo) ** 2)
+    return float(-10 * torch.log10(error.clamp_min(1e-10)))
+
+
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds, as short as possible: 1:02:03, 2:03, 0:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def peak_memory_bytes() -> int | None:
+    """The most memory this process has held so far; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

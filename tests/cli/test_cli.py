@@ -1,0 +1,230 @@
+import io
+import os
+import re
+import subprocess
+import sys
+import types
+from dataclasses import dataclass, replace
+
+import pytest
+
+from surfkit.cli import COMMANDS, main
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.core.registry import hookimpl
+
+OK = ("train", "recipe:discs", "--data", "d")
+
+
+def command(monkeypatch, run):
+    """Put a command named `export` in place that does `run`."""
+
+    @dataclass(frozen=True)
+    class Export:
+        """Do it."""
+
+        def run(self):
+            return run()
+
+    module = types.ModuleType("surfkit.cli.export")
+    module.COMMAND = Export
+    monkeypatch.setitem(sys.modules, "surfkit.cli.export", module)
+
+
+def test_help_lists_every_command(capsys):
+    assert main(["--help"]) == main([]) == 0
+    out = capsys.readouterr().out
+    for name, text in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(text)}$", out, re.M)
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"surfkit \S+\n", capsys.readouterr().out)
+
+
+def test_settings_and_choices_in_any_order(world, capsys):
+    wanted = world.Train(
+        replace(
+            world.Recipe("Flat\n  discs."),
+            pretrain=world.Stage(grow=world.Relocate(cap=5), losses={"l1": world.L1(0.5), "depth": world.Depth()}),
+            tune=world.Stage(steps=8),
+        ),
+        world.Path("d"),
+    )
+    choices = ["recipe:discs", "pretrain.grow:relocate", "tune:stage"]
+    flags = ["--data", "d", "--pretrain.grow.cap", "5", "--pretrain.losses.l1.weight", "0.5", "--tune.steps", "8"]
+    for words in ([*choices, *flags], [*flags, *choices], [*flags[:6], *choices[::-1], *flags[6:]]):
+        assert main(["train", *words]) == 0
+        assert capsys.readouterr().out == f"{wanted}\n"
+
+
+def test_the_default_part_may_be_named(world, capsys):
+    assert main([*OK, "--pretrain.grow.every", "7", "pretrain.grow:adaptive"]) == 0
+    assert "Adaptive(every=7" in capsys.readouterr().out
+
+
+def test_none_and_tuple_positions(world, capsys):
+    words = ["train", "recipe:balls", "--data", "d", "pretrain.grow:none", "pretrain.prune.0:adaptive"]
+    assert main([*words, "--pretrain.prune.0.every", "3"]) == 0
+    out = capsys.readouterr().out
+    assert "grow=None" in out and "prune=(Adaptive(every=3" in out
+
+
+def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
+    assert main(["train", "--help"]) == 0
+    assert re.search(r"recipe:balls +Round balls\.", capsys.readouterr().out)
+    assert main(["train", "recipe:discs", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "--pretrain.grow.every" in out and "Steps between edits" in out and "pretrain.grow:relocate" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["trian"], "no command 'trian'; did you mean 'train'? commands: train, evaluate,"),
+        (["train", "recipe:discs"], "--data PATH missing; see surfkit train --help"),
+        (["train", "--data", "d"], "no recipe chosen: add one of recipe:discs, recipe:balls"),
+        (["train", "--pretrain.steps", "5"], "no recipe chosen: add one of recipe:discs, recipe:balls"),
+        (
+            ["train", "recipe:dics", "--data", "d"],
+            "no recipe named 'dics'; did you mean 'discs'? known: discs, balls; or",
+        ),
+        ([*OK, "recipe:balls"], "recipe is chosen twice: recipe:discs, recipe:balls; keep one"),
+        ([*OK, "pretrain.grow:adaptve"], "no pretrain.grow named 'adaptve'; did you mean 'adaptive'? known: adaptive,"),
+        (
+            [*OK, "pretrain.grwo:none"],
+            "nothing to choose at 'pretrain.grwo'; did you mean 'pretrain.grow'? choices are",
+        ),
+        ([*OK, "tune:stag"], "no tune named 'stag'; did you mean 'stage'? known: stage, none"),
+        ([*OK, "stray"], "unexpected 'stray'; settings are given as --NAME VALUE"),
+        ([*OK, "--pretrain.stepz", "3"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
+        ([*OK, "--pretrain.stepz=3", "--dat", "x"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
+        ([*OK, "--zzzzzz"], "no option --zzzzzz; see surfkit train --help"),
+        (
+            [*OK, "--pretrain.grow.cap", "3"],
+            "--pretrain.grow.cap does not apply here; it belongs to pretrain.grow:relocate, which is not chosen",
+        ),
+        ([*OK, "--pretrain.steps", "many"], "--pretrain.steps: expected a whole number, got 'many'"),
+        ([*OK, "--pretrain.losses.l1.weight", "x"], "--pretrain.losses.l1.weight: expected a number, got 'x'"),
+        ([*OK, "--pretrain.losses.depth.until", "x"], "--pretrain.losses.depth.until: expected {None}|INT, got 'x'"),
+        ([*OK, "--pretrain.steps"], "--pretrain.steps: a value must follow"),
+        ([*OK, "--device", "tpu"], "--device: expected one of 'auto', 'cpu', got 'tpu'"),
+        ([*OK, "--pretrain.losses.depth.start", "-1"], "pretrain.losses.depth: start is -1; it must be 0 or more"),
+        (["train", "recipe:no.json", "--data", "d"], "no.json: no such file"),
+        (["components", "gorw"], "no kind of component named 'gorw'; did you mean 'grow'? known: grow, loss"),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])  # of stdout: tyro draws other boxes
+def test_what_users_get_wrong_is_one_line(world, capsys, monkeypatch, encoding, words, line):
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"surfkit: {line}")
+    assert said.count("\n") == 1 and said.endswith("\n")
+
+
+def test_a_recipe_from_a_file(world, capsys, tmp_path):
+    path = tmp_path / "my_runs" / "A b" / "recipe.json"
+    write_json(path, world.Recipe("mine", pretrain=world.Stage(steps=77)))
+    assert main(["train", f"recipe:{path}", "--data", "d", "--pretrain.grow.every", "9"]) == 0
+    out = capsys.readouterr().out
+    assert "steps=77" in out and "every=9" in out
+    write_json(path, {"pretrain": {"stepz": 1}})
+    assert main(["train", f"recipe:{path}", "--data", "d"]) == 2
+    assert capsys.readouterr().err.startswith(f"surfkit: {path}: pretrain.stepz: unknown setting; Stage has steps")
+
+
+def test_lists(world, bare, capsys):
+    class Listener:
+        @hookimpl
+        def surfkit_event(self, event):
+            pass
+
+    class Broken:
+        @hookimpl
+        def surfkit_recipes(self):
+            raise RuntimeError("no network")
+
+    bare.plugins().register(Listener(), "logger")
+    bare.plugins().register(Broken(), "broken")
+    assert main(["recipes"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "recipe  what it is",
+        "discs   Flat discs.",
+        "balls   Round balls.",
+    ]
+    assert main(["components", "grow"]) == 0
+    assert [line.split() for line in capsys.readouterr().out.splitlines()[1:]] == [
+        ["grow", "adaptive", "Clone", "and", "split.", "stand-in"],
+        ["grow", "relocate", "Move", "dead", "points", "|", "to", "live", "ones.", "stand-in"],
+    ]
+    assert main(["plugins"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"^stand-in +l1, depth, adaptive, relocate, recipe:discs, recipe:balls$", out, re.M)
+    assert re.search(r"^logger +listens to events$", out, re.M)
+    assert re.search(r"^broken +not in use: surfkit_recipes: RuntimeError: no network$", out, re.M)
+
+
+def test_markdown(world, capsys):
+    assert main(["components", "--markdown"]) == 0
+    out = capsys.readouterr().out
+    assert "## grow\n\nHow points multiply.\n\n### `adaptive`\n\nClone and split.\n" in out
+    assert "| `every` | int | `100` | Steps between edits, at least one. |" in out
+    assert "## loss" in out
+
+
+def test_a_terminal_gets_colours(world, bare, monkeypatch):
+    screen = io.StringIO()
+    screen.isatty = lambda: True
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stdout", screen)
+    bare.plugins().register(types.SimpleNamespace(), "idle")
+    assert main(["recipes"]) == 0
+    assert "\x1b[" in screen.getvalue() and "Round balls." in screen.getvalue()
+
+
+def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
+    def bad():
+        raise BadInput("data:\n  no images")
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    command(monkeypatch, bad)
+    assert (main(["export"]), capsys.readouterr().err) == (2, "surfkit: data: no images\n")
+    command(monkeypatch, interrupted)
+    assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
+    command(monkeypatch, lambda: 3)
+    assert main(["export"]) == 3
+
+
+def test_our_own_mistakes_keep_their_traceback(monkeypatch):
+    def broken():
+        raise ValueError("a bug")
+
+    command(monkeypatch, broken)
+    with pytest.raises(ValueError, match="a bug"):
+        main(["export"])
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_closed_pipe_is_quiet(unbuffered):
+    code = "import sys; from surfkit.cli import main; sys.exit(main(['--help']))"
+    reader, writer = os.pipe()
+    os.close(reader)
+    environ = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, env=environ, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_help_loads_neither_torch_nor_tyro():
+    code = (
+        "import sys, surfkit; from surfkit.cli import main; main(['--help']); main(['--version']);"
+        "print([name for name in ('torch', 'numpy', 'tyro') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"

@@ -1,0 +1,172 @@
+"""A small world of components and recipes for the tests of core and cli: no built-in folder, no plugin, no torch."""
+
+import sys
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+
+from surfkit.cli.recipes import chosen_recipe
+from surfkit.core import registry
+from surfkit.core.registry import Component, choice, hookimpl
+from surfkit.core.schedule import Interval, StepCount, Steps
+
+
+class Loss(Component):
+    """What is minimised."""
+
+
+class Grow(Component):
+    """How points multiply."""
+
+
+class Empty(Component):
+    """A kind that nobody offers."""
+
+
+@dataclass(frozen=True)
+class L1(Loss):
+    """Mean absolute error."""
+
+    weight: float = 0.8
+    """Share of the total."""
+
+
+@dataclass(frozen=True)
+class Depth(Loss):
+    """Depth against a prior."""
+
+    start: Steps = 7_000
+    """First step that counts."""
+    until: Steps | None = None
+    """Last step that counts."""
+
+    def __post_init__(self):
+        if self.start < 0:
+            raise ValueError(f"start is {self.start}; it must be 0 or more")
+
+
+@dataclass(frozen=True)
+class Adaptive(Grow):
+    """Clone and split.
+
+    Not in the first paragraph.
+    """
+
+    every: Interval = 100
+    """Steps between edits,
+    at least one."""
+    reset: Annotated[int, StepCount(floor=25)] = 3_000
+    """Steps between resets."""
+    empty: tuple[Annotated[Empty, choice(Empty)], ...] = ()
+    """Conditions."""
+
+
+@dataclass(frozen=True)
+class Relocate(Grow):
+    """Move dead points | to live ones."""
+
+    cap: int = 1_000
+    """Most points."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One optimisation run."""
+
+    steps: Steps = 30_000
+    losses: dict[str, Annotated[Loss, choice(Loss)]] = field(default_factory=lambda: {"l1": L1(), "depth": Depth()})
+    grow: Annotated[Grow | None, choice(Grow, optional=True)] = Adaptive()
+    prune: tuple[Annotated[Grow, choice(Grow)], ...] = ()
+    marks: tuple[Steps, ...] = (7_000, 30_000)
+
+    def __post_init__(self):
+        if self.steps < 1:
+            raise ValueError(f"steps is {self.steps}; it must be 1 or more")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides a result."""
+
+    about: str = ""
+    mode: Literal["fast", "fine"] = "fine"
+    pretrain: Stage = Stage()
+    tune: Stage | None = None
+
+
+@dataclass(frozen=True)
+class Train:
+    """Reconstruct a surface."""
+
+    recipe: Annotated[Recipe, chosen_recipe]
+    data: Path
+    """Folder of photographs."""
+    device: Literal["auto", "cpu"] = "auto"
+    """Where to compute."""
+
+    def run(self):
+        print(self)
+
+
+class Plugin:
+    """The plugin that offers the stand-ins."""
+
+    @hookimpl
+    def surfkit_components(self):
+        return {"l1": L1, "depth": Depth, "adaptive": Adaptive, "relocate": Relocate}
+
+    @hookimpl
+    def surfkit_recipes(self):
+        return {"discs": Recipe("Flat\n  discs."), "balls": Recipe("Round balls.", pretrain=Stage(prune=(Relocate(),)))}
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """The registry with nothing in it; as it was again afterwards."""
+    monkeypatch.setattr(registry, "BUILTIN", ())
+    monkeypatch.setenv("SURFKIT_PLUGINS", "none")
+    registry.reload()
+    yield registry
+    registry.reload()
+
+
+@pytest.fixture
+def world(bare, monkeypatch):
+    """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and `surfkit.recipe`."""
+    bare.plugins().register(Plugin(), "stand-in")
+    for name, values in {"surfkit.cli.train": {"COMMAND": Train}, "surfkit.recipe": {"Recipe": Recipe}}.items():
+        module = types.ModuleType(name)
+        vars(module).update(values)
+        monkeypatch.setitem(sys.modules, name, module)
+    return types.SimpleNamespace(**globals())
+
+
+@pytest.fixture
+def crowd():
+    """200 random points and a step about them, at which policies with default settings act."""
+    import torch
+
+    from surfkit.densify.base import Step
+    from surfkit.primitives.points import Points
+    from surfkit.primitives.surfel2d import Surfel2D
+    from surfkit.scene.scene import Cloud
+
+    draw = torch.Generator().manual_seed(0)
+    count = 200
+    cloud = Cloud(torch.rand(count, 3, generator=draw), torch.zeros(count, 3, dtype=torch.uint8))
+    params = Surfel2D().init(cloud, draw)
+    contribution = torch.rand(count, generator=draw)
+    step = Step(
+        index=1_000,
+        steps=30_000,
+        seen=torch.rand(count, generator=draw) > 0.3,
+        shape=Surfel2D().shape(params, 3),
+        grad=4e-4 * torch.rand(count, generator=draw),
+        radii=50 * torch.rand(count, generator=draw),
+        image_px=800,
+        views=types.SimpleNamespace(contribution=lambda gamma: contribution**gamma),
+    )
+    return Points.fresh(params), step

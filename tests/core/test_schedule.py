@@ -1,0 +1,48 @@
+import math
+
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import log_linear, rescale
+
+
+def test_marked_counts_are_scaled_at_any_depth(world):
+    recipe = world.Recipe(
+        "x",
+        pretrain=world.Stage(losses={"d": world.Depth(start=7_000, until=9_000)}, prune=(world.Relocate(cap=500),)),
+        tune=world.Stage(grow=None),
+    )
+    small = rescale(recipe, 1 / 15)
+    assert small.pretrain.steps == 2_000
+    assert small.pretrain.losses == {"d": world.Depth(start=467, until=600)}
+    assert small.pretrain.grow == world.Adaptive(every=7, reset=200)
+    assert small.pretrain.marks == (467, 2_000)
+    assert small.pretrain.prune == recipe.pretrain.prune  # a count of points, not of steps
+    assert (small.tune.steps, small.tune.grow, small.about) == (2_000, None, "x")
+    assert recipe.pretrain.steps == 30_000
+    assert rescale(recipe, 1.0) == recipe
+
+
+def test_floors(world):
+    part = world.Adaptive(every=100, reset=3_000)
+    assert rescale(part, 1e-4) == world.Adaptive(every=1, reset=25)
+    assert rescale(world.Adaptive(every=0, reset=10), 0.5) == world.Adaptive(every=0, reset=10)  # never, and small
+    assert rescale(world.Depth(start=4, until=None), 0.1) == world.Depth(start=0, until=None)
+    assert rescale(world.Depth(start=4, until=3), 2.5) == world.Depth(start=10, until=8)
+
+
+def test_what_cannot_be_scaled(world):
+    for factor in (0, -1, math.nan, math.inf):
+        with pytest.raises(BadInput, match="factor above 0"):
+            rescale(world.Stage(), factor)
+    with pytest.raises(BadInput, match="scaling the steps by 1e-06: steps is 0"):
+        rescale(world.Stage(), 1e-6)
+
+
+def test_log_linear():
+    assert log_linear(1e-2, 1e-4, 0.0) == 1e-2
+    assert log_linear(1e-2, 1e-4, 1.0) == 1e-4
+    assert log_linear(1e-2, 1e-4, 0.5) == pytest.approx(1e-3)
+    assert log_linear(1e-2, 1e-4, 7.0) == 1e-4
+    with pytest.raises(BadInput, match="above 0"):
+        log_linear(1.0, 0.0, 0.5)

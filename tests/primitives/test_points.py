@@ -1,0 +1,62 @@
+import torch
+
+from surfkit.primitives.points import Edit, Points, merge
+
+
+def points(count: int = 6) -> Points:
+    params = {"means": torch.arange(3.0 * count).view(count, 3), "opacities": torch.arange(1.0 * count)}
+    made = Points.fresh(params)
+    for group, size in ((made.first, 10.0), (made.second, 100.0)):
+        for name, value in params.items():
+            group[name] = value + size
+    made.stat("a/count").copy_(torch.arange(1.0 * count))
+    return made
+
+
+def mask(*rows: int, count: int = 6) -> torch.Tensor:
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(rows, dtype=torch.int64), True)
+
+
+def test_take_moves_every_column_with_its_row():
+    taken = points().take(torch.tensor([4, 1]))
+    assert taken.params["opacities"].tolist() == [4, 1]
+    assert taken.first["opacities"].tolist() == [14, 11]
+    assert taken.second["means"][:, 0].tolist() == [112, 103]
+    assert taken.stat("a/count").tolist() == [4, 1]
+
+
+def test_new_rows_start_without_a_past():
+    grown = points().append({"means": torch.ones(2, 3), "opacities": torch.full((2,), 9.0)})
+    assert len(grown) == 8 and grown.params["opacities"][-2:].tolist() == [9, 9]
+    for group in (grown.first, grown.second):
+        assert group["means"].shape == (8, 3) and not group["means"][-2:].any() and group["means"][:6].any()
+    assert grown.stat("a/count").tolist() == [0, 1, 2, 3, 4, 5, 0, 0]
+
+
+def test_a_statistic_begins_at_zero_and_is_kept():
+    made = points()
+    made.stat("b/sum").add_(2)
+    assert made.stat("b/sum").tolist() == [2] * 6
+
+
+def test_to_moves_every_group():
+    moved = points().to("meta")
+    assert all(v.device.type == "meta" for group in vars(moved).values() for v in group.values())
+
+
+def test_merge_lets_drop_win_over_split_and_split_over_clone():
+    merged = merge([Edit(drop=mask(0, 1), max_opacity=0.5), None, Edit(clone=mask(1, 2, 3), split=mask(0, 3, 4))])
+    assert torch.equal(merged.drop, mask(0, 1))
+    assert torch.equal(merged.clone, mask(2))
+    assert torch.equal(merged.split, mask(3, 4))
+    assert merged.max_opacity == 0.5
+
+
+def test_merge_joins_masks_and_keeps_the_lowest_cap():
+    merged = merge([Edit(drop=mask(0), max_opacity=0.2), Edit(drop=mask(5), max_opacity=0.01)])
+    assert torch.equal(merged.drop, mask(0, 5)) and merged.max_opacity == 0.01
+    assert merged.clone is None and merged.split is None
+
+
+def test_merge_of_nothing_is_nothing():
+    assert merge([None, None]) is None and merge([]) is None

@@ -1,0 +1,55 @@
+"""Every component and recipe that is offered, built in or installed, is tested from the day it arrives."""
+
+import json
+
+import pytest
+
+import surfkit
+from surfkit.cli.recipes import about, recipes
+from surfkit.core.codec import dump, load
+from surfkit.core.registry import components, kind_of, offered
+from surfkit.core.schedule import rescale
+from surfkit.densify.base import Policy
+from surfkit.losses.base import Loss
+from surfkit.primitives.base import Primitive
+from surfkit.recipe import Recipe
+from surfkit.testing import check_component, check_loss, check_policy, check_primitive
+
+OFFERED = sorted({(kind_of(cls).__name__, name): cls for _, name, cls in offered("surfkit_components")}.items())
+
+
+@pytest.mark.parametrize("cls", [cls for _, cls in OFFERED], ids=[f"{kind}-{name}" for (kind, name), _ in OFFERED])
+def test_components(cls):
+    check_component(cls())
+
+
+@pytest.mark.parametrize("name", components(Policy))
+def test_policies(name, crowd):
+    check_policy(components(Policy)[name](), *crowd)
+
+
+@pytest.mark.parametrize("name", components(Loss))
+def test_losses(name):
+    check_loss(components(Loss)[name]())
+
+
+@pytest.mark.parametrize("name", components(Primitive))
+def test_primitives(name):
+    for degree in (0, 2):
+        check_primitive(components(Primitive)[name](sh_degree=degree), count=20)
+
+
+@pytest.mark.parametrize("name", recipes())
+def test_recipes(name):
+    recipe = recipes()[name]
+    assert about(recipe), "say what the recipe is in `about`"
+    assert load(Recipe, json.loads(json.dumps(dump(recipe), allow_nan=False))) == recipe
+    for factor in (1 / 15, 1 / 1_000, 2):
+        assert rescale(recipe, factor) != recipe
+
+
+def test_public_names():
+    for name in surfkit.__all__:
+        assert getattr(surfkit, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'Prunes'"):
+        surfkit.Prunes  # noqa: B018

@@ -1,0 +1,81 @@
+"""A folder imports only folders on lower floors, and no file grows too long."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import surfkit
+
+ROOT = Path(surfkit.__file__).parent
+FLOORS = (
+    "core",
+    "scene",
+    "raster",
+    "primitives losses",
+    "densify",
+    "train partition compress mesh evaluate",
+    "recipe",
+    "pipeline",
+    "report",
+    "recipes",
+    "cli viewer testing",
+)
+LEVEL = {name: level for level, floor in enumerate(FLOORS) for name in floor.split()}
+FILES = sorted(ROOT.rglob("*.py"))
+LONGEST = 400
+
+
+def imported(source: str, package: tuple[str, ...] = ("surfkit",)) -> Iterator[str]:
+    """Full names of everything a module imports, also inside functions; `package` is where it lies."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            yield from (".".join([*base, *filter(None, [node.module]), alias.name]) for alias in node.names)
+
+
+def upward(source: str, here: str) -> list[str]:
+    """Imports of a module in folder `here` that lie on no lower floor."""
+    names = [name.split(".")[1] for name in imported(source, ("surfkit", here)) if name.startswith("surfkit.")]
+    return [there for there in names if there != here and LEVEL.get(there, len(FLOORS)) >= LEVEL[here]]
+
+
+def test_nothing_imports_upwards():
+    wrong = []
+    for path in FILES:
+        here = path.relative_to(ROOT).with_suffix("").parts[0]
+        if here != "__init__":
+            wrong += [f"{path.relative_to(ROOT)} imports {there}" for there in upward(path.read_text(), here)]
+    assert not wrong
+
+
+def test_every_folder_has_a_floor():
+    tops = {path.relative_to(ROOT).with_suffix("").parts[0] for path in FILES} - {"__init__"}
+    assert tops <= LEVEL.keys()
+
+
+def test_core_and_the_command_table_are_light():
+    for path in [*(ROOT / "core").glob("*.py"), ROOT / "__init__.py", ROOT / "cli" / "__init__.py"]:
+        heavy = {name.split(".")[0] for name in imported(path.read_text())} & {"torch", "numpy", "PIL", "pycolmap"}
+        assert not heavy, f"{path.relative_to(ROOT)} imports {heavy}"
+
+
+def test_files_are_short():
+    lengths = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in FILES}
+    assert not {name: length for name, length in lengths.items() if length > LONGEST}
+
+
+def test_the_check_sees_every_way_to_import():
+    for source in (
+        "import surfkit.train.stage",
+        "from surfkit.train import stage",
+        "from surfkit import train",
+        "def f():\n    from surfkit.train.stage import Stage",
+        "from ..train import stage",
+    ):
+        assert upward(source, "densify") == ["train"], source
+    assert upward("from surfkit.mesh import x", "train") == ["mesh"]  # neighbours on one floor
+    assert upward("from surfkit.losses import x", "primitives") == ["losses"]
+    assert not upward("from surfkit.core import x\nfrom .adc import ADC\nimport torch", "densify")
+    assert upward("from surfkit import Prune", "densify") == ["Prune"]  # the public names may lie on any floor

@@ -1,0 +1,55 @@
+import io
+
+import torch
+from rich.console import Console
+
+from surfkit.raster.api import Maps
+from surfkit.train.progress import Display, Mean, clock, psnr
+from surfkit.train.stage import Done
+
+
+class Shown:
+    photo = torch.zeros(3, 4, 4)
+
+
+def done(index: int) -> Done:
+    return Done(index, {"l1": 0.25, "ssim": 0.25}, 12_345, Maps(color=torch.full((3, 4, 4), 0.1)), Shown())
+
+
+def test_psnr_of_a_known_error():
+    assert abs(psnr(torch.full((3, 4, 4), 0.1), torch.zeros(3, 4, 4)) - 20) < 1e-4
+    assert psnr(torch.full((3, 4, 4), 7.0), torch.ones(3, 4, 4)) == 100
+
+
+def test_clock():
+    assert [clock(s) for s in (0, 61, 3723)] == ["0:00", "1:01", "1:02:03"]
+
+
+def test_mean_forgets_slowly():
+    mean = Mean()
+    mean.add(4)
+    mean.add(2)
+    assert mean.value == 3
+    for _ in range(200):
+        mean.add(10)
+    assert abs(mean.value - 10) < 0.01
+
+
+def test_without_a_terminal_lines_are_plain_and_the_last_step_is_shown():
+    out = io.StringIO()
+    with Display("pretrain", 20, Console(file=out, width=40)) as display:
+        for index in range(1, 21):
+            display.show(done(index))
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 2 and "\x1b" not in out.getvalue()
+    assert lines[0].startswith("pretrain  step 1/20") and "PSNR" not in lines[0]
+    for part in ("step 20/20", "it/s", "0:00 left", "12,345 points", "loss 0.5000", "PSNR 20.00 dB"):
+        assert part in lines[1]
+
+
+def test_on_a_terminal_there_is_a_bar():
+    out = io.StringIO()
+    with Display("pretrain", 3, Console(file=out, width=160, force_terminal=True)) as display:
+        for index in range(1, 4):
+            display.show(done(index))
+    assert "━" in out.getvalue() and "step 3/3" in out.getvalue()

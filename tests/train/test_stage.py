@@ -1,0 +1,163 @@
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.densify import ADC, LossGradient
+from surfkit.densify.base import Prune
+from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.surface import NormalConsistency
+from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
+from surfkit.primitives.points import Edit
+from surfkit.train.adam import Rate
+from surfkit.train.progress import psnr
+from surfkit.train.stage import RATES, Stage
+
+QUIET = Stage(steps=40, densify=None, sh_every=10)
+
+
+def scored(trainer, state) -> float:
+    """Mean PSNR over all views."""
+    splats = trainer.primitive.shape(state.points.params, 0)
+    return sum(
+        psnr(trainer.rasterizer.render(splats, view.camera, 0.005, geometry=False).maps.color, photo.float() / 255)
+        for view, photo in zip(trainer.views, trainer.photos, strict=True)
+    ) / len(trainer.views)
+
+
+@pytest.mark.parametrize("primitive", [Surfel2D(1), Gaussian3D(1), Flat3D(1)], ids=lambda part: type(part).__name__)
+def test_training_raises_psnr(begin, primitive):
+    trainer, state = begin(QUIET, primitive)
+    before = scored(trainer, state)
+    steps = list(trainer.run(state))
+    assert [done.index for done in steps] == list(range(1, 41)) and state.index == 40
+    assert scored(trainer, state) > before + 3
+    assert state.seconds > 0 and state.cpu_seconds > 0
+
+
+def test_one_step_moves_parameters_against_a_numerical_gradient(begin):
+    stage = replace(
+        QUIET, losses={"l1": L1(weight=0.8), "ssim": SSIM(weight=0.2)}, rates={k: Rate(1e-3) for k in RATES}
+    )
+    trainer, state = begin(stage)
+    before = {name: value.clone() for name, value in state.points.params.items()}
+    done = trainer.step(state)
+    row = int(state.points.second["opacities"].argmax())  # the opacity that matters most
+
+    def loss(value: float) -> float:
+        params = {k: v.clone() for k, v in before.items()}
+        params["opacities"][row] = value
+        maps = trainer.rasterizer.render(trainer.primitive.shape(params, 0), done.sample.view.camera, 0.005).maps
+        return float(0.8 * L1()(maps, done.sample) + 0.2 * SSIM()(maps, done.sample))
+
+    at = float(before["opacities"][row])
+    slope = (loss(at + 0.05) - loss(at - 0.05)) / 0.1
+    assert float(state.points.first["opacities"][row]) == pytest.approx(0.1 * slope, rel=0.02)
+    assert float(state.points.params["opacities"][row]) == pytest.approx(at - 1e-3 * (1 if slope > 0 else -1), abs=1e-6)
+
+
+def test_harmonics_grow_by_a_degree_every_so_often(begin):
+    trainer, state = begin(replace(QUIET, steps=12, sh_every=5))
+    grown = {done.index: bool(state.points.params["sh_rest"].any()) for done in trainer.run(state)}
+    assert not grown[4] and grown[5]
+
+
+class Recording:
+    """A rasterizer that notes what it is asked for."""
+
+    def __init__(self, inner):
+        self.inner, self.geometry, self.backwards = inner, [], []
+
+    def render(self, splats, camera, near, geometry=True):
+        self.geometry.append(geometry)
+        render, outer = self.inner.render(splats, camera, near, geometry), self
+
+        class Noted:
+            maps, seen, radii = render.maps, render.seen, render.radii
+
+            def backward(self, total, chosen=None):
+                outer.backwards.append((total, chosen))
+                return render.backward(total, chosen)
+
+        return Noted()
+
+
+def recorded(begin, stage, steps=None):
+    trainer, state = begin(stage)
+    notes = Recording(trainer.rasterizer)
+    for _ in replace(trainer, rasterizer=notes).run(state):
+        pass
+    return notes
+
+
+def test_geometry_is_made_only_while_a_loss_reads_it(begin):
+    losses = {"l1": L1(), "normal": NormalConsistency(weight=0.05, start=3)}
+    active = [losses["normal"].weight_at(i, 5) > 0 for i in range(1, 6)]
+    assert recorded(begin, replace(QUIET, steps=5, losses=losses)).geometry == active and len(set(active)) == 2
+    assert recorded(begin, replace(QUIET, steps=3)).geometry == [False] * 3
+
+
+def test_one_backward_a_step_and_no_second_cotangent_unless_losses_are_chosen(begin):
+    plain = recorded(begin, replace(QUIET, steps=3))
+    assert [chosen for _, chosen in plain.backwards] == [None] * 3
+    split = recorded(begin, replace(QUIET, steps=3, signal=LossGradient(terms=("ssim",))))
+    only = recorded(begin, replace(QUIET, steps=3, losses={"ssim": SSIM()}))
+    assert len(split.backwards) == 3
+    (total, chosen), (alone, _), (whole, _) = split.backwards[0], only.backwards[0], plain.backwards[0]
+    assert torch.allclose(chosen.color, alone.color, atol=1e-9) and chosen.color.any()
+    assert torch.allclose(total.color, whole.color, atol=1e-9) and not torch.allclose(total.color, chosen.color)
+
+
+def test_chosen_losses_that_are_not_yet_active_give_no_signal(begin):
+    losses = {"l1": L1(), "normal": NormalConsistency(weight=0.05, start=100)}
+    stage = replace(QUIET, steps=2, losses=losses, signal=LossGradient(terms=("normal",)), densify=ADC())
+    trainer, state = begin(stage)
+    list(trainer.run(state))
+    assert not state.points.stat("adc/grad").any() and state.points.stat("adc/seen").any()
+
+
+def test_densification_adds_points_with_the_rest_in_step(begin):
+    stage = Stage(steps=30, densify=ADC(start=5, until=25, every=5, threshold=1e-6, reset_every=10))
+    trainer, state = begin(stage)
+    counts = [done.points for done in trainer.run(state)]
+    assert counts[9] > counts[8] == 40 and counts[-1] > counts[9]
+    for group in vars(state.points).values():
+        assert {len(value) for value in group.values()} == {counts[-1]}
+
+
+@dataclass(frozen=True)
+class DropAll(Prune):
+    """Drops every point at step 2."""
+
+    def edit(self, points, step):
+        return Edit(drop=torch.ones(len(points), dtype=torch.bool)) if step.index == 2 else None
+
+
+def test_a_run_without_points_stops(begin):
+    trainer, state = begin(replace(QUIET, prune=(DropAll(),)))
+    with pytest.raises(RuntimeError, match="step 2 dropped the last point"):
+        list(trainer.run(state))
+
+
+@dataclass(frozen=True)
+class Broken(L1):
+    """Not a number."""
+
+    def __call__(self, maps, sample):
+        return maps.color.sum() * float("nan")
+
+
+def test_a_loss_that_is_not_finite_names_step_and_view(begin):
+    trainer, state = begin(replace(QUIET, losses={"l1": Broken()}))
+    with pytest.raises(RuntimeError, match=r"step 1, view \d.png: the losses are"):
+        list(trainer.run(state))
+
+
+def test_stages_that_make_no_sense_are_refused(begin):
+    with pytest.raises(BadInput, match="names normal; the losses are l1, ssim"):
+        Stage(signal=LossGradient(terms=("normal",)))
+    with pytest.raises(BadInput, match="0 steps"):
+        Stage(steps=0)
+    with pytest.raises(BadInput, match="the points have means"):
+        begin(Stage(rates={"means": Rate(1.0)}))
