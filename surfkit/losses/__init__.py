@@ -1,0 +1,10 @@
+"""Terms of the objective, by the name users type."""
+
+from surfkit.core.registry import hookimpl
+from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.surface import Distortion, NormalConsistency
+
+
+@hookimpl
+def surfkit_components():
+    return {"l1": L1, "ssim": SSIM, "normal": NormalConsistency, "distortion": Distortion}

@@ -13,6 +13,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.primitives.points import Columns, Edit, Points
 from surfkit.raster.api import Splats
+from surfkit.scene.ply import SplatTable
 from surfkit.scene.scene import Cloud
 
 SHRINK = 1.6
@@ -94,6 +95,21 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
     if added:
         points = points.append({name: torch.cat([rows[name] for rows in added]) for name in points.params})
     return points if edit.max_opacity is None else _dimmed(points, edit.max_opacity)
+
+
+def to_table(primitive: Primitive, params: Columns) -> SplatTable:
+    """The points as files hold them, local frame."""
+    splats = primitive.shape({name: value.detach() for name, value in params.items()}, 0)
+    return SplatTable(
+        kind=splats.kind,
+        means=splats.means,
+        quats=splats.quats,
+        log_scales=splats.scales.log(),
+        opacity_logits=params["opacities"].detach(),
+        sh0=params["sh0"].detach()[:, 0],
+        sh_rest=params["sh_rest"].detach(),
+        antialias=splats.antialias,
+    )
 
 
 def _dimmed(points: Points, most: float) -> Points:

@@ -23,6 +23,7 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 """Where a model may lie, the first that is there wins."""
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+ENDS = (".bin", ".txt")
 PARTS = {"cameras": 40, "images": 73, "points3D": 51}
 """The files of a model, and the fewest bytes that an entry of the binary one takes."""
 
@@ -76,21 +77,22 @@ def _model_folder(root: Path) -> Path:
     if not any(root.iterdir()):
         raise BadInput(f"{root}: the folder is empty; {_wanted()}")
     for place in MODELS:
-        if any(all((root / place / f"{part}{end}").is_file() for part in PARTS) for end in (".bin", ".txt")):
+        if any(not _lacking(root / place, end) for end in ENDS):
             return root / place
     for place in MODELS:
-        for part in PARTS:
-            if any((root / place / f"{part}{end}").is_file() for end in (".bin", ".txt")):
-                lacks = [
-                    p for p in PARTS if not any((root / place / f"{p}{end}").is_file() for end in (".bin", ".txt"))
-                ]
-                raise BadInput(f"{root / place}: the COLMAP model lacks {', '.join(lacks) or 'files of one format'}")
+        lacking = min((_lacking(root / place, end) for end in ENDS), key=len)
+        if len(lacking) < len(PARTS):
+            raise BadInput(f"{root / place}: the COLMAP model lacks {', '.join(lacking)}; copy it whole")
     raise BadInput(f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}")
+
+
+def _lacking(folder: Path, end: str) -> list[str]:
+    return [f"{part}{end}" for part in PARTS if not (folder / f"{part}{end}").is_file()]
 
 
 def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
     """Shots in name order, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
-    binary = all((folder / f"{part}.bin").is_file() for part in PARTS)
+    binary = not _lacking(folder, ".bin")
     for part, least in PARTS.items() if binary else ():  # of text files, pycolmap sees by itself that they are cut off
         _refuse_truncated(folder / f"{part}.bin", least)
     try:

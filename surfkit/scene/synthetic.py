@@ -98,6 +98,8 @@ class Box(Surface):
 
 
 SURFACES: tuple[Surface, ...] = (Ground(), Box(), Sphere())
+COLORS = np.array([[0.42, 0.52, 0.38], [0.66, 0.42, 0.34], [0.36, 0.48, 0.68]])
+"""Mean colour of each surface."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def photograph(flight: Flight | None = None) -> Synthetic:
     lens = _lens(flight)
     names = [f"view_{i:03d}.png" for i in range(flight.views)]
     held_out = set(names[:: flight.test_every]) if flight.test_every else set()
-    xyz, rgb = _sparse(poses, lens, waves, flight.points, draw)
+    xyz, rgb = _sparse(flight, poses, waves, draw)
     frame = Frame.around(np.stack([p for n, p in zip(names, poses, strict=True) if n not in held_out]), xyz)
     views, exact = [], {}
     for name, pose in zip(names, poses, strict=True):
@@ -178,6 +180,8 @@ def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False) -> No
 
     scene, model = synthetic.scene, folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
+    for old in model.glob("*.bin"):  # they would win over the text files
+        old.unlink()
     views = sorted([*scene.train, *scene.held_out], key=lambda view: view.name)
     shots = []
     for i, view in enumerate(views, 1):
@@ -211,11 +215,9 @@ def _lens(flight: Flight) -> dict[str, float]:
     return {"fx": 0.9 * w, "fy": 0.91 * w, "cx": 0.53 * w, "cy": 0.48 * h}
 
 
-def _waves(draw: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The texture of each surface: mean (3,), two wave vectors a channel (2, 3, 3) in 1/m, phases (2, 3)."""
-    return [
-        (draw.uniform(0.35, 0.65, 3), draw.normal(0, 1.1, (2, 3, 3)), draw.uniform(0, 6.28, (2, 3))) for _ in SURFACES
-    ]
+def _waves(draw: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The texture of each surface: wave vectors (4, 3), 1/m, and phases (4,); one of brightness, one a channel."""
+    return [(draw.normal(0, 0.8, (4, 3)), draw.uniform(0, 2 * np.pi, 4)) for _ in SURFACES]
 
 
 def _cast(origins: np.ndarray, directions: np.ndarray, waves: list) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -223,11 +225,12 @@ def _cast(origins: np.ndarray, directions: np.ndarray, waves: list) -> tuple[np.
     hits = [surface.hit(origins, directions) for surface in SURFACES]
     first = np.argmin([t for t, _ in hits], axis=0)
     depth, normal, color = np.full(len(first), np.inf), np.zeros_like(directions), np.zeros_like(directions)
-    for i, ((t, normals), (mean, vectors, phases)) in enumerate(zip(hits, waves, strict=True)):
+    for i, ((t, normals), (vectors, phases)) in enumerate(zip(hits, waves, strict=True)):
         here = (first == i) & np.isfinite(t)
         where = origins[here] + t[here, None] * directions[here]
         depth[here], normal[here] = t[here], normals[here]
-        color[here] = mean + 0.17 * np.sin(np.einsum("kcx,px->pkc", vectors, where) + phases).sum(1)
+        wave = np.sin(where @ vectors.T + phases)
+        color[here] = COLORS[i] + 0.17 * wave[:, :1] + 0.11 * wave[:, 1:]
     return depth, normal, color
 
 
@@ -244,16 +247,17 @@ def _exact(camera: Camera, pose: np.ndarray, waves: list, scale: float) -> Exact
 
 
 def _sparse(
-    poses: list[np.ndarray], lens: dict[str, float], waves: list, count: int, draw: np.random.Generator
+    flight: Flight, poses: list[np.ndarray], waves: list, draw: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(count, 3) points on the visible surface, where random rays of random views end; (count, 3) uint8 colours."""
-    picked = np.stack(poses)[draw.integers(len(poses), size=2 * count)]
-    x, y = draw.uniform(-0.45, 0.45, (2, 2 * count)) * [[lens["cx"] * 2], [lens["cy"] * 2]]
-    rays = np.stack([x / lens["fx"], y / lens["fy"], np.ones_like(x)], 1)
-    rays = np.einsum("rij,ri->rj", picked[:, :3, :3], rays)
+    """(P, 3) points on the visible surface, where random rays of random views end; (P, 3) uint8 colours."""
+    lens, count = _lens(flight), 2 * flight.points
+    picked = np.stack(poses)[draw.integers(len(poses), size=count)]
+    x = (draw.uniform(0, flight.width, count) - lens["cx"]) / lens["fx"]
+    y = (draw.uniform(0, flight.height, count) - lens["cy"]) / lens["fy"]
+    rays = np.einsum("rij,ri->rj", picked[:, :3, :3], np.stack([x, y, np.ones_like(x)], 1))
     origins = -np.einsum("rij,ri->rj", picked[:, :3, :3], picked[:, :3, 3])
     depth, _, color = _cast(origins, rays, waves)
-    found = np.flatnonzero(np.isfinite(depth))[:count]
+    found = np.flatnonzero(np.isfinite(depth))[: flight.points]
     return origins[found] + depth[found, None] * rays[found], (color[found] * 255).round().astype(np.uint8)
 
 

@@ -16,7 +16,7 @@ from surfkit.train.views import Order
 
 FORMAT = "surfkit-stage-1"
 GROUPS = ("params", "first", "second", "stats")
-FACTS = {"index", "views", "shown", "seconds", "cpu_seconds"}
+FACTS = {"index", "views", "shown", "seconds", "cpu_seconds", "peak_memory_bytes"}
 
 
 def save(path: Path, state: StageState) -> None:
@@ -35,6 +35,7 @@ def save(path: Path, state: StageState) -> None:
         "shown": state.order.at,
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
+        "peak_memory_bytes": state.peak_memory_bytes,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
@@ -57,7 +58,8 @@ def load(path: Path) -> StageState:
     generator = torch.Generator()
     generator.set_state(tensors["generator"])
     order = Order(facts["views"], tensors["order"], facts["shown"])
-    return StageState(points, order, generator, facts["index"], facts["seconds"], facts["cpu_seconds"])
+    done = ("index", "seconds", "cpu_seconds", "peak_memory_bytes")
+    return StageState(points, order, generator, *(facts[name] for name in done))
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict]:

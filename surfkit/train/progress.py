@@ -76,7 +76,7 @@ class Display:
             f"loss {self.loss.value:.4f}",
         ]
         parts += [f"PSNR {self.psnr.value:.2f} dB"] * (self.psnr.count > 0)
-        parts += [f"{memory / 2**30:.1f} GiB" for memory in [peak_memory_bytes()] if memory is not None]
+        parts += [f"{memory / 2**30:.1f} GiB" for memory in [peak_memory_bytes()] if memory]
         return "  ".join(parts)
 
 
@@ -105,12 +105,12 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def peak_memory_bytes() -> int | None:
-    """The most memory this process has held so far; None where the system does not tell (Windows)."""
+def peak_memory_bytes() -> int:
+    """The most memory this process has held so far; 0 where the system does not tell (Windows)."""
     try:
         import resource
     except ImportError:
-        return None
+        return 0
     import sys
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

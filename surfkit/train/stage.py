@@ -91,6 +91,8 @@ class StageState:
     """Wall time of the steps done."""
     cpu_seconds: float = 0.0
     """Processor time of the steps done, all threads."""
+    peak_memory_bytes: int = 0
+    """Most memory held so far; 0 where the system does not tell."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def looking_down(x: float, y: float) -> Camera:
 @pytest.fixture(scope="session")
 def tiny() -> Tiny:
     """See `Tiny`."""
-    from surfkit.raster.reference import Reference
+    from surfkit.raster.select import select
 
     torch.set_num_threads(2)
     draw = torch.Generator().manual_seed(3)
@@ -45,7 +45,7 @@ def tiny() -> Tiny:
         "surfel", means, torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.full((count, 2), 0.08),
         torch.full((count,), 0.9), ((colors - 0.5) / 0.28209479)[:, None],
     )  # fmt: skip
-    rasterizer = Reference()
+    rasterizer, _ = select("cpu")
     cameras = [looking_down(x, y) for x in (-0.2, 0.0, 0.2) for y in (-0.1, 0.1)]
     views = tuple(View(f"{i}.png", camera, Path(f"{i}.png")) for i, camera in enumerate(cameras))
     images = [rasterizer.render(truth, camera, 0.005, geometry=False).maps.color for camera in cameras]

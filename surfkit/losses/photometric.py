@@ -1,0 +1,39 @@
+"""How far a rendered colour is from the photograph (3DGS, eq. 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surfkit.losses.base import Loss, Sample
+from surfkit.raster.api import Maps
+from surfkit.raster.ssim import ssim
+
+
+@dataclass(frozen=True)
+class L1(Loss):
+    """Mean absolute colour error."""
+
+    weight: float = 0.8
+    """Share in the objective."""
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return self.weight
+
+    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+        return (maps.color - sample.photo).abs().mean()
+
+
+@dataclass(frozen=True)
+class SSIM(Loss):
+    """One minus the structural similarity with the photograph (11 x 11 window, sigma 1.5)."""
+
+    weight: float = 0.2
+    """Share in the objective."""
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return self.weight
+
+    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+        return 1 - ssim(maps.color, sample.photo)

@@ -1,0 +1,57 @@
+"""Structural similarity (Wang et al. 2004) as splatting uses it: 11 x 11 Gaussian window, sigma 1.5, zero padding."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from surfkit.raster import native
+
+C1, C2 = 0.01**2, 0.03**2
+RADIUS, SIGMA = 5, 1.5
+
+
+def ssim(x: Tensor, y: Tensor) -> Tensor:
+    """Mean structural similarity of two images, differentiable in `x`.
+
+    Args:
+        x: (C, H, W) in [0, 1].
+        y: (C, H, W) in [0, 1]; a constant.
+    """
+    if native.module() is not None and x.device.type == "cpu" and x.dtype == torch.float32:
+        return _Fused.apply(x, y)
+    return ssim_reference(x, y)
+
+
+def ssim_reference(x: Tensor, y: Tensor) -> Tensor:
+    """The same in plain torch, in any precision."""
+    offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=x.dtype, device=x.device)
+    window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
+    window = window / window.sum()
+
+    def blur(image: Tensor) -> Tensor:
+        rows = conv2d(image[:, None], window.view(1, 1, 1, -1), padding=(0, RADIUS))
+        return conv2d(rows, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0]
+
+    mean_x, mean_y = blur(x), blur(y)
+    squares = mean_x**2 + mean_y**2
+    spread = blur(x * x + y * y) - squares
+    together = blur(x * y) - mean_x * mean_y
+    return ((2 * mean_x * mean_y + C1) * (2 * together + C2) / ((squares + C1) * (spread + C2))).mean()
+
+
+class _Fused(torch.autograd.Function):
+    """Value and gradient in one native pass."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+        x, y = x.detach().contiguous(), y.detach().to(torch.float32).contiguous()
+        gradient = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        value = native.module().ssim(x, y, gradient, torch.get_num_threads())
+        ctx.gradient = gradient
+        return x.new_tensor(value)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        return upstream * ctx.gradient, None
