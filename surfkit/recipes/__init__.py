@@ -23,7 +23,7 @@ SURFELS = Recipe(
         losses={
             "l1": L1(),
             "ssim": SSIM(),
-            "normal": NormalConsistency(weight=0.05, start=7_000),
+            "normal": NormalConsistency(weight=0.05, start=7_000, depth="expected"),
             "distortion": Distortion(weight=0.0, start=3_000),
         },
         densify=ADC(cull_opacity=0.05),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -93,8 +94,8 @@ def _lacking(folder: Path, end: str) -> list[str]:
 def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
     """Shots in name order, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
     binary = not _lacking(folder, ".bin")
-    for part, least in PARTS.items() if binary else ():  # of text files, pycolmap sees by itself that they are cut off
-        _refuse_truncated(folder / f"{part}.bin", least)
+    if binary:  # of text files, pycolmap sees by itself that they are cut off
+        _refuse_cut_off(folder)
     try:
         model = library().Reconstruction(str(folder))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
@@ -102,9 +103,9 @@ def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
             raise BadInput(f"{folder}: a camera model that COLMAP does not know; {_undistort()}") from error
         reason = " ".join(str(error).split())
         raise BadInput(f"{folder}: the COLMAP model is damaged: {reason}; write it again or copy it whole") from error
-    if binary:
-        total = sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
-        _refuse_truncated(folder / "cameras.bin", PARTS["cameras"], total)
+    cameras = sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if binary and (folder / "cameras.bin").stat().st_size < 8 + cameras:
+        raise _cut_off(folder / "cameras.bin")
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
     if not points:
@@ -119,13 +120,48 @@ def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
     return shots, xyz[finite], rgb[finite]
 
 
-def _refuse_truncated(path: Path, least: int, total: int = 0) -> None:
-    """BadInput where a binary file is too short for the entries it announces: pycolmap would read beyond its end."""
-    with path.open("rb") as file:
-        head = file.read(8)
-    count = struct.unpack("<Q", head)[0] if len(head) == 8 else 1
-    if path.stat().st_size < 8 + max(count * least, total):
-        raise BadInput(f"{path}: the file is cut off or no COLMAP file; copy it whole")
+def _refuse_cut_off(folder: Path) -> None:
+    """BadInput where a binary file ends before its entries do: pycolmap would read beyond the end, or for ever."""
+    for part, least in PARTS.items():
+        path = folder / f"{part}.bin"
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            count = struct.unpack("<Q", file.read(8))[0] if size >= 8 else 1
+            whole = size >= 8 + count * least
+            if whole and count and part in ENTRIES:
+                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
+                    whole = ENTRIES[part](raw, count) <= size
+        if not whole:
+            raise _cut_off(path)
+
+
+def _end_of_images(raw: mmap.mmap, count: int) -> int:
+    """Where the entries end: 64 bytes, a name, and a number of observations of 24 bytes."""
+    at = 8
+    for _ in range(count):
+        end = raw.find(b"\0", at + 64)
+        if end < 0 or end + 9 > len(raw):
+            return len(raw) + 1
+        at = end + 9 + 24 * struct.unpack_from("<Q", raw, end + 1)[0]
+    return at
+
+
+def _end_of_points(raw: mmap.mmap, count: int) -> int:
+    """Where the entries end: 43 bytes, and a number of observations of 8 bytes."""
+    length, last, at = struct.Struct("<Q").unpack_from, len(raw) - 51, 8
+    for _ in range(count):
+        if at > last:
+            return len(raw) + 1
+        at += 51 + 8 * length(raw, at + 43)[0]
+    return at
+
+
+ENTRIES = {"images": _end_of_images, "points3D": _end_of_points}
+"""Of the files whose entries differ in length; those of cameras are known when they are read."""
+
+
+def _cut_off(path: Path) -> BadInput:
+    return BadInput(f"{path}: the file is cut off or no COLMAP file; copy it whole")
 
 
 def _shots(folder: Path, model: Any) -> list[Shot]:

@@ -135,12 +135,11 @@ def read_splats(path: Path) -> SplatTable:
     names = rows.dtype.names or ()
     lacking = [name for name in NEEDED if name not in names]
     if lacking:
-        raise BadInput(
-            f"{path}: no file of splats: it lacks the property {lacking[0]}; its properties: {_short(names)}"
-        )
+        raise BadInput(f"{path}: no file of splats: it lacks {lacking[0]}; its properties: {_short(names)}")
     rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in (0, 9, 24, 45):
-        raise BadInput(f"{path}: {rest} properties f_rest; degrees 0 to 3 have 0, 9, 24 or 45")
+    ordered = [f"f_rest_{i}" for i in range(rest)]
+    if rest not in (0, 9, 24, 45) or not set(ordered) <= set(names):
+        raise BadInput(f"{path}: {rest} properties f_rest; degrees 0 to 3 have 0, 9, 24 or 45, counted from f_rest_0")
     tags = {key.strip().lower(): value.strip().lower() for key, _, value in (c.partition(":") for c in comments)}
     mode = tags.get("splatrendermode", "")
     surfel = mode == "2dgs" or "scale_2" not in names
@@ -148,7 +147,7 @@ def read_splats(path: Path) -> SplatTable:
     def gathered(*wanted: str) -> Tensor:
         return torch.from_numpy(np.stack([rows[name].astype(np.float32) for name in wanted], axis=1))
 
-    coefficients = gathered(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(len(rows), 0)
+    coefficients = gathered(*ordered) if rest else torch.zeros(len(rows), 0)
     return SplatTable(
         kind="surfel" if surfel else "gaussian",
         means=torch.from_numpy(np.stack([rows[axis].astype(rows["x"].dtype.newbyteorder("=")) for axis in "xyz"], 1)),
@@ -222,7 +221,7 @@ def _header_lines(path: Path, file: BinaryIO) -> list[str]:
 def _vertex(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
     """How many vertices there are, and the layout of one."""
     words = [line.split() for line in lines if line.startswith(("element ", "property "))]
-    if not words or words[0][:2] != ["element", "vertex"] or not words[0][-1].isdigit() or len(words[0]) != 3:
+    if not words or words[0][:2] != ["element", "vertex"] or not words[0][-1].isdecimal() or len(words[0]) != 3:
         first = " ".join(words[0]) if words else "nothing"
         raise BadInput(f"{path}: the first element must be 'element vertex N'; the header has {first!r}")
     ends = [i for i, word in enumerate(words[1:], 1) if word[0] == "element"]

@@ -11,6 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
 from surfkit.primitives.points import Columns, Points
+from surfkit.raster import native
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
@@ -42,8 +43,16 @@ def adam_step(points: Points, grads: Columns, rates: Mapping[str, float], index:
 
 
 def update(value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, index: int) -> None:
-    """Take one step of Adam on a tensor and its moments, in place. The seam for a native kernel."""
+    """Take one step of Adam on a tensor and its moments, in place."""
+    rate, correction = rate / (1 - BETA1**index), (1 - BETA2**index) ** -0.5
+    tensors = (value, grad, first, second)
+    if native.module() is not None and all(_plain(t) for t in tensors):
+        native.module().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
+        return
     first.lerp_(grad, 1 - BETA1)
     second.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
-    root = second.sqrt().mul_((1 - BETA2**index) ** -0.5).add_(EPSILON)
-    value.addcdiv_(first, root, value=-rate / (1 - BETA1**index))
+    value.addcdiv_(first, second.sqrt().mul_(correction).add_(EPSILON), value=-rate)
+
+
+def _plain(tensor: Tensor) -> bool:
+    return tensor.device.type == "cpu" and tensor.dtype == torch.float32 and tensor.is_contiguous()

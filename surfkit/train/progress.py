@@ -24,14 +24,14 @@ MEMORY = 0.95
 class Display:
     """Step, speed, time left, points, loss, PSNR and memory: a live bar on a terminal, else a line every few seconds.
 
-    Loss and PSNR are running means over the training views just shown.
+    Loss, PSNR and speed are running means; the PSNR is that of training views.
     """
 
     def __init__(self, stage: str, steps: int, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self.stage, self.steps = stage, steps
-        self.loss, self.psnr = Mean(), Mean()
-        self.began, self.first, self.drawn = time.perf_counter(), 0, 0.0
+        self.loss, self.psnr, self.pace = Mean(), Mean(), Mean()
+        self.last, self.drawn = time.perf_counter(), 0.0
         self.bar: Progress | None = None
         self.task: TaskID | None = None
 
@@ -49,29 +49,29 @@ class Display:
 
     def show(self, done: Done) -> None:
         """Take in one step; draw when it is time."""
-        self.first = self.first or done.index
         self.loss.add(sum(done.losses.values()))
         last = done.index == self.steps
         if done.index % PSNR_EVERY == 0 or last:
             self.psnr.add(psnr(done.maps.color, done.sample.photo))
         now = time.perf_counter()
+        self.pace.add(now - self.last)
+        self.last = now
         if now - self.drawn < (DRAW_EVERY_S if self.bar else PLAIN_EVERY_S) and not last:
             return
         self.drawn = now
-        line = self.line(done, now)
+        line = self.line(done)
         if self.bar is None:
             self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True)
         else:
             self.bar.update(self.task, completed=done.index, line=line)
             self.bar.refresh()
 
-    def line(self, done: Done, now: float) -> str:
+    def line(self, done: Done) -> str:
         """The numbers of a step, in words."""
-        speed = (done.index - self.first + 1) / max(now - self.began, 1e-9)
         parts = [
             f"step {done.index}/{self.steps}",
-            f"{speed:.1f} it/s",
-            f"{clock((self.steps - done.index) / speed)} left",
+            f"{1 / max(self.pace.value, 1e-9):.1f} it/s",
+            f"{clock((self.steps - done.index) * self.pace.value)} left",
             f"{done.points:,} points",
             f"loss {self.loss.value:.4f}",
         ]

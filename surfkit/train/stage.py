@@ -14,7 +14,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import PointsEdited, StepDone, emit
 from surfkit.core.registry import choice
-from surfkit.core.schedule import Steps
+from surfkit.core.schedule import Interval, Steps
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
@@ -60,7 +60,7 @@ class Stage:
     rates: dict[str, Rate] = field(default_factory=lambda: dict(RATES))
     """Learning rates of the parameters; of positions as a share of the scene extent."""
 
-    sh_every: Steps = 1_000
+    sh_every: Interval = 1_000
     """Steps between degrees of the spherical harmonics, from 0 up to the primitive's."""
 
     near: float = 0.005
@@ -69,6 +69,8 @@ class Stage:
     def __post_init__(self) -> None:
         if self.steps < 1:
             raise BadInput(f"a stage has {self.steps} steps; give 1 or more")
+        if self.sh_every < 1:
+            raise BadInput(f"sh_every is {self.sh_every}; it must be 1 or more steps")
         if unknown := set(self.signal.terms or ()) - set(self.losses):
             raise BadInput(f"signal.terms names {', '.join(sorted(unknown))}; the losses are {', '.join(self.losses)}")
 
@@ -242,4 +244,4 @@ def pulled(shape: Splats, gradients: Gradients, leaves: Columns) -> Columns:
     raw = torch.autograd.grad(
         [splats[name] for name in names], list(leaves.values()), [grads[name] for name in names], allow_unused=True
     )
-    return {name: grad for name, grad in zip(leaves, raw, strict=True) if grad is not None}
+    return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}

@@ -662,11 +662,11 @@ void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, c
 
 // ----------------------------------------------------------------------------------------------------------------- Adam
 
-void adam(int64_t count, float* value, const float* gradient, float* first, float* second, float rate, float beta1,
-          float beta2, float second_correction, float epsilon) {
+void adam(int64_t count, float* value, const float* gradient, float* first, float* second, float rate, float share1,
+          float share2, float second_correction, float epsilon) {
     auto update = [&](Floats g, Floats& m, Floats& v, Floats& p) {
-        m = madd(g - m, 1.0f - beta1, m);
-        v = madd(madd(g, g, -v), broadcast(1.0f - beta2), v);
+        m = madd(g - m, share1, m);
+        v = madd(madd(g, g, -v), broadcast(share2), v);
         p = p - rate * m / (root(v) * second_correction + epsilon);
     };
     int64_t i = 0;

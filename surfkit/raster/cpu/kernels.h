@@ -76,7 +76,7 @@ struct Kernels {
     void (*ssim_gradient_rows)(const float* x, const float* y, const float* d_mean, const float* d_square,
                                const float* d_cross, int width, int height, int y0, int y1, float scale, float* out);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
-                 float beta1, float beta2, float second_correction, float epsilon);
+                 float share1, float share2, float second_correction, float epsilon);
 };
 
 const Kernels& kernels_avx512();

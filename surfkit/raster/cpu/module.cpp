@@ -132,7 +132,7 @@ NB_MODULE(_native, m) {
         nb::gil_scoped_release free;
         parallel((n + piece - 1) / piece, threads, [&](int64_t i) {
             const int64_t at = i * piece;
-            kernels().adam(std::min(piece, n - at), p + at, g + at, m1 + at, m2 + at, (float)rate, (float)beta1, (float)beta2, (float)second_correction, (float)epsilon);
+            kernels().adam(std::min(piece, n - at), p + at, g + at, m1 + at, m2 + at, (float)rate, (float)(1 - beta1), (float)(1 - beta2), (float)second_correction, (float)epsilon);
         });
     });
 }

@@ -1,0 +1,61 @@
+"""Image metrics on images whose answer is known."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from surfkit.evaluate.images import evaluate_views, frames_per_second, psnr
+from surfkit.raster.api import Maps
+from surfkit.scene.synthetic import Flight, photograph
+
+SYNTHETIC = photograph(Flight(views=5, width=32, height=24, points=20))
+VIEWS = (*SYNTHETIC.scene.train, *SYNTHETIC.scene.held_out)
+PHOTOS = [(SYNTHETIC.exact[view.name].color * 255).round().to(torch.uint8) for view in VIEWS]
+
+
+def drawn(view):
+    return Maps(color=SYNTHETIC.exact[view.name].color.float() + 0.1)
+
+
+def test_psnr_of_a_known_error():
+    photo = torch.full((3, 4, 5), 0.5)
+    assert psnr(photo + 0.1, photo) == pytest.approx(20, abs=1e-4)
+    assert psnr(photo + 7, photo) == pytest.approx(-20 * math.log10(0.5), abs=1e-4)  # clamped to 1
+    assert psnr(photo, photo) == pytest.approx(100)
+
+
+def test_every_view_and_the_means():
+    shown = []
+    result = evaluate_views(VIEWS, PHOTOS, drawn, show=lambda view, photo, maps: shown.append((view.name, photo.dtype)))
+    images = result["images"]
+    assert list(images["per_image"]) == [view.name for view in VIEWS] == [name for name, _ in shown]
+    for view, photo in zip(VIEWS, PHOTOS, strict=True):
+        expected = psnr(drawn(view).color, photo / 255)
+        assert images["per_image"][view.name]["psnr"] == pytest.approx(expected, abs=1e-4)
+        assert 0.2 < images["per_image"][view.name]["ssim"] < 1
+    assert images["psnr"] == pytest.approx(sum(v["psnr"] for v in images["per_image"].values()) / 5)
+    assert 19 < images["psnr"] < 21 and result["fps"] > 0
+    json.dumps(result, allow_nan=False)
+
+
+def test_the_right_photograph_scores_highest():
+    aligned = evaluate_views(VIEWS, PHOTOS, drawn)["images"]
+    shifted = evaluate_views(VIEWS, PHOTOS[1:] + PHOTOS[:1], drawn)["images"]
+    assert aligned["psnr"] > shifted["psnr"] + 1 and aligned["ssim"] > shifted["ssim"] + 0.1
+
+
+def test_perfect_renders():
+    exact = evaluate_views(VIEWS, PHOTOS, lambda view: Maps(color=PHOTOS[VIEWS.index(view)] / 255))["images"]
+    assert exact["psnr"] == pytest.approx(100) and exact["ssim"] == pytest.approx(1, abs=1e-5)
+
+
+def test_without_views_there_are_no_numbers():
+    assert evaluate_views([], [], drawn) == {"images": {"psnr": None, "ssim": None, "per_image": {}}, "fps": None}
+
+
+def test_speed_counts_after_the_warmup():
+    calls = []
+    assert frames_per_second(VIEWS, lambda view: calls.append(view.name) or drawn(view), warmup=2, most=3) > 0
+    assert len(calls) == 2 + 3 and len(set(calls[2:])) == 3

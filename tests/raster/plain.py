@@ -1,0 +1,176 @@
+"""Splats drawn pixel by pixel in plain Python, written from the papers and not from `surfkit.raster.reference`.
+
+A ray meets a disc as a line meets a plane in space (no homography); an ellipsoid's depth comes from the inverse of its
+covariance; distortion is a double loop over pairs; spherical harmonics come from Legendre functions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, T_MIN, Splats
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One splat in the camera's frame; `shape(x, y)` gives rho and depth at a pixel position."""
+
+    index: int
+    opacity: float
+    color: np.ndarray
+    normal: np.ndarray
+    z: float
+    shape: Callable[[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Maps by name, and (row, column, splat, alpha, transmittance before) of everything blended."""
+
+    maps: dict[str, np.ndarray]
+    blended: list[tuple[int, int, int, float, float]]
+
+
+def harmonics(direction: np.ndarray, degree: int) -> np.ndarray:
+    """((degree + 1)^2,) real spherical harmonics with the Condon-Shortley phase."""
+    from scipy.special import lpmv
+
+    x, y, z = direction
+    azimuth, values = math.atan2(y, x), []
+    for n in range(degree + 1):
+        for m in range(-n, n + 1):
+            k = abs(m)
+            size = math.sqrt((2 * n + 1) / (4 * math.pi) * math.factorial(n - k) / math.factorial(n + k))
+            turn = math.sin(k * azimuth) if m < 0 else math.cos(k * azimuth)
+            values.append(size * (math.sqrt(2) if m else 1) * turn * float(lpmv(k, n, z)))
+    return np.array(values)
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    """(3, 3) from wxyz of any length, by Rodrigues' formula."""
+    w, *axis = quat / np.linalg.norm(quat)
+    x, y, z = axis
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * across + 2 * across @ across
+
+
+def clamp(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
+    """The splats that are drawn, front to back."""
+    means, quats, scales, opacities, sh = (t.detach().double().numpy() for t in splats.tensors().values())
+    pose = camera.world_to_camera.numpy()
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    found = []
+    for i in range(len(means)):
+        centre = pose[:3, :3] @ means[i] + pose[:3, 3]
+        if not (centre[2] > near and opacities[i] > ALPHA_MIN):
+            continue
+        axes = pose[:3, :3] @ rotation(quats[i])
+        away = means[i] - eye
+        degree = math.isqrt(sh.shape[1]) - 1
+        color = np.maximum(harmonics(away / np.linalg.norm(away), degree) @ sh[i] + 0.5, 0)
+        if splats.kind == "surfel":
+            made = surfel(centre, axes, scales[i], camera, near)
+            opacity, normal = opacities[i], axes[:, 2]
+        else:
+            fade, made = gaussian(centre, axes, scales[i], camera, near, splats.antialias)
+            opacity, normal = opacities[i] * fade, axes[:, np.argmin(scales[i])]
+        if made is not None:
+            normal = -normal if normal @ centre > 0 else normal
+            found.append(Seen(i, opacity, color, normal, centre[2], made))
+    return sorted(found, key=lambda s: s.z)
+
+
+def surfel(centre, axes, scales, camera: Camera, near: float):
+    """Shape of a disc, or None if it crosses the camera plane."""
+    a, b = axes[:, 0] * scales[0], axes[:, 1] * scales[1]
+    reach = CUTOFF * math.hypot(a[2], b[2])
+    if reach >= centre[2]:
+        return None
+    lens = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    disc = lens @ np.stack([a, b, centre], 1)
+    dual = disc @ np.diag([9.0, 9.0, -1.0]) @ disc.T  # the dual conic of the 3 sigma contour's image
+    mid_x, mid_y = (dual[:2, 2] / dual[2, 2]).tolist()
+    nx, ny, nz = np.cross(axes[:, 0], axes[:, 1]).tolist()
+    level = nx * centre[0] + ny * centre[1] + nz * centre[2]
+    (ax, ay, az), (bx, by, bz) = (axes[:, 0] / scales[0]).tolist(), (axes[:, 1] / scales[1]).tolist()
+    cx, cy, cz = centre.tolist()
+    low, high = max(cz - reach, near), cz + reach
+
+    def shape(x: float, y: float) -> tuple[float, float]:
+        dx, dy = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+        rho_low = 2 * ((x - mid_x) ** 2 + (y - mid_y) ** 2)
+        steep = nx * dx + ny * dy + nz
+        if steep == 0:  # the ray lies in the plane or never meets it
+            return rho_low, low
+        z = level / steep
+        px, py, pz = z * dx - cx, z * dy - cy, z - cz
+        rho = (px * ax + py * ay + pz * az) ** 2 + (px * bx + py * by + pz * bz) ** 2
+        return min(rho, rho_low), clamp(z, low, high)
+
+    return shape
+
+
+def gaussian(centre, axes, scales, camera: Camera, near: float, antialias: bool):
+    """Factor on the opacity and shape of an ellipsoid (EWA)."""
+    z = centre[2]
+    edge_x, edge_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    tx = z * clamp(centre[0] / z, -camera.cx / camera.fx - edge_x, (camera.width - camera.cx) / camera.fx + edge_x)
+    ty = z * clamp(centre[1] / z, -camera.cy / camera.fy - edge_y, (camera.height - camera.cy) / camera.fy + edge_y)
+    jacobian = np.array([[camera.fx / z, 0, -camera.fx * tx / z**2], [0, camera.fy / z, -camera.fy * ty / z**2]])
+    covariance = axes @ np.diag(scales**2) @ axes.T
+    raw = jacobian @ covariance @ jacobian.T
+    (xx, xy), (_, yy) = footprint = raw + 0.3 * np.eye(2)
+    det = xx * yy - xy * xy
+    fade = math.sqrt(max(2.5e-5, np.linalg.det(raw) / np.linalg.det(footprint))) if antialias else 1.0
+    mid_x, mid_y = camera.fx * centre[0] / z + camera.cx, camera.fy * centre[1] / z + camera.cy
+    pull = np.linalg.inv(covariance) @ (centre / z)
+    slope_x, slope_y = (-z * pull[:2] / (pull @ centre / z) / [camera.fx, camera.fy]).tolist()
+    reach = CUTOFF * scales.max()
+    low, high = max(z - reach, near), z + reach
+
+    def shape(x: float, y: float) -> tuple[float, float]:
+        dx, dy = x - mid_x, y - mid_y
+        rho = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det
+        return rho, clamp(z + slope_x * dx + slope_y * dy, low, high)
+
+    return fade, shape
+
+
+def evaluate(splats: Splats, camera: Camera, near: float) -> Plain:
+    """Every splat at every pixel."""
+    size = (camera.height, camera.width)
+    maps = {name: np.zeros(size) for name in ("alpha", "depth", "median", "distortion")}
+    maps |= {name: np.zeros((3, *size)) for name in ("color", "normal")}
+    ordered, blended = see(splats, camera, near), []
+    for i, j in np.ndindex(*size):
+        open_, pairs = 1.0, []
+        for s in ordered:
+            rho, z = s.shape(j + 0.5, i + 0.5)
+            alpha = min(ALPHA_MAX, s.opacity * math.exp(-rho / 2))
+            if alpha < ALPHA_MIN:
+                continue
+            if open_ * (1 - alpha) < T_MIN:
+                break
+            weight = alpha * open_
+            maps["color"][:, i, j] += weight * s.color
+            maps["normal"][:, i, j] += weight * s.normal
+            maps["alpha"][i, j] += weight
+            maps["depth"][i, j] += weight * z
+            if open_ > 0.5:
+                maps["median"][i, j] = z
+            maps["distortion"][i, j] += sum(weight * w * (1 / z - 1 / before) ** 2 for w, before in pairs)
+            pairs.append((weight, z))
+            blended.append((i, j, s.index, alpha, open_))
+            open_ *= 1 - alpha
+        if open_ > 0.5:
+            maps["median"][i, j] = 0
+    return Plain(maps, blended)

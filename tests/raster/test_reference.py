@@ -1,0 +1,256 @@
+"""The reference rasterizer against plain loops, finite differences, quadrature and identities."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from plain import evaluate, harmonics
+from scenes import CASES, KINDS, NEAR, Draw, axis_camera, camera, crop, double, leaves, make, plain, rows, splats
+
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
+
+MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
+each_case = pytest.mark.parametrize(("name", "kind"), CASES)
+
+
+@cache
+def small(name: str, kind: str):
+    """Some 60 splats of a scene in float64, through a window of 24 x 20 pixels about the camera's axis."""
+    drawn, view = make(name, kind)
+    return rows(double(drawn), slice(0, 60)), crop(view, 24, 20, 16, 14)
+
+
+@cache
+def looped(name: str, kind: str):
+    return evaluate(*small(name, kind), NEAR)
+
+
+@each_case
+def test_maps_equal_a_plain_loop(name, kind):
+    drawn = draw(*small(name, kind), NEAR)
+    assert drawn.near_threshold.double().mean() < 0.03
+    expected = looped(name, kind).maps
+    assert len(looped(name, kind).blended) > 20
+    for key, value in drawn.maps.present().items():
+        error = (value - torch.from_numpy(expected[key])).abs() * ~drawn.near_threshold
+        # Where the ray nearly lies in the disc's plane, a rounding of 1e-16 moves the hit by 1e-16 / 1e-7 sigmas or more.
+        assert error.max() < (1e-7 if (name, kind) == ("edge_on", "surfel") else 1e-10), key
+
+
+@each_case
+@pytest.mark.parametrize("powers", [(0.5, 0.5), (1.0, 1.0), (0.8, 0.3)])
+def test_contribution_equals_a_sum_over_what_is_blended(name, kind, powers):
+    shown, view = small(name, kind)
+    if draw(shown, view, NEAR).near_threshold.any() and name == "edge_on":
+        pytest.skip("a pixel sits on a threshold")
+    total, count = np.zeros(len(shown)), np.zeros(len(shown), dtype=int)
+    for _, _, index, alpha, open_ in looped(name, kind).blended:
+        total[index] += alpha ** powers[0] * open_ ** powers[1]
+        count[index] += 1
+    made, hits = Reference().contribution(shown, view, NEAR, *powers)
+    assert hits.tolist() == count.tolist()
+    assert np.abs(made.numpy() - total).max() < 1e-7
+
+
+@each_case
+def test_culling_does_not_change_a_pixel(name, kind):
+    shown, view = make(name, kind)
+    shown = rows(double(shown), slice(0, 40))
+    culled, whole = draw(shown, view, NEAR), draw(shown, view, NEAR, cull=False)
+    for key, value in culled.maps.present().items():
+        assert (value - getattr(whole.maps, key)).abs().max() < 1e-12, key
+    assert torch.equal(culled.seen, whole.seen)
+    assert not (culled.seen & ~culled.footprints.drawn).any()
+
+
+@each_case
+def test_everything_is_finite(name, kind):
+    shown, view = small(name, kind)
+    render = Reference().render(shown, view, NEAR)
+    draws = Draw(0)
+    gradients = render.backward(Maps(**{key: draws.normal(*value.shape) for key, value in render.maps.present().items()}))
+    values = {**render.maps.present(), **gradients.tensors(), "signal": gradients.signal, "radii": render.radii}
+    for key, value in values.items():
+        assert torch.isfinite(value).all(), key
+    assert gradients.means.abs().sum() > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_splat_at_the_centre_of_the_camera_gives_finite_gradients(kind):
+    shown, view = make("plain", kind, degree=3)
+    shown = rows(double(shown), slice(0, 8))
+    view = replace(axis_camera(24, 20), world_to_camera=torch.eye(4, dtype=torch.float64))
+    shown.means[:4] = torch.tensor([0.1, 0.1, 1.5]).double()
+    shown.means[4:] = 0
+    gradients = Reference().render(shown, view, NEAR).backward(Maps(color=torch.ones(3, 20, 24).double()))
+    assert all(torch.isfinite(value).all() for value in gradients.tensors().values())
+    assert gradients.means[:4].abs().sum() > 0
+    assert not gradients.means[4:].any()
+
+
+def test_spherical_harmonics_equal_legendre_functions():
+    directions = torch.nn.functional.normalize(Draw(1).normal(50, 3), dim=1)
+    expected = np.stack([harmonics(direction, 3) for direction in directions.numpy()])
+    for count in (1, 4, 9, 16):
+        assert np.abs(sh_basis(directions, count).numpy() - expected[:, :count]).max() < 1e-12
+
+
+def test_spherical_harmonics_are_orthonormal():
+    heights, weights = np.polynomial.legendre.leggauss(8)
+    around = 2 * np.pi * np.arange(16) / 16
+    z, azimuth = (torch.from_numpy(a.ravel()) for a in np.meshgrid(heights, around, indexing="ij"))
+    level = (1 - z * z).sqrt()
+    basis = sh_basis(torch.stack([level * azimuth.cos(), level * azimuth.sin(), z], 1), 16)
+    area = torch.from_numpy(np.repeat(weights, 16) * 2 * np.pi / 16)
+    assert torch.allclose(basis.T @ (area[:, None] * basis), torch.eye(16).double(), atol=1e-12)
+
+
+def few(kind: str, degree: int, antialias: bool = False):
+    """Three large splats over 4 x 3 pixels, far from every threshold, the median inside."""
+    draws = Draw(5)
+    view = replace(crop(camera(draws), 4, 3), cx=1.7, cy=1.9, fx=6.0, fy=7.0)
+    made = double(splats(
+        draws, view, kind, degree,
+        centres=torch.tensor([[0.05, -0.04, 1.0], [-0.1, 0.06, 1.3], [0.1, 0.02, 1.7]]).double(),
+        scales=draws.uniform(0.3, 0.5, 3, 2 if kind == "surfel" else 3),
+        opacities=torch.tensor([0.35, 0.6, 0.7]).double(),
+    ))  # fmt: skip
+    return Splats(kind, *made.tensors().values(), antialias=antialias), view
+
+
+@pytest.mark.parametrize(("kind", "antialias"), [("surfel", False), ("gaussian", False), ("gaussian", True)])
+def test_gradcheck_of_every_map_for_every_parameter(kind, antialias):
+    shown, view = few(kind, 1, antialias)
+    drawn = draw(shown, view, NEAR)
+    assert not drawn.near_threshold.any()
+    assert all(value.abs().max() > 1e-3 for value in drawn.maps.present().values())
+    assert drawn.seen.all()
+
+    def maps(*tensors):
+        return tuple(draw(Splats(kind, *tensors, antialias), view, NEAR).maps.present().values())
+
+    assert torch.autograd.gradcheck(maps, tuple(leaves(shown).tensors().values()), atol=1e-7, rtol=1e-5)
+
+
+def test_gradcheck_of_the_colour_of_degree_3():
+    shown, view = few("surfel", 3)
+
+    def seen(means, sh):
+        return colors(Splats("surfel", means, shown.quats, shown.scales, shown.opacities, sh), view)
+
+    tensors = leaves(shown).tensors()
+    assert torch.autograd.gradcheck(seen, (tensors["means"], tensors["sh"]))
+
+
+def test_gradients_of_the_low_pass_filter():
+    """Discs smaller than a pixel: the filter's centre carries the gradient, and the depth is that of the disc's plane."""
+    shown, view = few("surfel", 0)
+    shown.scales.mul_(0.05)
+    view = replace(view, fx=24.0, fy=28.0)
+    assert draw(shown, view, NEAR).maps.alpha.max() > 0.1
+
+    def maps(*tensors):
+        made = draw(Splats("surfel", *tensors), view, NEAR).maps
+        return made.color, made.alpha, made.depth
+
+    assert torch.autograd.gradcheck(maps, tuple(leaves(shown).tensors().values()), atol=1e-6, rtol=1e-4)
+
+
+def test_depth_of_a_gaussian_is_where_its_density_on_the_ray_is_largest():
+    """To first order about the centre: half the offset leaves a quarter of the error."""
+    from scipy.optimize import minimize_scalar
+
+    shown, view = make("plain", "gaussian")
+    shown = rows(double(shown), slice(0, 6))
+    prints = gaussians(shown, view, NEAR)
+    pose = view.world_to_camera
+    for i in range(len(shown)):
+        lone = gaussians(rows(shown, slice(i, i + 1)), view, NEAR)
+        axes = (pose[:3, :3] @ turned(shown.quats[i])).numpy()
+        centre = (pose[:3, :3] @ shown.means[i] + pose[:3, 3]).numpy()
+        precision = axes @ np.diag(shown.scales[i].numpy() ** -2) @ axes.T
+        errors = []
+        for step in (0.0, 0.02, 0.01):
+            x, y = (prints.screen[i] + step * torch.tensor([0.8, -0.6]).double()).tolist()
+            ray = np.array([(x - view.cx) / view.fx, (y - view.cy) / view.fy, 1.0])
+
+            def distance(z, ray=ray, centre=centre, precision=precision):
+                return (z * ray - centre) @ precision @ (z * ray - centre)
+
+            bounds = (0.5 * centre[2], 1.5 * centre[2])
+            true = minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-12}).x
+            depth = lone.at(torch.tensor([0]), torch.tensor([x]).double(), torch.tensor([y]).double())[1].item()
+            errors.append(abs(depth - true))
+        assert errors[0] < 1e-7
+        assert errors[2] < 0.3 * errors[1] + 1e-7 and errors[1] < 2e-3
+
+
+def turned(quat):
+    from plain import rotation
+
+    return torch.from_numpy(rotation(quat.numpy()))
+
+
+def weighted(maps: Maps, by: dict) -> torch.Tensor:
+    return sum((by[key] * value).sum() for key, value in maps.present().items())
+
+
+def cotangents(view, seed: int = 7) -> dict:
+    draws, size = Draw(seed), (view.height, view.width)
+    return {key: draws.normal(*((3, *size) if key in ("color", "normal") else size)) for key in MAPS}
+
+
+def test_the_signal_of_gaussians_is_the_slope_of_a_shift_on_the_screen():
+    """Moving the principal point moves every splat on the screen and changes nothing else; one splat is drawn at a time."""
+    shown, view = few("gaussian", 2)
+    by = cotangents(view)
+    for which in (slice(0, 1), slice(1, 2), slice(2, 3), slice(0, 3)):
+        some = rows(shown, which)
+        gradients = Reference().render(some, view, NEAR).backward(Maps(**by), Maps(color=by["color"]))
+        for axis, name, size in ((0, "cx", view.width), (1, "cy", view.height)):
+            h = 1e-5
+            moved = [draw(some, replace(view, **{name: getattr(view, name) + s}), NEAR).maps for s in (h, -h)]
+            slope = (weighted(moved[0], by) - weighted(moved[1], by)) / (2 * h) * size / 2
+            assert gradients.signal[:, axis].sum().item() == pytest.approx(slope.item(), rel=1e-6, abs=1e-7)
+            slope = ((moved[0].color - moved[1].color) * by["color"]).sum() / (2 * h) * size / 2
+            assert gradients.chosen[:, axis].sum().item() == pytest.approx(slope.item(), rel=1e-6, abs=1e-7)
+
+
+def test_the_signal_of_surfels_is_the_slope_of_a_sideways_move():
+    """A move of the mean along the image plane by h changes T_u.z (or T_v.z) by f h and, at degree 0, nothing else."""
+    shown, view = few("surfel", 0)
+    by = cotangents(view)
+    pose = view.world_to_camera
+    gradients = Reference().render(shown, view, NEAR).backward(Maps(**by))
+    for i in range(len(shown)):
+        z = (pose[:3, :3] @ shown.means[i] + pose[:3, 3])[2]
+        for axis, focal, size in ((0, view.fx, view.width), (1, view.fy, view.height)):
+            values = []
+            for h in (1e-5, -1e-5):
+                means = shown.means.clone()
+                means[i] += h * pose[axis, :3]
+                values.append(weighted(draw(replace(shown, means=means), view, NEAR).maps, by))
+            slope = (values[0] - values[1]) / 2e-5 / focal * z * size / 2
+            assert gradients.signal[i, axis].item() == pytest.approx(slope.item(), rel=1e-6, abs=1e-7)
+
+
+def test_colour_and_alpha_do_not_need_geometry():
+    shown, view = plain("surfel", 0, 1)
+    whole, bare = (Reference().render(shown, view, NEAR, geometry=g).maps for g in (True, False))
+    assert set(whole.present()) == set(MAPS) and set(bare.present()) == {"color", "alpha"}
+    assert torch.equal(whole.color, bare.color) and torch.equal(whole.alpha, bare.alpha)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_splats_and_splats_behind_the_camera_give_black(kind):
+    shown, view = make("plain", kind)
+    behind = shown.means - 5 * view.world_to_camera[2, :3].float()
+    for some in (rows(shown, slice(0, 0)), replace(shown, means=behind)):
+        render = Reference().render(some, view, NEAR)
+        assert not any(value.any() for value in render.maps.present().values())
+        assert not render.seen.any() and not render.radii.any()
+        gradients = render.backward(Maps(color=torch.ones(3, 47, 61)))
+        assert gradients.means.shape == some.means.shape and not gradients.means.any()

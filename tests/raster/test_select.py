@@ -1,0 +1,28 @@
+"""The device decides which rasterizer draws."""
+
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.raster import native
+from surfkit.raster.reference import Reference
+from surfkit.raster.select import select
+
+
+def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkeypatch):
+    monkeypatch.setattr(native, "module", lambda: None)
+    with pytest.warns(UserWarning, match="without its compiled rasterizer") as warned:
+        rasterizer, name = select()
+    assert isinstance(rasterizer, Reference) and name.startswith("cpu reference")
+    assert len(warned) == 1
+
+
+@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+def test_the_compiled_module_is_preferred():
+    rasterizer, name = select("cpu")
+    assert isinstance(rasterizer, native.NativeRasterizer)
+    assert name == f"cpu {native.module().kernels_in_use()}"
+
+
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(BadInput, match="--device cuda"):
+        select("cuda")

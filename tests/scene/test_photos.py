@@ -1,0 +1,103 @@
+"""Photographs of every kind become RGB of the right size, and damaged ones are named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from surfkit.core.check import BadInput
+from surfkit.scene.camera import Camera
+from surfkit.scene.photos import Photos, photo_size, read_photo
+from surfkit.scene.scene import View
+
+
+def stripes(width=8, height=6):
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+
+
+def view(path, width=8, height=6):
+    return View(path.name, Camera(torch.eye(4, dtype=torch.float64), 9, 9, 4, 3, width, height), path)
+
+
+def save(path, pixels, mode=None, **options):
+    image = Image.fromarray(pixels)
+    (image.convert(mode) if mode else image).save(path, **options)
+    return path
+
+
+def test_pixels_are_those_of_the_file(tmp_path):
+    pixels = stripes()
+    got = read_photo(save(tmp_path / "a.png", pixels), (8, 6))
+    assert got.dtype == torch.uint8 and got.is_contiguous()
+    np.testing.assert_array_equal(got.permute(1, 2, 0).numpy(), pixels)
+
+
+def test_reduction_averages_and_does_not_alias(tmp_path):
+    fine = np.zeros((120, 160, 3), np.uint8)
+    fine[:, ::2] = 200  # one pixel stripes, which a plain pick would keep
+    got = read_photo(save(tmp_path / "a.png", fine), (20, 15)).float()
+    assert got.shape == (3, 15, 20)
+    assert (got - 100).abs().max() <= 3
+
+
+def test_reduction_keeps_the_place_of_things(tmp_path):
+    ramp = np.broadcast_to(np.arange(240, dtype=np.uint8)[None, :, None], (60, 240, 3)).copy()
+    got = read_photo(save(tmp_path / "a.png", ramp), (80, 20)).float()
+    centres = (torch.arange(80) + 0.5) * 3 - 0.5
+    assert (got[:, :, 2:-2] - centres[2:-2]).abs().max() <= 1
+
+
+@pytest.mark.parametrize("mode", ["L", "1", "P", "CMYK", "LA"])
+def test_other_modes_become_rgb(tmp_path, mode):
+    grey = np.full((6, 8, 3), 255, np.uint8)
+    grey[:, :4] = 0
+    path = save(tmp_path / ("a.tif" if mode == "CMYK" else "a.png"), grey, mode)
+    np.testing.assert_array_equal(read_photo(path, (8, 6)).permute(1, 2, 0).numpy(), grey)
+
+
+def test_sixteen_bits_are_scaled_and_not_clipped(tmp_path):
+    values = np.array([[0, 200, 32896, 65535]], np.uint16)
+    assert read_photo(save(tmp_path / "a.png", values), (4, 1))[1].tolist() == [[0, 1, 128, 255]]
+
+
+def test_alpha_lies_over_black(tmp_path):
+    pixels = np.full((2, 2, 4), 200, np.uint8)
+    pixels[0, :, 3] = [0, 255]
+    pixels[1, :, 3] = 128
+    got = read_photo(save(tmp_path / "a.png", pixels), (2, 2))[0].tolist()
+    assert got == [[0, 200], [100, 100]]
+
+
+def test_the_rotation_in_exif_is_not_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    path = save(tmp_path / "a.jpg", stripes(), exif=exif)
+    assert photo_size(path) == (8, 6)
+    assert read_photo(path, (8, 6)).shape == (3, 6, 8)
+
+
+def test_by_position_in_the_size_of_the_camera(tmp_path):
+    paths = [save(tmp_path / f"{i}.png", np.full((6, 8, 3), i * 10, np.uint8)) for i in range(5)]
+    photos = Photos([view(path, 4, 3) for path in paths], threads=2)
+    assert len(photos) == 5
+    for i in (3, 0, 4, 3, -1):
+        assert photos[i].shape == (3, 3, 4) and (photos[i] == i % 5 * 10).all()
+    assert photos[2] is photos[2]
+
+
+def test_a_damaged_photograph_is_named(tmp_path):
+    whole = save(tmp_path / "whole.jpg", stripes(64, 48))
+    cut = tmp_path / "cut.jpg"
+    cut.write_bytes(whole.read_bytes()[:700])
+    photos = Photos([view(whole, 64, 48), view(cut, 64, 48)])
+    assert photos[0].shape == (3, 48, 64)
+    with pytest.raises(BadInput, match="cut.jpg: not a whole picture: .*truncated") as error:
+        photos[1]
+    assert "\n" not in str(error.value)
+    (tmp_path / "page.jpg").write_text("<html>")
+    with pytest.raises(BadInput, match="page.jpg: not a whole picture"):
+        photo_size(tmp_path / "page.jpg")
+    with pytest.raises(BadInput, match="no such photograph"):
+        photo_size(Path(tmp_path / "none.jpg"))

@@ -1,0 +1,199 @@
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from surfkit import pipeline
+from surfkit.cli.recipes import recipes
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.tree import evolve
+from surfkit.pipeline import load_run, run, with_steps
+from surfkit.scene import colmap
+from surfkit.scene.data import Data
+from surfkit.scene.ply import read_splats
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Data:
+    torch.set_num_threads(2)
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(width=64, height=48, points=300)))
+    return Data(folder)
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    small = evolve(with_steps(recipes()["2dgs"], STEPS), "primitive.sh_degree", 1)
+    return evolve(evolve(small, "pretrain.densify.every", 5), "pretrain.densify.start", 10)
+
+
+@pytest.fixture(scope="module")
+def finished(data, recipe, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    return out, run(recipe, data, out)
+
+
+def test_a_run_leaves_everything_behind(finished, data, recipe):
+    out, metrics = finished
+    assert json.loads((out / "metrics.json").read_text()) == metrics
+    assert metrics["images"]["psnr"] > 13 and 0 < metrics["images"]["ssim"] < 1
+    assert set(metrics["images"]["per_image"]) == {"view_000.png", "view_008.png"}
+    for name in ("points", "seconds", "cpu_seconds", "peak_memory_bytes", "fps"):
+        assert metrics[name] > 0, name
+    record = json.loads((out / "run.json").read_text())
+    assert record["versions"]["torch"] == torch.__version__ and record["device"].startswith("cpu")
+    assert record["data"]["path"] == str(data.path) and record["seed"] == 0 and record["notes"] == []
+    assert sorted(p.name for p in (out / "pictures").iterdir()) == ["view_000.png.png", "view_008.png.png"]
+    with Image.open(out / "pictures" / "view_000.png.png") as picture:
+        assert picture.size == (4 * 64, 48)
+    assert not list(out.rglob(".*")), "nothing half-written stays"
+
+
+def test_points_are_in_the_frame_of_the_input(finished, data):
+    out, metrics = finished
+    table, scene = read_splats(out / "point_cloud.ply"), colmap.read(data)
+    assert table.kind == "surfel" and len(table) == metrics["points"] > 300
+    truth = scene.frame.to_input(scene.cloud.xyz.numpy())
+    for share in (10, 50, 90):
+        there, wanted = (np.percentile(xyz[:, :2], share, axis=0) for xyz in (table.means.numpy(), truth))
+        assert np.allclose(there, wanted, atol=2.5), "metres; the scene is 20 m wide"
+    assert np.ptp(np.percentile(truth, [10, 90], axis=0)[:, 0]) > 8
+
+
+def test_the_seed_decides_the_draws(data, recipe, tmp_path):
+    for name, seed in {"a": 0, "b": 0, "c": 1}.items():
+        run(with_steps(replace(recipe, seed=seed), 1), data, tmp_path / name)
+    a, b, c = ((tmp_path / name / "point_cloud.ply").read_bytes() for name in "abc")
+    assert a == b != c
+
+
+def test_training_beats_the_sparse_points(finished, data, recipe, tmp_path):
+    start = run(with_steps(recipe, 1), data, tmp_path)
+    assert finished[1]["images"]["psnr"] > start["images"]["psnr"] + 4
+
+
+def test_a_finished_run_says_so_and_makes_only_what_is_missing(finished, data, recipe, monkeypatch, capsys):
+    out, metrics = finished
+    monkeypatch.setattr(pipeline, "optimise", None)  # training again would fail
+    assert run(replace(recipe, about="in other words"), data, out) == metrics
+    assert "is finished" in capsys.readouterr().err
+    cloud = (out / "point_cloud.ply").read_bytes()
+    (out / "point_cloud.ply").unlink()
+    (out / "metrics.json").unlink()
+    again = run(recipe, data, out)
+    assert again["images"] == metrics["images"] and again["seconds"] == metrics["seconds"]
+    assert (out / "point_cloud.ply").read_bytes() == cloud
+
+
+def test_results_of_a_model_that_is_gone_are_made_anew(finished, data, recipe, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    (tmp_path / "run" / "pretrain" / "checkpoint.safetensors").unlink()
+    (tmp_path / "run" / "point_cloud.ply").write_text("old")
+    run(recipe, data, tmp_path / "run")
+    assert (tmp_path / "run" / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("pretrain.losses.l1.weight", 0.7, "pretrain.losses.l1.weight 0.8, and this one has 0.7"),
+        ("pretrain.densify", None, 'pretrain.densify {"use": "adc"'),
+        ("seed", 3, "seed 0, and this one has 3"),
+    ],
+)
+def test_another_recipe_is_refused(finished, data, recipe, path, value, message):
+    with pytest.raises(BadInput) as error:
+        run(evolve(recipe, path, value), data, finished[0])
+    assert message in str(error.value) and "name another folder" in str(error.value)
+
+
+def test_other_data_is_refused(finished, data, recipe):
+    with pytest.raises(BadInput, match="data.test_every 8, and this one has 4"):
+        run(recipe, replace(data, test_every=4), finished[0])
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(data, recipe, tmp_path):
+    (tmp_path / "run").write_text("")
+    with pytest.raises(BadInput, match="a file, not a folder"):
+        run(recipe, data, tmp_path / "run")
+
+
+@pytest.mark.parametrize(("number", "at"), [(signal.SIGINT, 1), (signal.SIGTERM, 15), (signal.SIGINT, 59)])
+def test_an_interrupted_run_goes_on_to_the_same_points(
+    finished, data, recipe, tmp_path, monkeypatch, capsys, number, at
+):
+    class Interrupting(pipeline.Display):
+        def show(self, done):
+            if done.index == at:
+                os.kill(os.getpid(), number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "Display", Interrupting)
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, data, tmp_path)
+    assert f"stopped after step {at} of 60; the same command goes on" in capsys.readouterr().err
+    assert not (tmp_path / "metrics.json").exists()
+    with pytest.raises(BadInput, match=f"stopped after step {at} of 60"):
+        load_run(tmp_path)
+    metrics = run(recipe, data, tmp_path)
+    assert f"going on after step {at} of 60" in capsys.readouterr().err
+    assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
+    assert metrics["images"] == finished[1]["images"]
+
+
+def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(pipeline.checkpoint, "save", lambda path, state: written.append(state.index))
+    run(with_steps(recipe, 10), data, tmp_path, checkpoint_every=4)
+    assert written == [4, 8, 10]
+
+
+def test_without_held_out_photographs_the_metrics_say_so(data, recipe, tmp_path, capsys):
+    metrics = run(with_steps(recipe, 2), replace(data, test_every=0), tmp_path)
+    assert metrics["images"] == {"psnr": None, "ssim": None, "per_image": {}} and metrics["fps"] > 0
+    notes = json.loads((tmp_path / "run.json").read_text())["notes"]
+    assert len(notes) == 1 and "cannot be measured" in notes[0] and notes[0] in capsys.readouterr().err
+
+
+def test_warnings_of_a_run_become_notes_once(data, recipe, tmp_path, monkeypatch):
+    read = colmap.read
+
+    def warning(given):
+        emit(Warned("the scene is odd"))
+        return read(given)
+
+    monkeypatch.setattr(colmap, "read", warning)
+    for _ in range(2):
+        run(with_steps(recipe, 1), data, tmp_path)
+        assert json.loads((tmp_path / "run.json").read_text())["notes"] == ["the scene is odd"]
+
+
+def test_photographs_that_are_no_longer_there_are_noticed(data, recipe, tmp_path, monkeypatch):
+    run(with_steps(recipe, 2), data, tmp_path)
+    scene = colmap.read(data)
+    monkeypatch.setattr(colmap, "read", lambda given: replace(scene, train=scene.train[1:]))
+    with pytest.raises(BadInput, match="trained on 10 photographs and .* now gives 9"):
+        run(with_steps(recipe, 2), data, tmp_path)
+
+
+def test_bad_data_leaves_nothing_behind(recipe, tmp_path):
+    with pytest.raises(BadInput, match="no such folder"):
+        run(recipe, Data(tmp_path / "nowhere"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
+    this, state, scene = load_run(finished[0])
+    assert this.recipe == recipe and this.data == data and state.index == STEPS and len(scene.train) == 10
+    with pytest.raises(BadInput, match="no run folder"):
+        load_run(tmp_path)

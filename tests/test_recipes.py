@@ -1,0 +1,51 @@
+"""The recipes say what was published."""
+
+import pytest
+
+from surfkit.cli.recipes import recipes
+from surfkit.core.check import BadInput
+from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
+from surfkit.pipeline import with_steps
+from surfkit.primitives import Gaussian3D, Surfel2D
+
+
+def test_3dgs():
+    recipe = recipes()["3dgs"]
+    stage, grow = recipe.pretrain, recipe.pretrain.densify
+    assert recipe.primitive == Gaussian3D(sh_degree=3, antialias=False)
+    assert (stage.steps, stage.sh_every) == (30_000, 1_000)
+    assert stage.losses == {"l1": L1(weight=0.8), "ssim": SSIM(weight=0.2)}
+    assert (grow.threshold, grow.small, grow.start, grow.until, grow.every) == (2e-4, 0.01, 500, 15_000, 100)
+    assert (grow.cull_opacity, grow.cull_scale, grow.reset_every, grow.reset_opacity) == (0.005, 0.1, 3_000, 0.01)
+    assert stage.signal.terms is None and stage.signal.boost == 0
+    at = {name: (rate.at(0, 30_000), rate.at(30_000, 30_000)) for name, rate in stage.rates.items()}
+    assert at["means"] == pytest.approx((1.6e-4, 1.6e-6))
+    constant = {"scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "sh_rest": 1.25e-4}
+    assert {name: ends for name, ends in at.items() if name != "means"} == {k: (v, v) for k, v in constant.items()}
+
+
+def test_2dgs():
+    recipe = recipes()["2dgs"]
+    losses = recipe.pretrain.losses
+    assert recipe.primitive == Surfel2D(sh_degree=3)
+    assert losses["normal"] == NormalConsistency(weight=0.05, start=7_000, depth="expected")
+    assert isinstance(losses["distortion"], Distortion) and losses["distortion"].weight_at(20_000, 30_000) == 0
+    assert recipe.pretrain.densify.cull_opacity == 0.05
+    assert recipe.pretrain.rates == recipes()["3dgs"].pretrain.rates
+
+
+@pytest.mark.parametrize("name", ["2dgs", "3dgs"])
+@pytest.mark.parametrize("steps", [1, 7, 300, 1_000, 2_000, 7_000, 30_000, 60_000])
+def test_any_number_of_steps_is_the_whole_schedule(name, steps):
+    stage = with_steps(recipes()[name], steps).pretrain
+    assert stage.steps == steps
+    assert abs(stage.densify.until - steps / 2) <= 0.5
+    assert abs(stage.sh_every - max(1, steps / 30)) <= 0.5
+    assert 1 <= stage.densify.every <= max(25, steps / 300)
+    if name == "2dgs":
+        assert abs(stage.losses["normal"].start - steps * 7 / 30) <= 0.5
+
+
+def test_no_steps_are_refused():
+    with pytest.raises(BadInput, match="--steps 0"):
+        with_steps(recipes()["3dgs"], 0)
