@@ -555,9 +555,9 @@ const Window& window() {
 struct Rows {
     static constexpr int margin = kLanes < kRadius ? 2 * kLanes : kLanes;
     int stride, count;
-    std::vector<float> data;
+    std::vector<float> data, nothing;
     Rows(int width, int rows)
-        : stride((width + kLanes - 1) / kLanes * kLanes + 2 * margin), count(rows), data((size_t)stride * rows) {}
+        : stride((width + kLanes - 1) / kLanes * kLanes + 2 * margin), count(rows), data((size_t)stride * rows), nothing(stride) {}
     float* row(int i) { return data.data() + (size_t)(i % count) * stride + margin; }
 };
 static_assert(kRadius <= Rows::margin, "the margin must hold the window");
@@ -568,17 +568,20 @@ inline Floats across(const float* p) {
     for (int i = 1; i <= kRadius; i++) v = madd(load(p - i) + load(p + i), w[i], v);
     return v;
 }
-inline Floats along(Rows& rows, int y, int x, int height) {
-    const float* w = window().w;
-    Floats v = load(rows.row(y) + x) * w[0];
-    for (int i = 1; i <= kRadius; i++) {
-        Floats both{};
-        if (y - i >= 0) both = load(rows.row(y - i) + x);
-        if (y + i < height) both += load(rows.row(y + i) + x);
-        v = madd(both, w[i], v);
+// The rows of the window about row y, nothing (zeros) beyond the image.
+struct Column {
+    const float* row[2 * kRadius + 1];
+    Column(Rows& rows, int y, int height) {
+        for (int i = -kRadius; i <= kRadius; i++)
+            row[i + kRadius] = y + i >= 0 && y + i < height ? rows.row(y + i) : rows.nothing.data();
     }
-    return v;
-}
+    inline Floats blurred(int x) const {
+        const float* w = window().w;
+        Floats v = load(row[kRadius] + x) * w[0];
+        for (int i = 1; i <= kRadius; i++) v = madd(load(row[kRadius - i] + x) + load(row[kRadius + i] + x), w[i], v);
+        return v;
+    }
+};
 
 double ssim_rows(const float* px, const float* py, int width, int height, int y0, int y1, float* d_mean, float* d_square,
                  float* d_cross) {
@@ -605,15 +608,16 @@ double ssim_rows(const float* px, const float* py, int width, int height, int y0
             }
         }
         Floats row_sum{};
+        const Column cx(mx, row, height), cy(my, row, height), cs(ms, row, height), cp(mp, row, height);
         for (int i = 0; i < width; i += kLanes) {
-            const Floats a = along(mx, row, i, height), b = along(my, row, i, height);
+            const Floats a = cx.blurred(i), b = cy.blurred(i);
             const Floats means = madd(a, a, b * b), ab = a * b;
             const Floats p1 = 2.0f * ab + c1, q1 = means + c1;
-            const Floats p2 = 2.0f * (along(mp, row, i, height) - ab) + c2, q2 = along(ms, row, i, height) - means + c2;
-            const Floats inv = 1.0f / (q1 * q2), s = p1 * p2 * inv;
+            const Floats p2 = 2.0f * (cp.blurred(i) - ab) + c2, q2 = cs.blurred(i) - means + c2;
+            const Floats inv1 = reciprocal(q1), inv2 = reciprocal(q2), inv = inv1 * inv2, s = p1 * p2 * inv;
             // S as a function of the blurred x, x^2 + y^2 and x y.
-            const Floats dm = 2.0f * inv * (b * (p2 - p1)) - 2.0f * s * a * (1.0f / q1 - 1.0f / q2);
-            const Floats ds = -(s / q2), dc = 2.0f * p1 * inv;
+            const Floats dm = 2.0f * inv * (b * (p2 - p1)) - 2.0f * s * a * (inv1 - inv2);
+            const Floats ds = -(s * inv2), dc = 2.0f * p1 * inv;
             const int n = width - i < kLanes ? width - i : kLanes;
             const size_t at = (size_t)row * width + i;
             std::memcpy(d_mean + at, &dm, n * sizeof(float));
@@ -648,13 +652,14 @@ void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, c
                 store(bc.row(next) + i, across(line.row(2) + i));
             }
         }
+        const Column cm(bm, row, height), cs(bs, row, height), cc(bc, row, height);
         for (int i = 0; i < width; i += kLanes) {
             const int n = width - i < kLanes ? width - i : kLanes;
             const size_t at = (size_t)row * width + i;
             Floats x{}, y{};
             std::memcpy(&x, px + at, n * sizeof(float));
             std::memcpy(&y, py + at, n * sizeof(float));
-            const Floats g = scale * madd(2.0f * x, along(bs, row, i, height), madd(y, along(bc, row, i, height), along(bm, row, i, height)));
+            const Floats g = scale * madd(2.0f * x, cs.blurred(i), madd(y, cc.blurred(i), cm.blurred(i)));
             std::memcpy(out + at, &g, n * sizeof(float));
         }
     }
