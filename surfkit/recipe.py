@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+import tyro
+
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.primitives.base import Primitive
@@ -16,7 +18,7 @@ from surfkit.train.stage import Stage
 class Recipe:
     """Everything that decides a result, and nothing that does not."""
 
-    about: str = ""
+    about: Annotated[str, tyro.conf.Suppress] = ""
     """What the recipe is, in one line."""
 
     primitive: Annotated[Primitive, choice(Primitive)] = Surfel2D()

@@ -41,7 +41,7 @@ def test_any_number_of_steps_is_the_whole_schedule(name, steps):
     assert stage.steps == steps
     assert abs(stage.densify.until - steps / 2) <= 0.5
     assert abs(stage.sh_every - max(1, steps / 30)) <= 0.5
-    assert 1 <= stage.densify.every <= max(25, steps / 300)
+    assert 1 <= stage.densify.every <= max(100, steps / 300)
     if name == "2dgs":
         assert abs(stage.losses["normal"].start - steps * 7 / 30) <= 0.5
 

@@ -34,6 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Words after `surfkit`; those of this process if None.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    # Idle threads of torch would otherwise spin, and burn as much processor time as the work itself.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         status = _guarded(words)
         sys.stdout.flush()

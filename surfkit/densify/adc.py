@@ -34,8 +34,9 @@ class ADC(Densify):
     until: Steps = 15_000
     """Step from which on nothing is edited."""
 
-    every: Annotated[int, StepCount(floor=25)] = 100
-    """Steps between edits; short runs keep at least 25, as fewer views say too little."""
+    every: Annotated[int, StepCount(floor=100)] = 100
+    """Steps between edits; short runs keep at least 100, for points need time to find their place before they multiply.
+    """
 
     cull_opacity: float = 0.005
     """Drop points fainter than this."""

@@ -1,0 +1,33 @@
+"""`surfkit evaluate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.cli.result import show
+from surfkit.pipeline import drawer, evaluate, load_run
+from surfkit.raster.select import Device
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a finished run again on the photographs it has not seen; writes metrics.json and the pictures anew."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    def run(self) -> None:
+        """Measure, and show what came out."""
+        this, state, scene = load_run(self.run_folder)
+        rasterizer, _ = drawer(self.device)
+        show(this, evaluate(this, state, scene, rasterizer))
+
+
+COMMAND = Evaluate

@@ -1,0 +1,44 @@
+"""`surfkit export`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.core.check import BadInput
+from surfkit.pipeline import load_run
+from surfkit.primitives.base import to_table
+from surfkit.scene.ply import write_splats
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the points of a finished run as PLY, in the data set's own frame, for SuperSplat and other viewers."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    out: Path | None = None
+    """File to write, ending in .ply; RUN/point_cloud.ply by default."""
+
+    strict_2dgs: bool = False
+    """Leave out the third scale of surfels, as programs written for 2DGS alone expect."""
+
+    def run(self) -> None:
+        """Write the file."""
+        this, state, scene = load_run(self.run_folder)
+        path = self.out or this.cloud
+        if path.suffix.lower() != ".ply":
+            raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
+        if path.exists() and self.out is not None and path.is_dir():
+            raise BadInput(f"--out {path}: a folder; name a file")
+        table = to_table(this.recipe.primitive, state.points.params).in_input_frame(scene.frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_splats(path, table, strict_2dgs=self.strict_2dgs)
+        print(f"wrote {len(state.points):,} points to {path}")
+
+
+COMMAND = Export

@@ -1,0 +1,97 @@
+"""`surfkit train`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+import surfkit
+from surfkit.cli.recipes import ARGV, chosen_recipe
+from surfkit.cli.result import show
+from surfkit.core.check import BadInput
+from surfkit.pipeline import CHECKPOINT_EVERY, Run, run, with_steps
+from surfkit.raster.select import Device
+from surfkit.recipe import Recipe
+from surfkit.scene.data import Data
+
+EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
+
+
+def named_recipe() -> str:
+    """The recipe's name as typed, for the default run folder."""
+    typed = [word.removeprefix("recipe:") for word in ARGV.get() if word.startswith("recipe:")]
+    return Path(typed[-1]).stem if typed else "run"
+
+
+@dataclass(frozen=True)
+class Train:
+    """Reconstruct a surface from photographs with known cameras.
+
+    An interrupted run goes on when the same command is given again. Any part of the recipe can be swapped with
+    `field:NAME`, such as `primitive:gaussian3d` or `pretrain.densify:none`; `surfkit components` lists the names.
+    """
+
+    recipe: Annotated[Recipe, chosen_recipe]
+    """What to do."""
+
+    data: Path | None = None
+    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse. By default the
+    bundled example, a farm photographed from a kite."""
+
+    out: Path | None = None
+    """Run folder; runs/DATA-RECIPE by default."""
+
+    steps: int | None = None
+    """Length of the run. Every schedule of the recipe is scaled along, so that a short run is a small whole run."""
+
+    scale: float | None = None
+    """Divide the size of every photograph by this."""
+
+    longest: int | None = None
+    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
+
+    test_every: int = 8
+    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none."""
+
+    test_list: Path | None = None
+    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
+
+    images: Path | None = None
+    """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    checkpoint_every: int = CHECKPOINT_EVERY
+    """Steps between checkpoints."""
+
+    folder: tyro.conf.Suppress[str] = ""
+
+    def __post_init__(self) -> None:
+        if self.checkpoint_every < 1:
+            raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
+        if not self.folder:  # the words of the command line are only known while it is parsed
+            object.__setattr__(self, "folder", named_recipe())
+
+    def run(self) -> None:
+        """Train, and show what came out."""
+        data = Data(self._data(), self.scale, self.longest, self.test_every, self.test_list, self.images)
+        out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
+        recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
+        metrics = run(recipe, data, out, self.device, self.checkpoint_every)
+        show(Run(out, recipe, data), metrics)
+
+    def _data(self) -> Path:
+        if self.data is not None:
+            return self.data
+        if not EXAMPLE.is_dir():
+            raise BadInput("no --data given, and the bundled example is only part of a source checkout; name a data set")
+        print(f"no --data given: using the bundled example {EXAMPLE}", file=sys.stderr)
+        return EXAMPLE
+
+
+COMMAND = Train
