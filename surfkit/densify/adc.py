@@ -28,15 +28,14 @@ class ADC(Densify):
     small: float = 0.01
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
 
-    start: Steps = 500
-    """Steps before the first edit."""
+    start: Annotated[int, StepCount(floor=250)] = 500
+    """Steps before the first edit; short runs keep at least 250, as gradients mean little until colours settle."""
 
     until: Steps = 15_000
     """Step from which on nothing is edited."""
 
     every: Annotated[int, StepCount(floor=100)] = 100
-    """Steps between edits; short runs keep at least 100, for points need time to find their place before they multiply.
-    """
+    """Steps between edits; short runs keep at least 100, which points need to find their place."""
 
     cull_opacity: float = 0.005
     """Drop points fainter than this."""

@@ -141,14 +141,17 @@ class Rasterizer(ABC):
     """Draws splats."""
 
     @abstractmethod
-    def render(self, splats: Splats, camera: Camera, near: float, geometry: bool = True) -> Render:
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
         """Draw `splats`.
 
         Args:
             splats: Values are used, an autograd graph is not.
             camera: World is the splats' frame.
             near: Splats whose centre has z <= near are not drawn; depths are at least this. Local units.
-            geometry: Also make depth, median, normal and distortion.
+            geometry: Also make depth, median and normal.
+            distortion: And with them distortion, which costs the most.
 
         Raises:
             BadInput: A scale, opacity, mean or quaternion is not finite, or a shape is wrong.

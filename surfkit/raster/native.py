@@ -15,6 +15,7 @@ from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
 MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
+"""In the order of `api.Maps`; the kernels make the first 2, the first 5 or all of them."""
 
 
 @cache
@@ -37,8 +38,10 @@ def module() -> ModuleType | None:
 class NativeRasterizer(Rasterizer):
     """Draws on the CPU with SIMD on `torch.get_num_threads()` threads; their number does not change a bit."""
 
-    def render(self, splats: Splats, camera: Camera, near: float, geometry: bool = True) -> Render:
-        return NativeRender(splats, camera, near, geometry)
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
+        return NativeRender(splats, camera, near, MAPS[: 2 + 3 * geometry + (geometry and distortion)])
 
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
@@ -79,14 +82,13 @@ class _Pass:
 class NativeRender(Render):
     """A view drawn by the native kernels; keeps what the backward needs."""
 
-    def __init__(self, splats: Splats, camera: Camera, near: float, geometry: bool) -> None:
+    def __init__(self, splats: Splats, camera: Camera, near: float, made: tuple[str, ...]) -> None:
         self._pass = _Pass(splats, camera, near)
         self.seen, self.radii = self._pass.seen, self._pass.radii
         self._size = (camera.height, camera.width)
         shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
-        made = MAPS if geometry else MAPS[:2]
         maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in made}
-        self._pass.native.forward(2 if geometry else 0, [maps.get(name) for name in MAPS], torch.get_num_threads())
+        self._pass.native.forward({2: 0, 5: 1, 6: 2}[len(made)], [maps.get(name) for name in MAPS], torch.get_num_threads())
         self.maps = Maps(**maps)
 
     def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:

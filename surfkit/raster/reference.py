@@ -323,8 +323,13 @@ def _blend(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tens
 class Reference(Rasterizer):
     """Draws with `draw`, in the precision of the splats; slow, and right."""
 
-    def render(self, splats: Splats, camera: Camera, near: float, geometry: bool = True) -> Render:
-        return ReferenceRender(splats, camera, near, geometry)
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
+        left_out = {"distortion"} if not distortion else set()
+        if not geometry:
+            left_out = {"depth", "median", "normal", "distortion"}
+        return ReferenceRender(splats, camera, near, left_out)
 
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
@@ -354,7 +359,7 @@ def _tiles(prints: Footprints, camera: Camera) -> Iterator[tuple[Tensor, Tensor,
 class ReferenceRender(Render):
     """A view drawn by the reference; autograd takes it back."""
 
-    def __init__(self, splats: Splats, camera: Camera, near: float, geometry: bool) -> None:
+    def __init__(self, splats: Splats, camera: Camera, near: float, left_out: set[str]) -> None:
         leaves = {name: value.detach().requires_grad_() for name, value in splats.tensors().items()}
         with torch.enable_grad():
             self._drawn = draw(Splats(splats.kind, *leaves.values(), splats.antialias), camera, near)
@@ -362,8 +367,7 @@ class ReferenceRender(Render):
         self._surfel = splats.kind == "surfel"
         self._half_image = torch.tensor([camera.width / 2, camera.height / 2]).to(splats.means)
         made = self._drawn.maps.present()
-        names = made if geometry else ("color", "alpha")
-        self.maps = Maps(**{name: made[name].detach() for name in names})
+        self.maps = Maps(**{name: value.detach() for name, value in made.items() if name not in left_out})
         self.seen = self._drawn.seen
         prints = self._drawn.footprints
         self.radii = torch.where(self.seen, prints.radius.detach(), 0.0)

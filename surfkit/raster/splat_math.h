@@ -488,17 +488,26 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
 
 // ------------------------------------------------------------------------------------------------------- tiles and rows
 
+// What of a bound does not change from line to line.
+template <class R> struct Outline {
+    R hx, hy;    // half sides of the ellipse's box
+    R tilt;      // x of the ellipse's middle, per line
+    R wide;      // square of its half width on the line through its centre
+    R turn;      // the right-most point's ordinate
+};
+template <class R> SPLAT_FN Outline<R> outline(const Bound<R>& b) {
+    const R hx = square_root(b.hxx), tilt = b.hxy / b.hyy;
+    return {hx, square_root(b.hyy), tilt, largest(b.hxx - b.hxy * tilt, R(0)), b.hxy / hx};
+}
+
 // The pixels x in [low, high] of the bound on the lines y0 <= y <= y1; false if there are none.
-template <class R> SPLAT_FN bool bound_span(const Bound<R>& b, R y0, R y1, R& low, R& high) {
+template <class R> SPLAT_FN bool bound_span(const Bound<R>& b, const Outline<R>& o, R y0, R y1, R& low, R& high) {
     bool any = false;
-    const R hx = square_root(b.hxx), hy = square_root(b.hyy);
-    const R a = largest(y0 - b.my, -hy), z = smallest(y1 - b.my, hy);
+    const R a = largest(y0 - b.my, -o.hy), z = smallest(y1 - b.my, o.hy);
     if (a <= z) {
-        const R tilt = b.hxy / b.hyy, wide = largest(b.hxx - b.hxy * tilt, R(0));
-        const R turn = b.hxy / hx;  // the ordinate of the right-most point
-        const R right = smallest(largest(turn, a), z), left = smallest(largest(-turn, a), z);
-        high = b.mx + tilt * right + square_root(largest(wide * (1 - right * right / b.hyy), R(0)));
-        low = b.mx + tilt * left - square_root(largest(wide * (1 - left * left / b.hyy), R(0)));
+        const R right = smallest(largest(o.turn, a), z), left = smallest(largest(-o.turn, a), z);
+        high = b.mx + o.tilt * right + square_root(largest(o.wide * (1 - right * right / b.hyy), R(0)));
+        low = b.mx + o.tilt * left - square_root(largest(o.wide * (1 - left * left / b.hyy), R(0)));
         any = true;
     }
     if (b.r2 > 0) {

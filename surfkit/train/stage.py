@@ -157,12 +157,13 @@ class Trainer:
         shown = state.order.next(state.generator)
         sample = Sample(self.views[shown], self.photos[shown].to(torch.float32).div_(255))
         active = {n: w for n, loss in stage.losses.items() if (w := loss.weight_at(index, stage.steps)) > 0}
-        geometry = any(set(stage.losses[name].reads) - {"color", "alpha"} for name in active)
+        reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
         shape = self.primitive.shape(leaves, min(self.primitive.sh_degree, index // stage.sh_every))
         splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
 
-        render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry)
+        geometry, distortion = bool(reads - {"color", "alpha"}), "distortion" in reads
+        render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry, distortion)
         losses, total, chosen = self.cotangents(active, render.maps, sample)
         if not math.isfinite(sum(losses.values())):
             raise RuntimeError(f"step {index}, view {sample.view.name}: the losses are {losses}; lower the rates")

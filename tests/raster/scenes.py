@@ -143,6 +143,36 @@ def edge_on(kind: Kind, degree: int, seed: int):
     return splats(draw, view, kind, degree, centres=centres, quats=quats, scales=scales, opacities=opacities), view
 
 
+def grazing(kind: Kind, degree: int, seed: int):
+    """Discs that a ray through their centre meets at 0.001 to 0.1 of a radian, from a random pose."""
+    draw = Draw(seed)
+    view, count = camera(draw), 60
+    centres = _box(draw, count)
+    ray = torch.nn.functional.normalize(centres, dim=1)
+    side = torch.nn.functional.normalize(torch.linalg.cross(ray, draw.normal(count, 3)), dim=1)
+    angle = torch.logspace(-3, -1, count).double()[:, None]
+    along = angle.cos() * ray + angle.sin() * torch.linalg.cross(ray, side)
+    axes = torch.stack([torch.linalg.cross(along, side), along, side], 2)[:, :, [1, 2, 0]]
+    quats = quaternions(view.world_to_camera[:3, :3].T @ axes)
+    scales = draw.uniform(0.02, 0.2, count, _columns(kind))
+    scales[:, 2:] *= 0.02
+    opacities = draw.uniform(0.1, 0.97, count)
+    return splats(draw, view, kind, degree, centres=centres, quats=quats, scales=scales, opacities=opacities), view
+
+
+def quaternions(turns: Tensor) -> Tensor:
+    """(N, 4) wxyz of (N, 3, 3) rotations: each is the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
+    found = []
+    for m in turns:
+        across = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+        trace = m.trace()
+        table = torch.zeros(4, 4).double()
+        table[0, 0], table[0, 1:], table[1:, 0] = trace, across, across
+        table[1:, 1:] = m + m.T - trace * torch.eye(3).double()
+        found.append(torch.linalg.eigh(table).eigenvectors[:, -1])
+    return torch.stack(found)
+
+
 def antialias(kind: Kind, degree: int, seed: int):
     """Gaussians of all sizes, their opacity lowered by what the dilation adds."""
     small, view = plain(kind, degree, seed, size=0.3)
@@ -150,7 +180,7 @@ def antialias(kind: Kind, degree: int, seed: int):
 
 
 SCENES: dict[str, Callable[[Kind, int, int], tuple[Splats, Camera]]] = {
-    maker.__name__: maker for maker in (plain, needle, huge, tiny, around, opaque, faint, edge_on, antialias)
+    maker.__name__: maker for maker in (plain, needle, huge, tiny, around, opaque, faint, grazing, edge_on, antialias)
 }
 CASES = [(name, kind) for kind in KINDS for name in SCENES if (name, kind) != ("antialias", "surfel")]
 """Scene and kind; `antialias` says nothing about surfels."""

@@ -158,20 +158,20 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     return true;
 }
 
-// Calls f(row, first, last) for the tiles that a bound touches.
-template <class F> void each_tile_row(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
-    const double reach = std::max(std::sqrt(b.hyy), 0.0), disc = b.r2 > 0 ? std::sqrt(b.r2) : 0;
-    const double top = b.r2 > 0 ? std::min(b.my - reach, b.dy - disc) : b.my - reach;
-    const double bottom = b.r2 > 0 ? std::max(b.my + reach, b.dy + disc) : b.my + reach;
-    // Tile t holds the pixel centres 16 t + 0.5 ... 16 t + 15.5.
-    const int y0 = (int)std::clamp(std::ceil((top - 15.5) / kTile), 0.0, (double)tiles_y);
-    const int y1 = (int)std::clamp(std::floor((bottom - 0.5) / kTile) + 1, 0.0, (double)tiles_y);
+// Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + 0.5 ... 16 t + 15.5.
+template <class F> void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
+    const auto first = [](double low, int tiles) { return (int)std::clamp(std::ceil((low - 15.5) / kTile), 0.0, (double)tiles); };
+    const auto end = [](double high, int tiles) { return (int)std::clamp(std::floor((high - 0.5) / kTile) + 1, 0.0, (double)tiles); };
+    const splat::Outline<double> o = splat::outline(b);
+    const double disc = b.r2 > 0 ? std::sqrt(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
+    const int y0 = first(std::min(b.my - o.hy, dy - disc), tiles_y), y1 = end(std::max(b.my + o.hy, dy + disc), tiles_y);
+    const int left = first(std::min(b.mx - o.hx, dx - disc), tiles_x), right = end(std::max(b.mx + o.hx, dx + disc), tiles_x);
+    if (left >= right) return;
     for (int y = y0; y < y1; y++) {
         double low, high;
-        if (!splat::bound_span(b, y * kTile + 0.5, y * kTile + 15.5, low, high)) continue;
-        const int x0 = (int)std::clamp(std::ceil((low - 15.5) / kTile), 0.0, (double)tiles_x);
-        const int x1 = (int)std::clamp(std::floor((high - 0.5) / kTile) + 1, 0.0, (double)tiles_x);
-        if (x0 < x1) f(y, x0, x1);
+        if (!splat::bound_span(b, o, y * kTile + 0.5, y * kTile + 15.5, low, high)) continue;
+        const int x1 = end(high, tiles_x);
+        for (int x = first(low, tiles_x); x < x1; x++) f((uint32_t)(y * tiles_x + x));
     }
 }
 
@@ -215,7 +215,7 @@ template <class Record> void Pass::project(const SplatArrays& splats, int thread
     const int64_t n = splats.count, chunks = chunks_of(n, kChunk);
     const int columns = scale_columns(kind_);
     records_.reset(new char[n * sizeof(Record)]);
-    bounds_.reset(new Bound<double>[n]);
+    tiles_of_.assign(chunks, {});
     index_.reset(new int64_t[n]);
     depth_.reset(new float[n]);
     slot_.reset(new uint32_t[n]);
@@ -239,14 +239,14 @@ template <class Record> void Pass::project(const SplatArrays& splats, int thread
             const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
             b = widened(b);
             fill_bound(r, b);
-            uint32_t tiles = 0;
-            each_tile_row(b, tiles_x_, tiles_y_, [&](int, int x0, int x1) { tiles += (uint32_t)(x1 - x0); });
+            const size_t before = tiles_of_[c].size();
+            each_tile(b, tiles_x_, tiles_y_, [&](uint32_t tile) { tiles_of_[c].push_back(tile); });
+            const uint32_t tiles = (uint32_t)(tiles_of_[c].size() - before);
             if (!tiles) continue;
             const Shade look = shade(splats, i, in, camera_);
             if (!std::isfinite(look.rgb[0] + look.rgb[1] + look.rgb[2]) && invalid[c] < 0) invalid[c] = i;
             for (int k = 0; k < 3; k++) r.color[k] = (float)std::max(look.rgb[k], 0.0);
             records[at] = r;
-            bounds_[at] = b;
             index_[at] = i;
             depth_[at] = (float)(splat::mul(camera_.turn, in.mean) + camera_.shift).z;
             tiles_[at] = tiles;
@@ -279,20 +279,19 @@ void Pass::bin(int threads) {
     offsets_.assign(tiles + 1, 0);
     // Counting sort by tile, stable in depth: pieces of the depth order count, then place.
     const int64_t pieces = std::min<int64_t>(std::max(1, threads), chunks_of(seen, 1024)), size = pieces ? chunks_of(seen, pieces) : 0;
-    std::vector<uint32_t> tile_of(pairs);
+    std::vector<uint32_t> tile_of(pairs);  // by slot
+    int64_t copied = 0;
+    for (const auto& tiles_of : tiles_of_) {
+        std::copy(tiles_of.begin(), tiles_of.end(), tile_of.begin() + copied);
+        copied += (int64_t)tiles_of.size();
+    }
+    std::vector<std::vector<uint32_t>>().swap(tiles_of_);
     std::vector<int64_t> next((size_t)pieces * tiles, 0);
     parallel(pieces, threads, [&](int64_t p) {
         int64_t* counts = next.data() + p * tiles;
         for (int64_t k = p * size; k < std::min(seen, (p + 1) * size); k++) {
             const uint32_t r = at[order[k]];
-            uint32_t slot = slot_[r];
-            each_tile_row(bounds_[r], tiles_x_, tiles_y_, [&](int y, int x0, int x1) {
-                for (int x = x0; x < x1; x++) {
-                    const uint32_t t = (uint32_t)(y * tiles_x_ + x);
-                    tile_of[slot++] = t;
-                    counts[t]++;
-                }
-            });
+            for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) counts[tile_of[slot]]++;
         }
     });
     int64_t sum = 0;

@@ -51,11 +51,11 @@ class Pass {
     int tiles_x_, tiles_y_;
     // Per projected splat; those of chunk c start at c * kChunk, their numbers are in seen_in_.
     std::unique_ptr<char[]> records_;
-    std::unique_ptr<splat::Bound<double>[]> bounds_;
     std::unique_ptr<int64_t[]> index_;
     std::unique_ptr<float[]> depth_;
     std::unique_ptr<uint32_t[]> slot_, tiles_;
     std::vector<int32_t> seen_in_;
+    std::vector<std::vector<uint32_t>> tiles_of_;  // per chunk, until they are sorted
     std::vector<Entry> entries_;
     std::vector<int64_t> offsets_;
     // Saved by forward.
