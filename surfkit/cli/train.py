@@ -89,7 +89,9 @@ class Train:
         if self.data is not None:
             return self.data
         if not EXAMPLE.is_dir():
-            raise BadInput("no --data given, and the bundled example is only part of a source checkout; name a data set")
+            raise BadInput(
+                "no --data given, and the bundled example is only part of a source checkout; name a data set"
+            )
         print(f"no --data given: using the bundled example {EXAMPLE}", file=sys.stderr)
         return EXAMPLE
 

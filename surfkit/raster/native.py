@@ -88,7 +88,9 @@ class NativeRender(Render):
         self._size = (camera.height, camera.width)
         shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
         maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in made}
-        self._pass.native.forward({2: 0, 5: 1, 6: 2}[len(made)], [maps.get(name) for name in MAPS], torch.get_num_threads())
+        self._pass.native.forward(
+            {2: 0, 5: 1, 6: 2}[len(made)], [maps.get(name) for name in MAPS], torch.get_num_threads()
+        )
         self.maps = Maps(**maps)
 
     def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:

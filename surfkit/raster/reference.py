@@ -270,7 +270,9 @@ def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> D
 
 
 def _pixels(x0: int, y0: int, x1: int, y1: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    y, x = torch.meshgrid(torch.arange(y0, y1, dtype=dtype) + 0.5, torch.arange(x0, x1, dtype=dtype) + 0.5, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(y0, y1, dtype=dtype) + 0.5, torch.arange(x0, x1, dtype=dtype) + 0.5, indexing="ij"
+    )
     return x.flatten(), y.flatten()
 
 

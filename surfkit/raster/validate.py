@@ -37,4 +37,6 @@ def validate(splats: Splats, values: bool = True) -> None:
 
 def _refuse(bad: torch.Tensor, name: str, what: str) -> None:
     if bad.any():
-        raise BadInput(f"splats.{name}: {int(bad.sum())} of {len(bad)} rows are {what}; the first is row {int(bad.int().argmax())}")
+        raise BadInput(
+            f"splats.{name}: {int(bad.sum())} of {len(bad)} rows are {what}; the first is row {int(bad.int().argmax())}"
+        )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from plain import evaluate, harmonics
-from scenes import CASES, KINDS, NEAR, Draw, axis_camera, camera, crop, double, leaves, make, plain, rows, splats
+from scenes import CASES, KINDS, NEAR, Draw, axis_camera, camera, crop, double, leaves, make, plain, quaternions, rows, splats
 
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
@@ -112,10 +112,12 @@ def few(kind: str, degree: int, antialias: bool = False, pixels: float = 8.0):
     """Three splats of some pixels over 4 x 3 pixels, away from every threshold, the median inside."""
     draws = Draw(5)
     view = replace(crop(camera(draws), 4, 3), cx=1.7, cy=1.9, fx=26.0, fy=28.0)
+    skew = 0.4 * draws.normal(3, 3, 3)
+    tilted = torch.linalg.matrix_exp(skew - skew.transpose(1, 2))  # of discs that face the camera
     made = double(splats(
         draws, view, kind, degree,
+        quats=quaternions(view.world_to_camera[:3, :3].T @ tilted),
         centres=torch.tensor([[0.02, -0.03, 1.0], [-0.03, 0.02, 1.3], [0.03, 0.01, 1.7]]).double(),
-        quats=torch.tensor([1.0, 0, 0, 0]).double() + 0.3 * draws.normal(3, 4),
         scales=pixels / 27 * draws.uniform(0.6, 1.4, 3, 2 if kind == "surfel" else 3),
         opacities=torch.tensor([0.35, 0.6, 0.7]).double(),
     ))  # fmt: skip
