@@ -28,8 +28,8 @@ class ADC(Densify):
     small: float = 0.01
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
 
-    start: Annotated[int, StepCount(floor=250)] = 500
-    """Steps before the first edit; short runs keep at least 250, as gradients mean little until colours settle."""
+    start: Annotated[int, StepCount(floor=300)] = 500
+    """Steps before the first edit; short runs keep at least 300, as gradients mean little until colours settle."""
 
     until: Steps = 15_000
     """Step from which on nothing is edited."""

@@ -5,44 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import torch
 from torch import Tensor
 
 from surfkit.core.schedule import Steps
 from surfkit.losses.base import Loss, Sample
 from surfkit.raster.api import Maps
-from surfkit.scene.camera import Camera
-
-
-def normals_of(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals of the surface that a depth map describes, and where there are any.
-
-    Points are back-projected through the rasterizer's own pixel centres and differenced centrally, so a normal needs
-    the depths of the four neighbours; border pixels have none.
-
-    Args:
-        depth: (H, W) camera z, 0 where there is none.
-        camera: That the map was rendered for.
-
-    Returns:
-        (3, H - 2, W - 2) unit normals of the inner pixels in the camera frame, facing the camera, and a mask.
-    """
-    x = (torch.arange(camera.width, dtype=depth.dtype) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=depth.dtype) + 0.5 - camera.cy) / camera.fy
-    px, py = depth * x, depth * y[:, None]
-    right = [p[1:-1, 2:] - p[1:-1, :-2] for p in (px, py, depth)]
-    down = [p[2:, 1:-1] - p[:-2, 1:-1] for p in (px, py, depth)]
-    normal = torch.stack(
-        [
-            down[1] * right[2] - down[2] * right[1],
-            down[2] * right[0] - down[0] * right[2],
-            down[0] * right[1] - down[1] * right[0],
-        ]
-    )
-    there = depth > 0
-    valid = there[1:-1, 2:] & there[1:-1, :-2] & there[2:, 1:-1] & there[:-2, 1:-1]
-    length = normal.square().sum(0).clamp_min(1e-30).rsqrt()
-    return normal * length, valid
+from surfkit.raster.normals import disagreement
 
 
 @dataclass(frozen=True)
@@ -65,10 +33,7 @@ class NormalConsistency(Loss):
 
     def __call__(self, maps: Maps, sample: Sample) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
-        surface, valid = normals_of(depth, sample.view.camera)
-        inner = maps.normal[:, 1:-1, 1:-1]
-        agreement = (inner * surface).sum(0) * maps.alpha.detach()[1:-1, 1:-1]
-        return ((1 - agreement) * valid).sum() / valid.numel()
+        return disagreement(depth, maps.alpha, maps.normal, sample.view.camera)
 
 
 @dataclass(frozen=True)

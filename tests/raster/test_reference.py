@@ -151,13 +151,16 @@ def test_gradcheck_of_the_colour_of_degree_3():
 
 
 def test_gradients_of_the_low_pass_filter():
-    """Discs of half a pixel: the filter's centre carries the gradient, the depth is that of the disc's plane."""
-    shown, view = few("surfel", 0, pixels=0.5)
+    """Discs below a pixel: the filter's centre carries the gradient, the depth is that of the disc's plane.
+
+    The depth is checked near the middle, where it is not clamped: the limits count as constants.
+    """
+    shown, view = few("surfel", 0, pixels=0.6)
     assert draw(shown, view, NEAR).maps.alpha.max() > 0.3
 
     def maps(*tensors):
         made = draw(Splats("surfel", *tensors), view, NEAR).maps
-        return made.color, made.alpha, made.depth
+        return made.color, made.alpha, made.depth[1:, 1:3]
 
     assert torch.autograd.gradcheck(maps, tuple(leaves(shown).tensors().values()), atol=1e-6, rtol=1e-4)
 

@@ -665,6 +665,69 @@ void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, c
     }
 }
 
+// ------------------------------------------------------------------------------------------- normals against a depth map
+
+// Loads or stores n of the lanes, n > 0.
+inline Floats load_part(const float* p, int n) {
+    if (n == kLanes) return load(p);
+    Floats v{};
+    std::memcpy(&v, p, n * sizeof(float));
+    return v;
+}
+inline void store_part(float* p, Floats v, int n) { std::memcpy(p, &v, n * sizeof(float)); }
+
+double normal_rows(const NormalJob& j, int y0, int y1) {
+    const size_t plane = (size_t)j.width * j.height;
+    double sum = 0;
+    for (int y = y0; y < y1; y++) {
+        const float ry = (y + 0.5f - j.cy) / j.fy, step_y = 1 / j.fy;
+        Floats row_sum{};
+        for (int x = 1; x < j.width - 1; x += kLanes) {
+            const int n = j.width - 1 - x < kLanes ? j.width - 1 - x : kLanes;
+            const size_t at = (size_t)y * j.width + x;
+            Floats rx;
+            for (int l = 0; l < kLanes; l++) rx[l] = (x + l + 0.5f - j.cx) / j.fx;
+            const float step_x = 1 / j.fx;
+            const Floats right = load_part(j.depth + at + 1, n), left = load_part(j.depth + at - 1, n);
+            const Floats below = load_part(j.depth + at + j.width, n), above = load_part(j.depth + at - j.width, n);
+            const Mask valid = lesser(0.0f, right) & lesser(0.0f, left) & lesser(0.0f, below) & lesser(0.0f, above);
+            // Differences of the points depth * (rx, ry, 1) across and down; the normal is down x across.
+            const Floats across[3] = {right * (rx + step_x) - left * (rx - step_x), (right - left) * ry, right - left};
+            const Floats down[3] = {(below - above) * rx, below * (ry + step_y) - above * (ry - step_y), below - above};
+            Floats m[3], unit[3], g[3], gm[3];
+            for (int c = 0; c < 3; c++) {
+                const int a = (c + 1) % 3, b = (c + 2) % 3;
+                m[c] = down[a] * across[b] - down[b] * across[a];
+            }
+            const Floats length2 = higher(m[0] * m[0] + m[1] * m[1] + m[2] * m[2], broadcast(1e-30f));
+            const Floats inv = reciprocal(root(length2));
+            const Floats alpha = keep(valid, load_part(j.alpha + at, n));
+            Floats agreement{};
+            for (int c = 0; c < 3; c++) {
+                unit[c] = m[c] * inv;
+                g[c] = -(alpha * load_part(j.normal + c * plane + at, n));
+                agreement = madd(g[c], unit[c], agreement);
+                store_part(j.d_normal + c * plane + at, -(keep(valid, alpha * unit[c]) * j.scale), n);
+            }
+            row_sum += keep(valid, 1.0f + agreement);
+            for (int c = 0; c < 3; c++) gm[c] = keep(valid, (g[c] - unit[c] * agreement) * inv * j.scale);
+            Floats d_down[3], d_across[3];
+            for (int c = 0; c < 3; c++) {
+                const int a = (c + 1) % 3, b = (c + 2) % 3;
+                d_down[c] = across[a] * gm[b] - across[b] * gm[a];
+                d_across[c] = gm[a] * down[b] - gm[b] * down[a];
+            }
+            const Floats flat = d_across[1] * ry + d_across[2], steep = d_down[0] * rx + d_down[2];
+            store_part(j.to_right + at, madd(d_across[0], rx + step_x, flat), n);
+            store_part(j.to_left + at, -madd(d_across[0], rx - step_x, flat), n);
+            store_part(j.to_below + at, madd(d_down[1], ry + step_y, steep), n);
+            store_part(j.to_above + at, -madd(d_down[1], ry - step_y, steep), n);
+        }
+        for (int l = 0; l < kLanes; l++) sum += row_sum[l];
+    }
+    return sum;
+}
+
 // ----------------------------------------------------------------------------------------------------------------- Adam
 
 void adam(int64_t count, float* value, const float* gradient, float* first, float* second, float rate, float share1,
@@ -742,7 +805,7 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
 #define SURFKIT_TABLE_(x) kernels_##x
 #define SURFKIT_TABLE(x) SURFKIT_TABLE_(x)
 const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
-    static const Kernels table{SURFKIT_NAME(SURFKIT_KERNELS), forward, backward, contribution, ssim_rows, ssim_gradient_rows, adam};
+    static const Kernels table{SURFKIT_NAME(SURFKIT_KERNELS), forward, backward, contribution, ssim_rows, ssim_gradient_rows, normal_rows, adam};
     return table;
 }
 

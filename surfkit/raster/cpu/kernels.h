@@ -61,6 +61,15 @@ enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2 };
 constexpr int kSurfelSums = 20, kSurfelSumsChosen = 32;
 constexpr int kGaussianSums = 16, kGaussianSumsChosen = 20;
 
+// Normals of the splats against those of a depth map: inputs, and where the gradients go. Planes of width x height; the
+// gradient by the depths is left as what each pixel sends to its four neighbours.
+struct NormalJob {
+    const float *depth, *alpha, *normal;
+    int width, height;
+    float fx, fy, cx, cy, scale;
+    float *d_normal, *to_right, *to_left, *to_below, *to_above;
+};
+
 struct Kernels {
     const char* name;
     void (*forward)(Kind, Level, const Job&, int64_t tile, const Planes& out, const Saved&);
@@ -75,6 +84,8 @@ struct Kernels {
                         float* d_square, float* d_cross);
     void (*ssim_gradient_rows)(const float* x, const float* y, const float* d_mean, const float* d_square,
                                const float* d_cross, int width, int height, int y0, int y1, float scale, float* out);
+    // Sum of 1 - alpha (normal . normal of the depth) over the inner pixels of rows [y0, y1) that have one.
+    double (*normal_rows)(const NormalJob&, int y0, int y1);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
                  float share1, float share2, float second_correction, float epsilon);
 };

@@ -125,6 +125,22 @@ NB_MODULE(_native, m) {
         nb::gil_scoped_release free;
         return ssim(px, py, channels, width, height, g, threads);
     }, nb::arg("x"), nb::arg("y"), nb::arg("gradient").none(), nb::arg("threads"));
+    m.def("normal_disagreement", [](Array depth, Array alpha, Array normal, std::vector<double> lens, Array d_depth, Array d_normal, int threads) {
+        NormalJob job{};
+        job.depth = depth.data();
+        job.alpha = alpha.data();
+        job.normal = normal.data();
+        job.height = (int)depth.shape(0);
+        job.width = (int)depth.shape(1);
+        job.fx = (float)lens.at(0);
+        job.fy = (float)lens.at(1);
+        job.cx = (float)lens.at(2);
+        job.cy = (float)lens.at(3);
+        job.d_normal = d_normal.data();
+        float* g = d_depth.data();
+        nb::gil_scoped_release free;
+        return normal_disagreement(job, g, threads);
+    });
     m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2, double second_correction, double epsilon, int threads) {
         const int64_t n = (int64_t)value.size(), piece = 1 << 16;
         float *p = value.data(), *m1 = first.data(), *m2 = second.data();

@@ -86,8 +86,9 @@ Bound<double> widened(Bound<double> b) {
     if (b.r2 > 0) {
         b.r2 = b.r2 * more + pad;
         // A disc inside the ellipse says nothing new.
-        const double half = (b.hxx + b.hyy) / 2, spread = std::hypot((b.hxx - b.hyy) / 2, b.hxy);
-        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::hypot(b.dx - b.mx, b.dy - b.my)) b.r2 = -1;
+        const double half = (b.hxx + b.hyy) / 2, spread = std::sqrt((b.hxx - b.hyy) * (b.hxx - b.hyy) / 4 + b.hxy * b.hxy);
+        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::sqrt((b.dx - b.mx) * (b.dx - b.mx) + (b.dy - b.my) * (b.dy - b.my)))
+            b.r2 = -1;
     }
     return b;
 }
@@ -442,6 +443,39 @@ double ssim(const float* x, const float* y, int channels, int width, int height,
     double sum = 0;
     for (double s : sums) sum += s;
     return sum * scale;
+}
+
+double normal_disagreement(NormalJob job, float* d_depth, int threads) {
+    const int w = job.width, h = job.height, band = 16, bands = std::max(0, (h - 2 + band - 1) / band);
+    const size_t plane = (size_t)w * h;
+    std::fill(d_depth, d_depth + plane, 0.0f);
+    std::fill(job.d_normal, job.d_normal + 3 * plane, 0.0f);
+    if (w < 3 || h < 3) return 0;
+    const double count = (double)(w - 2) * (h - 2);
+    job.scale = (float)(1 / count);
+    std::vector<float> sent(4 * plane, 0.0f);
+    job.to_right = sent.data();
+    job.to_left = job.to_right + plane;
+    job.to_below = job.to_left + plane;
+    job.to_above = job.to_below + plane;
+    std::vector<double> sums(bands);
+    const Kernels& k = kernels();
+    parallel(bands, threads, [&](int64_t b) { sums[b] = k.normal_rows(job, 1 + (int)b * band, std::min(h - 1, 1 + (int)(b + 1) * band)); });
+    parallel((h + band - 1) / band, threads, [&](int64_t b) {
+        for (int y = (int)b * band; y < std::min(h, (int)(b + 1) * band); y++)
+            for (int x = 0; x < w; x++) {
+                const size_t at = (size_t)y * w + x;
+                float g = 0;
+                if (x > 0) g += job.to_right[at - 1];
+                if (x < w - 1) g += job.to_left[at + 1];
+                if (y > 0) g += job.to_below[at - w];
+                if (y < h - 1) g += job.to_above[at + w];
+                d_depth[at] = g;
+            }
+    });
+    double sum = 0;
+    for (double s : sums) sum += s;
+    return sum / count;
 }
 
 }  // namespace surfkit

@@ -72,4 +72,7 @@ void use_kernels(const Kernels& k);
 
 double ssim(const float* x, const float* y, int channels, int width, int height, float* gradient, int threads);
 
+// Mean over the inner pixels; the gradients by depth and normal are written. The job's own buffers are made here.
+double normal_disagreement(NormalJob job, float* d_depth, int threads);
+
 }  // namespace surfkit

@@ -1,0 +1,377 @@
+"""The native rasterizer against the reference in float64, and against itself with other threads and kernels."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import pytest
+import torch
+from scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.raster import native
+from surfkit.raster.api import ALPHA_MIN, Gradients, Maps, Render, Splats
+from surfkit.raster.native import NativeRasterizer
+from surfkit.raster.reference import Reference, draw, gaussians, surfels
+from surfkit.raster.ssim import ssim
+from surfkit.scene.camera import Camera
+
+pytestmark = pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+each_case = pytest.mark.parametrize(("name", "kind"), CASES)
+MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
+FORWARD, BACKWARD = 1e-5, 1e-4
+ZERO = 1e-9
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, what the reference makes of it, and random cotangents that are 0 at pixels near a threshold."""
+
+    splats: Splats
+    view: Camera
+    clear: Tensor
+    true: Render
+    cotangents: dict[str, Tensor]
+
+
+@cache
+def case(name: str, kind: str, degree: int | None = None) -> Case:
+    shown, view = make(name, kind, degree)
+    exact = double(shown)
+    with torch.no_grad():
+        clear = ~draw(exact, view, NEAR).near_threshold
+    true = Reference().render(exact, view, NEAR)
+    draws = Draw(11)
+    maps = true.maps.present()
+    cotangents = {key: (draws.normal(*value.shape) * clear).float() for key, value in maps.items()}
+    return Case(shown, view, clear, true, cotangents)
+
+
+def rendered(c: Case) -> Render:
+    return NativeRasterizer().render(c.splats, c.view, NEAR)
+
+
+def different_maps(found: Maps, true: Maps, clear: Tensor) -> dict[str, float]:
+    """Maps that differ by more than FORWARD and by how much. Distortion has the unit of 1 / z^2, here up to 400."""
+    errors = {}
+    for key, value in true.present().items():
+        size = max(1.0, value.abs().max().item()) if key == "distortion" else 1.0
+        error = ((getattr(found, key).double() - value.double()).abs() * clear).max().item() / size
+        if not error <= FORWARD:
+            errors[key] = error
+    return errors
+
+
+def different_gradients(found: Gradients, true: Gradients) -> dict[str, float]:
+    """Gradients that differ by more than BACKWARD in norm, and by how much.
+
+    A gradient may be 0 for every splat: a disc's scale does not move the plane that gives the median. There two sums
+    cancel that are as large as the gradient of the means, a length too, times the place on the disc in sigmas: it is
+    held against that gradient. The scales of a disc below a pixel act through perspective only, and nearly cancel
+    too, hence one more share.
+    """
+    errors = {}
+    means = true.means.norm().item()
+    parts = {"signal": true.signal, "chosen": true.chosen}
+    for key, value in {**true.tensors(), **parts}.items():
+        if value is None:
+            continue
+        size, made = value.norm().item(), getattr(found, key).double()
+        allowed = BACKWARD * means if key == "scales" and size < ZERO * means else BACKWARD * size
+        if key == "scales":
+            allowed += 1e-6 * means
+        error = (made - value.double()).norm().item()
+        if not error <= allowed:
+            errors[key] = error / max(size, 1e-30)
+    return errors
+
+
+@each_case
+def test_maps_equal_the_reference(name, kind):
+    c = case(name, kind)
+    assert c.clear.double().mean() > 0.97
+    assert c.true.maps.alpha.max() > 0.1
+    assert not different_maps(rendered(c).maps, c.true.maps, c.clear)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_degree_of_the_colour(kind, degree):
+    c = case("plain", kind, degree)
+    assert c.splats.sh.shape[1] == (degree + 1) ** 2
+    render = rendered(c)
+    assert not different_maps(render.maps, c.true.maps, c.clear)
+    total = Maps(color=c.cotangents["color"])
+    assert not different_gradients(render.backward(total), c.true.backward(total))
+
+
+@each_case
+def test_gradients_equal_the_reference_for_each_map(name, kind):
+    c = case(name, kind)
+    render, wrong = rendered(c), {}
+    for key, value in c.cotangents.items():
+        total = Maps(**{key: value})
+        found = render.backward(total, total)
+        assert (found.chosen - found.signal).norm() <= 1e-6 * found.signal.norm(), key
+        if errors := different_gradients(found, c.true.backward(total)):
+            wrong[key] = errors
+    assert not wrong
+
+
+@each_case
+def test_gradients_and_chosen_signals_equal_the_reference_for_all_maps(name, kind):
+    c = case(name, kind)
+    render, total = rendered(c), Maps(**c.cotangents)
+    for chosen in (Maps(color=c.cotangents["color"]), Maps(**{key: 0.5 * v for key, v in c.cotangents.items()})):
+        found, true = render.backward(total, chosen), c.true.backward(total, chosen)
+        assert not different_gradients(found, true)
+        assert (true.chosen - true.signal).norm() > 0.1 * true.signal.norm()
+
+
+@each_case
+def test_seen_and_radii_equal_the_reference(name, kind):
+    c = case(name, kind)
+    render = rendered(c)
+    assert not (c.true.seen & ~render.seen).any()
+    assert not render.radii[~render.seen].any()
+    error = (render.radii - c.true.radii).abs()[c.true.seen]
+    assert (error <= 1e-2 + 1e-3 * c.true.radii[c.true.seen]).all()
+
+
+@each_case
+def test_contribution_equals_the_reference(name, kind):
+    c = case(name, kind)
+    for powers in ((0.5, 0.5), (0.8, 0.3)):
+        total, count = NativeRasterizer().contribution(c.splats, c.view, NEAR, *powers)
+        true_total, true_count = Reference().contribution(double(c.splats), c.view, NEAR, *powers)
+        near = int((~c.clear).sum())  # pixels at which either may count one more or less
+        assert ((count - true_count).abs() <= near).all()
+        assert ((total - true_total).abs() <= 1e-4 * (1 + true_total) + near).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_contribution_is_exact_away_from_thresholds(kind):
+    shown, view = make("plain", kind)
+    for i in range(40):
+        one = rows(shown, slice(i, i + 1))
+        if draw(double(one), view, NEAR).near_threshold.any():
+            continue
+        for powers in ((0.5, 0.5), (1.0, 1.0), (0.8, 0.3)):
+            total, count = NativeRasterizer().contribution(one, view, NEAR, *powers)
+            true_total, true_count = Reference().contribution(double(one), view, NEAR, *powers)
+            assert torch.equal(count, true_count)
+            assert (total - true_total).abs() <= 1e-5 * (1 + true_total)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_backward_is_linear(kind):
+    c = case("opaque", kind)
+    render = rendered(c)
+    first = Maps(**{key: c.cotangents[key] for key in MAPS[:3]})
+    second = Maps(**{key: c.cotangents[key] for key in MAPS[3:]})
+    one, two, both = (render.backward(maps) for maps in (first, second, Maps(**c.cotangents)))
+    names = ("means", "quats", "scales", "opacities", "sh", "signal")
+    summed = Gradients(**{name: getattr(one, name).double() + getattr(two, name) for name in names})
+    assert both.chosen is None
+    assert not different_gradients(both, summed)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fewer_maps_are_the_same_maps(kind):
+    c = case("faint", kind)
+    whole = rendered(c)
+    only = Maps(color=c.cotangents["color"], alpha=c.cotangents["alpha"])
+    for wanted, names in (({"distortion": False}, MAPS[:5]), ({"geometry": False}, MAPS[:2])):
+        render = NativeRasterizer().render(c.splats, c.view, NEAR, **wanted)
+        assert tuple(render.maps.present()) == names
+        for key, value in render.maps.present().items():
+            assert (value - getattr(whole.maps, key)).abs().max() < 1e-6, key
+        assert not different_gradients(render.backward(only, only), whole.backward(only, only))
+
+
+def test_a_cotangent_of_a_map_that_was_not_made_is_refused():
+    c = case("plain", "surfel")
+    render = NativeRasterizer().render(c.splats, c.view, NEAR, geometry=False)
+    with pytest.raises(BadInput, match="cotangent of depth"):
+        render.backward(Maps(depth=c.cotangents["depth"]))
+    with pytest.raises(BadInput, match="cotangent of color: shape"):
+        render.backward(Maps(color=c.cotangents["color"][:, 1:]))
+
+
+def crowd(kind: str) -> tuple[Splats, Camera]:
+    """Splats of all scenes, several pieces of work for the threads, over several tiles."""
+    parts = [make(name, kind, 1, seed)[0] for seed in range(3) for name in SCENES]
+    joined = [torch.cat(tensors) for tensors in zip(*(part.tensors().values() for part in parts), strict=True)]
+    return Splats(kind, *joined), camera(Draw(2), 149, 97)
+
+
+def everything(shown: Splats, view: Camera) -> dict[str, Tensor]:
+    """Every number that the native module makes of a view."""
+    render = NativeRasterizer().render(shown, view, NEAR)
+    draws = Draw(4)
+    total = Maps(**{key: draws.normal(*value.shape).float() for key, value in render.maps.present().items()})
+    gradients = render.backward(total, Maps(color=total.color))
+    summed, count = NativeRasterizer().contribution(shown, view, NEAR, 0.5, 0.5)
+    image = render.maps.color.clamp(0, 1).requires_grad_()
+    similar = ssim(image, image.detach().flip(2))
+    similar.backward()
+    made = {**render.maps.present(), **{f"d {key}": value for key, value in gradients.tensors().items()}}
+    made |= {"signal": gradients.signal, "chosen": gradients.chosen, "seen": render.seen, "radii": render.radii}
+    return made | {"sum": summed, "count": count, "ssim": similar.detach(), "d ssim": image.grad}
+
+
+@pytest.fixture
+def threads():
+    """`torch.set_num_threads`, set back afterwards."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_number_of_threads_does_not_change_a_bit(kind, threads):
+    shown, view = crowd(kind)
+    made = {}
+    for number in (1, 2, 5):
+        threads(number)
+        made[number] = everything(shown, view)
+    assert len(shown) > 1500 and made[1]["seen"].sum() > 500
+    for number in (2, 5):
+        different = [key for key, value in made[1].items() if not same_bits(value, made[number][key])]
+        assert not different, f"{number} threads"
+
+
+def same_bits(a: Tensor, b: Tensor) -> bool:
+    """Equal, a NaN too: another test's concern."""
+    return a.numpy().tobytes() == b.numpy().tobytes()
+
+
+@pytest.fixture
+def kernels():
+    """`use_kernels` of the module, set back afterwards."""
+    before = native.module().kernels_in_use()
+    yield native.module().use_kernels
+    native.module().use_kernels(before)
+
+
+@pytest.mark.parametrize("compiled", native.module().kernels() if native.module() else [])
+@each_case
+def test_every_compilation_of_the_kernels_equals_the_reference(name, kind, compiled, kernels):
+    kernels(compiled)
+    assert native.module().kernels_in_use() == compiled
+    c = case(name, kind)
+    render = rendered(c)
+    assert not different_maps(render.maps, c.true.maps, c.clear)
+    assert not different_gradients(render.backward(Maps(**c.cotangents)), true_gradients(name, kind))
+
+
+@cache
+def true_gradients(name: str, kind: str) -> Gradients:
+    c = case(name, kind)
+    return c.true.backward(Maps(**c.cotangents))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_compilations_agree_on_a_larger_view(kind, kernels):
+    """The scenes above compare each with the reference; this one adds tiles cut by the border and long lists."""
+    shown, view = crowd(kind)
+    made = []
+    for compiled in native.module().kernels():
+        kernels(compiled)
+        made.append(NativeRasterizer().render(shown, view, NEAR).maps.present())
+    assert made[0]["alpha"].mean() > 0.5
+    for key, value in made[0].items():
+        for other in made[1:]:
+            apart = (value - other[key]).abs() > FORWARD * max(1.0, value.abs().max().item())
+            assert apart.double().mean() < 3e-3, key  # a few pixels sit on a threshold
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_culling_never_loses_a_pixel(kind):
+    """One splat at a time, of every scene, against the alpha of the reference at every pixel."""
+    for name in [name for name, k in CASES if k == kind]:
+        shown, view = make(name, kind, 0, seed=21)
+        exact = double(shown)
+        prints = (surfels if kind == "surfel" else gaussians)(exact, view, NEAR)
+        rays = view.rays(torch.float64)
+        x, y = (rays[0] * view.fx + view.cx).flatten(), (rays[1] * view.fy + view.cy).flatten()
+        rho, _, opacity = prints.at(torch.arange(len(shown)), x, y)
+        raw = opacity * torch.exp(-rho / 2) * prints.drawn[:, None]
+        # Where a ray nearly lies in the disc alpha itself is less exact; that is the concern of the tests above.
+        margin = 0.1 if (name, kind) == ("edge_on", "surfel") else 1e-4
+        for i in range(len(shown)):
+            made = NativeRasterizer().render(rows(shown, slice(i, i + 1)), view, NEAR, geometry=False).maps.alpha
+            lost = (made.flatten() == 0) & (raw[i] > (1 + margin) * ALPHA_MIN)
+            assert not lost.any(), f"{name}: splat {i} at {lost.nonzero()[:3, 0].tolist()}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [("scales", float("nan"), "not finite"), ("means", float("inf"), "not finite"), ("scales", -1.0, "not positive"),
+     ("quats", 0.0, "zero"), ("opacities", float("nan"), "not finite"), ("sh", float("nan"), "not finite")],
+)  # fmt: skip
+def test_bad_values_are_refused_with_their_row(kind, name, value, words):
+    shown, view = make("plain", kind)
+    # A splat that would be drawn: the module reads the colour of no other.
+    row = int(case("plain", kind).true.seen.nonzero()[9, 0])
+    tensor = getattr(shown, name).clone()
+    tensor[row] = value
+    with pytest.raises(BadInput, match=f"splats.{name}: 1 of 70 rows are {words}.*; the first is row {row}$"):
+        NativeRasterizer().render(replace(shown, **{name: tensor}), view, NEAR)
+
+
+def test_values_beyond_float32_are_refused():
+    shown, view = make("plain", "surfel")
+    exact = double(shown)
+    exact.scales[5] = 1e-60
+    with pytest.raises(BadInput, match="row 5 is out of the range of float32"):
+        NativeRasterizer().render(exact, view, NEAR)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_splats_and_splats_behind_the_camera_give_black(kind):
+    shown, view = make("plain", kind)
+    behind = shown.means - 5 * view.world_to_camera[2, :3].float()
+    for some in (rows(shown, slice(0, 0)), replace(shown, means=behind)):
+        render = NativeRasterizer().render(some, view, NEAR)
+        assert not any(value.any() for value in render.maps.present().values())
+        assert not render.seen.any() and not render.radii.any()
+        gradients = render.backward(Maps(color=torch.ones(3, 47, 61)))
+        assert gradients.means.shape == some.means.shape and not gradients.means.any()
+        total, count = NativeRasterizer().contribution(some, view, NEAR, 0.5, 0.5)
+        assert len(total) == len(count) == len(some) and not count.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 15), (33, 2), (3, 50)])
+def test_images_of_any_size(kind, size):
+    shown, view = make("plain", kind, 1)
+    view = view.resized(*size)
+    exact = double(shown)
+    drawn, render = draw(exact, view, NEAR), NativeRasterizer().render(shown, view, NEAR)
+    assert not different_maps(render.maps, drawn.maps, ~drawn.near_threshold)
+    total = Maps(color=(Draw(1).normal(3, size[1], size[0]) * ~drawn.near_threshold).float())
+    assert not different_gradients(render.backward(total), Reference().render(exact, view, NEAR).backward(total))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_splat_at_the_centre_of_the_camera_changes_nothing(kind):
+    shown, view = make("plain", kind, 3)
+    shown.means[3] = view.centre.float()
+    render = NativeRasterizer().render(shown, view, NEAR)
+    gradients = render.backward(Maps(color=torch.ones(3, 47, 61)))
+    assert not render.seen[3] and not gradients.means[3].any()
+    assert all(torch.isfinite(value).all() for value in gradients.tensors().values())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_near_hides_what_is_closer(kind):
+    shown, view = make("plain", kind)
+    pose = view.world_to_camera
+    z = shown.means.double() @ pose[2, :3] + pose[2, 3]
+    near = z.median().item() + 1e-4
+    render, true = (r.render(s, view, near) for r, s in ((NativeRasterizer(), shown), (Reference(), double(shown))))
+    assert not render.seen[z <= near].any() and render.seen[z > near].any()
+    clear = ~draw(double(shown), view, near).near_threshold
+    assert not different_maps(render.maps, true.maps, clear)
