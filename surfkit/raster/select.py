@@ -24,7 +24,7 @@ def select(device: Device = "auto") -> tuple[Rasterizer, str]:
 
     warnings.warn(
         "surfkit was installed without its compiled rasterizer (no C++ compiler was found): the reference in torch "
-        "draws instead, about a hundred times slower. Install GCC or Clang, then `pip install --force-reinstall surfkit`.",
+        "draws instead, about a hundred times slower; install GCC or Clang, then surfkit again",
         stacklevel=2,
     )
     return Reference(), f"cpu reference ({torch.__version__})"

@@ -7,7 +7,22 @@ import numpy as np
 import pytest
 import torch
 from plain import evaluate, harmonics
-from scenes import CASES, KINDS, NEAR, Draw, axis_camera, camera, crop, double, leaves, make, plain, quaternions, rows, splats
+from scenes import (
+    CASES,
+    KINDS,
+    NEAR,
+    Draw,
+    axis_camera,
+    camera,
+    crop,
+    double,
+    leaves,
+    make,
+    plain,
+    quaternions,
+    rows,
+    splats,
+)
 
 from surfkit.raster.api import Maps, Splats
 from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
@@ -71,7 +86,9 @@ def test_everything_is_finite(name, kind):
     shown, view = small(name, kind)
     render = Reference().render(shown, view, NEAR)
     draws = Draw(0)
-    gradients = render.backward(Maps(**{key: draws.normal(*value.shape) for key, value in render.maps.present().items()}))
+    gradients = render.backward(
+        Maps(**{key: draws.normal(*value.shape) for key, value in render.maps.present().items()})
+    )
     values = {**render.maps.present(), **gradients.tensors(), "signal": gradients.signal, "radii": render.radii}
     for key, value in values.items():
         assert torch.isfinite(value).all(), key

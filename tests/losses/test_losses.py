@@ -1,0 +1,134 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
+from surfkit.losses.base import Sample
+from surfkit.raster import native
+from surfkit.raster.api import Maps
+from surfkit.raster.normals import disagreement, disagreement_reference, normals_of
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import View
+
+CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 55.0, 17.0, 21.0, 41, 37)
+
+
+def sample(photo=None) -> Sample:
+    return Sample(View("a", CAMERA, None), photo)
+
+
+def plane_depth(normal, offset: float) -> torch.Tensor:
+    """Depth of the plane normal . p = offset at the camera's pixels."""
+    rays = CAMERA.rays(torch.float64)
+    return offset / (torch.tensor(normal, dtype=torch.float64)[:, None, None] * rays).sum(0)
+
+
+def test_normals_of_a_plane_are_the_planes_own():
+    normal = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
+    found, valid = normals_of(plane_depth(normal, -2.0), CAMERA)
+    assert valid.all()
+    assert (found - torch.tensor(normal)[:, None, None]).abs().max() < 1e-12
+
+
+def test_normals_of_a_sphere_point_from_its_centre():
+    rays, centre, radius = CAMERA.rays(torch.float64), torch.tensor([0.1, -0.2, 4.0], dtype=torch.float64), 1.0
+    b, a = (rays * centre[:, None, None]).sum(0), rays.square().sum(0)
+    gap = b.square() - a * (centre.square().sum() - radius**2)
+    depth = torch.where(gap > 0, (b - gap.clamp_min(0).sqrt()) / a, 0.0)
+    found, valid = normals_of(depth, CAMERA)
+    exact = ((rays * depth - centre[:, None, None]) / radius)[:, 1:-1, 1:-1]
+    frontal = valid & (exact[2] < -0.7)  # differences are coarse where the sphere turns away
+    assert frontal.sum() > 50
+    assert ((found * exact).sum(0)[frontal] > 0.999).all()
+
+
+def test_pixels_beside_a_hole_have_no_normal():
+    depth = plane_depth((0.0, 0.0, -1.0), -2.0)
+    depth[10, 12] = 0
+    _, valid = normals_of(depth, CAMERA)
+    holes = {(int(y) + 1, int(x) + 1) for y, x in (~valid).nonzero()}
+    assert holes == {(9, 12), (11, 12), (10, 11), (10, 13)}
+
+
+def random_maps(seed: int = 0) -> Maps:
+    draw = torch.Generator().manual_seed(seed)
+    size = (CAMERA.height, CAMERA.width)
+    depth = torch.rand(size, generator=draw) * 0.1 + 1
+    depth[torch.rand(size, generator=draw) < 0.03] = 0
+    return Maps(
+        color=torch.rand(3, *size, generator=draw),
+        alpha=torch.rand(size, generator=draw),
+        depth=depth,
+        median=depth,
+        normal=torch.randn(3, *size, generator=draw),
+        distortion=torch.rand(size, generator=draw),
+    )
+
+
+@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its native module")
+@pytest.mark.parametrize("kernels", native.module().kernels() if native.module() else [])
+def test_the_native_normals_agree_with_the_reference(kernels):
+    maps, before = random_maps(), native.module().kernels_in_use()
+    leaves = {name: getattr(maps, name).clone().requires_grad_() for name in ("median", "normal")}
+    doubles = {name: value.detach().double().requires_grad_() for name, value in leaves.items()}
+    try:
+        native.module().use_kernels(kernels)
+        value = disagreement(leaves["median"], maps.alpha, leaves["normal"], CAMERA)
+        (3 * value).backward()
+    finally:
+        native.module().use_kernels(before)
+    wanted = disagreement_reference(doubles["median"], maps.alpha.double(), doubles["normal"], CAMERA)
+    (3 * wanted).backward()
+    assert value.item() == pytest.approx(wanted.item(), rel=1e-6)
+    for name, leaf in leaves.items():
+        error = (leaf.grad - doubles[name].grad).norm() / doubles[name].grad.norm()
+        assert error < 1e-5, name
+
+
+def test_the_reference_disagreement_has_the_right_gradient():
+    small = Camera(torch.eye(4, dtype=torch.float64), 9.0, 8.0, 2.0, 3.5, 6, 5)
+    draw = torch.Generator().manual_seed(1)
+    depth = (torch.rand(5, 6, generator=draw, dtype=torch.float64) + 1).requires_grad_()
+    normal = torch.randn(3, 5, 6, generator=draw, dtype=torch.float64).requires_grad_()
+    alpha = torch.rand(5, 6, generator=draw, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda d, n: disagreement_reference(d, alpha, n, small), (depth, normal))
+
+
+def test_normal_consistency_is_zero_where_splats_lie_in_the_surface():
+    normal = torch.tensor([0.0, 0.6, -0.8])
+    depth = plane_depth(normal.double().numpy(), -3.0).float()
+    flat = normal[:, None, None].expand(3, CAMERA.height, CAMERA.width)
+    maps = Maps(alpha=torch.ones_like(depth), depth=depth, median=depth, normal=flat.contiguous())
+    for which in ("median", "expected"):
+        assert NormalConsistency(depth=which)(maps, sample()).abs() < 1e-5
+    turned = Maps(alpha=maps.alpha, depth=depth, median=depth, normal=-maps.normal)
+    assert NormalConsistency(depth="median")(turned, sample()).item() == pytest.approx(2.0, abs=1e-5)
+
+
+def test_normal_consistency_does_not_pull_alpha():
+    maps = random_maps()
+    alpha = maps.alpha.clone().requires_grad_()
+    loss = NormalConsistency(depth="median")(Maps(alpha=alpha, median=maps.median, normal=maps.normal), sample())
+    assert not loss.requires_grad or torch.autograd.grad(loss, alpha, allow_unused=True)[0] is None
+
+
+def test_photometric_losses():
+    maps, draw = random_maps(), torch.Generator().manual_seed(2)
+    photo = torch.rand(3, CAMERA.height, CAMERA.width, generator=draw)
+    expected = np.abs(maps.color.numpy() - photo.numpy()).mean()
+    assert L1()(maps, sample(photo)).item() == pytest.approx(expected, rel=1e-6)
+    assert SSIM()(maps, sample(maps.color)).item() == pytest.approx(0.0, abs=1e-6)
+    assert 0 < SSIM()(maps, sample(photo)).item() < 2
+
+
+def test_distortion_is_in_units_of_the_extent():
+    maps = random_maps()
+    assert Distortion(unit=0.5)(maps, sample()).item() == pytest.approx(0.25 * maps.distortion.mean().item(), rel=1e-6)
+
+
+def test_weights_begin_after_their_start():
+    loss = NormalConsistency(weight=0.05, start=70)
+    assert [loss.weight_at(index, 300) for index in (1, 70, 71, 300)] == [0, 0, 0.05, 0.05]
+    assert L1().weight_at(1, 300) == 0.8 and math.isclose(SSIM().weight_at(300, 300), 0.2)
