@@ -2,7 +2,7 @@
 VENV ?= .venv
 PYTHON ?= python3
 PY = $(VENV)/bin/python
-STEPS ?= 2000
+STEPS ?= 1000
 OUT ?= runs/demo
 
 .PHONY: demo test lint bench clean

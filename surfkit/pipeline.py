@@ -152,7 +152,7 @@ def claim(this: Run, backend: str, notes: list[str]) -> None:
         path,
         {
             "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
-            "plugins": [str(plugin) for plugin in records()],
+            "plugins": [str(plugin) for plugin in records() if plugin.distribution],
             "device": backend,
             "threads": torch.get_num_threads(),
             "seed": this.recipe.seed,

@@ -51,7 +51,7 @@ def test_maps_equal_a_plain_loop(name, kind):
     assert len(looped(name, kind).blended) > 20
     for key, value in drawn.maps.present().items():
         error = (value - torch.from_numpy(expected[key])).abs() * ~drawn.near_threshold
-        # Where the ray nearly lies in the disc's plane, a rounding of 1e-16 moves the hit by 1e-16 / 1e-7 sigmas or more.
+        # Where a ray nearly lies in the disc's plane, a rounding moves the hit by 1e7 times as much.
         assert error.max() < (1e-7 if (name, kind) == ("edge_on", "surfel") else 1e-10), key
 
 
@@ -227,7 +227,7 @@ def cotangents(view, seed: int = 7) -> dict:
 
 
 def test_the_signal_of_gaussians_is_the_slope_of_a_shift_on_the_screen():
-    """Moving the principal point moves every splat on the screen and changes nothing else; one splat is drawn at a time."""
+    """Moving the principal point moves every splat on the screen and changes nothing else."""
     shown, view = few("gaussian", 2)
     by = cotangents(view)
     for which in (slice(0, 1), slice(1, 2), slice(2, 3), slice(0, 3)):
