@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from surfkit.raster.api import (
     ALPHA_MAX,
@@ -74,6 +75,7 @@ class Drawn:
 
 def rotations(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotations of (N, 4) quaternions wxyz of any length."""
+    quats = quats / quats.detach().abs().amax(1, keepdim=True)  # lest the squares leave the range
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -108,7 +110,8 @@ def sh_basis(directions: Tensor, count: int) -> Tensor:
 def colors(splats: Splats, camera: Camera) -> Tensor:
     """(N, 3) colours of the splats as seen from the camera, not negative."""
     offset = splats.means - camera.centre.to(splats.means)
-    directions = offset / offset.norm(dim=1, keepdim=True)
+    length = offset.norm(dim=1, keepdim=True)
+    directions = offset / torch.where(length > 0, length, 1.0)
     basis = sh_basis(directions, splats.sh.shape[1])
     return ((basis[:, :, None] * splats.sh).sum(1) + 0.5).clamp_min(0)
 
@@ -166,15 +169,17 @@ def surfels(splats: Splats, camera: Camera, near: float) -> Footprints:
     def at(rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         u_row, v_row, w_row = t_u[rows][:, None], t_v[rows][:, None], t_w[rows][:, None]
         ray = torch.linalg.cross(x[None, :, None] * w_row - u_row, y[None, :, None] * w_row - v_row)
-        flat = ray[..., 2] == 0
-        uv = ray[..., :2] / torch.where(flat, 1.0, ray[..., 2])[..., None]
+        # Where the ray misses the plane, or so nearly that a slope leaves the range, no infinity enters the graph.
+        meets = torch.isfinite(ray.detach()[..., :2] / ray.detach()[..., 2:] / ray.detach()[..., 2:]).all(-1)
+        ray = torch.where(meets[..., None], ray, 1.0)
+        uv = ray[..., :2] / ray[..., 2:]
         rho_disc = (uv**2).sum(-1)
         offset = torch.stack([x[None] - low_pass[rows, :1], y[None] - low_pass[rows, 1:]], -1)
         rho_low = 2 * (offset**2).sum(-1)
-        on_disc = ~flat & (rho_disc <= rho_low)
+        on_disc = meets & (rho_disc <= rho_low)
         rho = torch.where(on_disc, rho_disc, rho_low)
         depth = (uv * w_row[..., :2]).sum(-1) + w_row[..., 2]
-        depth = torch.where(flat, z_low[rows], depth)
+        depth = torch.where(meets, depth, z_low[rows])
         return rho, clamped(depth, z_low[rows], z_high[rows]), splats.opacities[rows][:, None]
 
     normal = facing(axes[:, :, 2], centre.detach())
@@ -188,7 +193,8 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
     centre = splats.means @ turn.T + to_camera[:3, 3]
     axes = turn @ rotations(splats.quats)
     drawn = centre[:, 2] > near
-    z = torch.where(drawn, centre[:, 2], torch.ones_like(centre[:, 2]))
+    centre = torch.where(drawn[:, None], centre, torch.tensor([0, 0, 1]).to(centre))
+    z = centre[:, 2]
     tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
     jx = (centre[:, 0] / z).clamp(
         -camera.cx / camera.fx - 0.3 * tan_x, (camera.width - camera.cx) / camera.fx + 0.3 * tan_x
@@ -209,7 +215,8 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
     footprint = raw + DILATION * torch.eye(2).to(raw)
     opacity = splats.opacities
     if splats.antialias:
-        opacity = opacity * (torch.linalg.det(raw) / torch.linalg.det(footprint)).clamp_min(ANTIALIAS_FLOOR).sqrt()
+        kept, whole = (m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0] for m in (raw, footprint))
+        opacity = opacity * (kept / whole).clamp_min(ANTIALIAS_FLOOR).sqrt()
     drawn = drawn & (opacity > ALPHA_MIN)
     conic = torch.linalg.inv(footprint)
     screen = torch.stack([camera.fx * centre[:, 0] / z + camera.cx, camera.fy * centre[:, 1] / z + camera.cy], 1)
@@ -218,7 +225,7 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
     weight = (splats.scales.amin(1, keepdim=True) / splats.scales) ** 2 * (axes * ray[:, :, None]).sum(1)
     steep = (axes * weight[:, None]).sum(2)
     steep = steep / (steep * ray).sum(1, keepdim=True)
-    slope = -z[:, None] * steep[:, :2] / torch.tensor([camera.fx, camera.fy]).to(steep)
+    slope = -z[:, None] * steep[:, :2] / torch.tensor([camera.fx, camera.fy], dtype=steep.dtype)
     with torch.no_grad():
         k = (2 * (opacity / ALPHA_MIN).clamp_min(1).log()).sqrt()
         half = k[:, None] * torch.stack([footprint[:, 0, 0], footprint[:, 1, 1]], 1).sqrt()
@@ -248,36 +255,39 @@ def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> D
     """
     validate(splats)
     prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
-    height, width = camera.height, camera.width
-    channels = torch.zeros(10, height, width, dtype=splats.means.dtype)
-    near_threshold = torch.zeros(height, width, dtype=torch.bool)
+    near_threshold = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     seen = torch.zeros(len(splats), dtype=torch.bool)
-    strips = []
-    for y0 in range(0, height, TILE):
-        strip = []
-        for x0 in range(0, width, TILE):
-            y1, x1 = min(y0 + TILE, height), min(x0 + TILE, width)
-            rows = _in_tile(prints, (x0, y0, x1, y1), cull)
-            x, y = _pixels(x0, y0, x1, y1, channels.dtype)
-            block, risky, touched = _blend(prints, rows, x, y)
-            seen[rows[touched]] = True
-            near_threshold[y0:y1, x0:x1] = risky.view(y1 - y0, x1 - x0)
-            strip.append(block.view(10, y1 - y0, x1 - x0))
-        strips.append(torch.cat(strip, 2))
-    channels = torch.cat(strips, 1)
+    blocks = []
+    for tile in _tiles(camera):
+        x0, y0, x1, y1 = tile
+        rows, x, y = _in_tile(prints, tile, cull), *_pixels(tile, splats.means.dtype)
+        # The way back draws the tile again, so that one tile at a time is in memory and not the whole view.
+        block, risky, touched = checkpoint(_blend, prints, rows, x, y, use_reentrant=False, preserve_rng_state=False)
+        seen[rows[touched]] = True
+        near_threshold[y0:y1, x0:x1] = risky.view(y1 - y0, x1 - x0)
+        blocks.append(block.view(10, y1 - y0, x1 - x0))
+    across = -(-camera.width // TILE)
+    channels = torch.cat([torch.cat(blocks[i : i + across], 2) for i in range(0, len(blocks), across)], 1)
     maps = Maps(channels[0:3], channels[3], channels[4], channels[5], channels[6:9], channels[9])
     return Drawn(maps, prints, seen, near_threshold)
 
 
-def _pixels(x0: int, y0: int, x1: int, y1: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    y, x = torch.meshgrid(
-        torch.arange(y0, y1, dtype=dtype) + 0.5, torch.arange(x0, x1, dtype=dtype) + 0.5, indexing="ij"
-    )
-    return x.flatten(), y.flatten()
+def _tiles(camera: Camera) -> Iterator[tuple[int, int, int, int]]:
+    """Left, upper, right and lower edge of each tile, row by row."""
+    for y0 in range(0, camera.height, TILE):
+        for x0 in range(0, camera.width, TILE):
+            yield x0, y0, min(x0 + TILE, camera.width), min(y0 + TILE, camera.height)
+
+
+def _pixels(tile: tuple[int, int, int, int], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """x and y of the pixel centres in a tile, (P,) each."""
+    x0, y0, x1, y1 = tile
+    y, x = torch.meshgrid(torch.arange(y0, y1) + 0.5, torch.arange(x0, x1) + 0.5, indexing="ij")
+    return x.flatten().to(dtype), y.flatten().to(dtype)
 
 
 def _in_tile(prints: Footprints, tile: tuple[int, int, int, int], cull: bool) -> Tensor:
-    """Rows of the splats that may touch a tile, front to back."""
+    """Rows of the splats that may touch a tile, front to back; the order of float32 depths, in every precision."""
     keep = prints.drawn.clone()
     if cull:
         low = torch.tensor(tile[:2]).to(prints.half)
@@ -287,8 +297,8 @@ def _in_tile(prints: Footprints, tile: tuple[int, int, int, int], cull: bool) ->
     return rows[prints.z.detach()[rows].float().argsort(stable=True)]
 
 
-def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Alpha of the blended splats (else 0), transmittance before each, depth, and pixels near a threshold."""
+def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+    """Alpha of the blended splats (else 0), transmittance before each, depth; pixels near a threshold, rows touching."""
     rho, depth, opacity = prints.at(rows, x, y)
     raw = opacity * torch.exp(-rho / 2)
     alpha = torch.where(raw >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))
@@ -298,14 +308,14 @@ def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Ten
     with torch.no_grad():
         margins = [(raw / ALPHA_MIN - 1).abs(), (after / T_MIN - 1).abs(), (after / 0.5 - 1).abs()]
         risky = (torch.stack(margins) < 1e-4).any(0).any(0)
-    return torch.where(blended, alpha, 0.0), before, depth, risky
+    return torch.where(blended, alpha, 0.0), before, depth, risky, (alpha > 0).any(1)
 
 
 def _blend(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The ten channels at P pixels, (10, P), the pixels near a threshold, (P,), and the rows that touch one, (n,)."""
+    """The ten channels at P pixels, (10, P), the pixels near a threshold, (P,), and whether a row touches one, (n,)."""
     if not len(rows):
         return torch.zeros(10, len(x), dtype=x.dtype), torch.zeros(len(x), dtype=torch.bool), rows.bool()
-    alpha, before, depth, risky = _alphas(prints, rows, x, y)
+    alpha, before, depth, risky, touched = _alphas(prints, rows, x, y)
     weight = alpha * before
     total = weight.sum(0)
     met = (alpha > 0) & (before > 0.5)
@@ -319,7 +329,7 @@ def _blend(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tens
     bend = (weight * (inverse**2 * ahead + ahead2 - 2 * inverse * ahead1)).sum(0)
     parts = [prints.color[rows].T @ weight, total[None], (weight * depth).sum(0)[None], median[None]]
     block = torch.cat([*parts, prints.normal[rows].T @ weight, bend[None]])
-    return block, risky, (alpha > 0).any(1)
+    return block, risky, touched
 
 
 class Reference(Rasterizer):
@@ -341,21 +351,13 @@ class Reference(Rasterizer):
         count = torch.zeros(len(splats), dtype=torch.int64)
         with torch.no_grad():
             prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
-            for rows, x, y in _tiles(prints, camera):
-                alpha, before, _, _ = _alphas(prints, rows, x, y)
+            for tile in _tiles(camera):
+                rows, x, y = _in_tile(prints, tile, True), *_pixels(tile, total.dtype)
+                alpha, before, *_ = _alphas(prints, rows, x, y)
                 term = torch.where(alpha > 0, alpha**alpha_power * before**transmittance_power, 0.0)
                 total[rows] += term.sum(1)
                 count[rows] += (alpha > 0).sum(1)
         return total, count
-
-
-def _tiles(prints: Footprints, camera: Camera) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    for y0 in range(0, camera.height, TILE):
-        for x0 in range(0, camera.width, TILE):
-            y1, x1 = min(y0 + TILE, camera.height), min(x0 + TILE, camera.width)
-            rows = _in_tile(prints, (x0, y0, x1, y1), True)
-            if len(rows):
-                yield rows, *_pixels(x0, y0, x1, y1, prints.half.dtype)
 
 
 class ReferenceRender(Render):

@@ -18,38 +18,70 @@ constexpr float kAlphaMax = 0.99f;
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr double kCutoffSquared = 11.082527090316832;  // 2 ln 255: opacity 1 falls to kAlphaMin at this many sigmas^2
-constexpr double kDilation = 0.3;                       // px^2, added to a gaussian's footprint
+constexpr double kDilation = 0.3;                      // px^2, added to a gaussian's footprint
 constexpr double kAntialiasFloor = 2.5e-5;
 
-// ---------------------------------------------------------------------------------------------------- small vectors
+// ---- small vectors
 
-template <class R> struct Vec {
+template <class R>
+struct Vec {
     R x, y, z;
 };
-template <class R> SPLAT_FN Vec<R> operator+(Vec<R> a, Vec<R> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-template <class R> SPLAT_FN Vec<R> operator-(Vec<R> a, Vec<R> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-template <class R> SPLAT_FN Vec<R> operator*(R s, Vec<R> a) { return {s * a.x, s * a.y, s * a.z}; }
-template <class R> SPLAT_FN Vec<R> times(Vec<R> a, Vec<R> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
-template <class R> SPLAT_FN R dot(Vec<R> a, Vec<R> b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-template <class R> SPLAT_FN Vec<R> cross(Vec<R> a, Vec<R> b) {
+template <class R>
+SPLAT_FN Vec<R> operator+(Vec<R> a, Vec<R> b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class R>
+SPLAT_FN Vec<R> operator-(Vec<R> a, Vec<R> b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class R>
+SPLAT_FN Vec<R> operator*(R s, Vec<R> a) {
+    return {s * a.x, s * a.y, s * a.z};
+}
+template <class R>
+SPLAT_FN Vec<R> times(Vec<R> a, Vec<R> b) {
+    return {a.x * b.x, a.y * b.y, a.z * b.z};
+}
+template <class R>
+SPLAT_FN R dot(Vec<R> a, Vec<R> b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class R>
+SPLAT_FN Vec<R> cross(Vec<R> a, Vec<R> b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-template <class R> SPLAT_FN R largest(R a, R b) { return a > b ? a : b; }
-template <class R> SPLAT_FN R smallest(R a, R b) { return a < b ? a : b; }
-template <class R> SPLAT_FN R magnitude(R a) { return a < 0 ? -a : a; }
+template <class R>
+SPLAT_FN R largest(R a, R b) {
+    return a > b ? a : b;
+}
+template <class R>
+SPLAT_FN R smallest(R a, R b) {
+    return a < b ? a : b;
+}
+template <class R>
+SPLAT_FN R magnitude(R a) {
+    return a < 0 ? -a : a;
+}
 
 // A 3 x 3 matrix by columns.
-template <class R> struct Mat {
+template <class R>
+struct Mat {
     Vec<R> c0, c1, c2;
 };
-template <class R> SPLAT_FN Vec<R> mul(const Mat<R>& m, Vec<R> v) { return v.x * m.c0 + v.y * m.c1 + v.z * m.c2; }
-template <class R> SPLAT_FN Vec<R> mul_transposed(const Mat<R>& m, Vec<R> v) {
+template <class R>
+SPLAT_FN Vec<R> mul(const Mat<R>& m, Vec<R> v) {
+    return v.x * m.c0 + v.y * m.c1 + v.z * m.c2;
+}
+template <class R>
+SPLAT_FN Vec<R> mul_transposed(const Mat<R>& m, Vec<R> v) {
     return {dot(m.c0, v), dot(m.c1, v), dot(m.c2, v)};
 }
 
-// ------------------------------------------------------------------------------------------------------------- camera
+// ---- camera
 
-template <class R> struct CameraModel {
+template <class R>
+struct CameraModel {
     Mat<R> turn;    // world to camera
     Vec<R> shift;   // world to camera
     Vec<R> centre;  // in the world
@@ -58,17 +90,19 @@ template <class R> struct CameraModel {
     int width, height;
 };
 
-// ----------------------------------------------------------------------------------------------------------- rotation
+// ---- rotation
 
 // Columns of the rotation of a unit quaternion w, x, y, z.
-template <class R> SPLAT_FN Mat<R> rotation(R w, R x, R y, R z) {
+template <class R>
+SPLAT_FN Mat<R> rotation(R w, R x, R y, R z) {
     return {{1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)},
             {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)},
             {2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)}};
 }
 
 // dL/d(quaternion of any length) from dL/d(rotation), g by columns.
-template <class R> SPLAT_FN void rotation_backward(const R q[4], R length, const Mat<R>& g, R out[4]) {
+template <class R>
+SPLAT_FN void rotation_backward(const R q[4], R length, const Mat<R>& g, R out[4]) {
     const R w = q[0] / length, x = q[1] / length, y = q[2] / length, z = q[3] / length;
     const R g00 = g.c0.x, g10 = g.c0.y, g20 = g.c0.z, g01 = g.c1.x, g11 = g.c1.y, g21 = g.c1.z, g02 = g.c2.x,
             g12 = g.c2.y, g22 = g.c2.z;
@@ -83,10 +117,11 @@ template <class R> SPLAT_FN void rotation_backward(const R q[4], R length, const
     out[3] = (dz - z * along) / length;
 }
 
-// ------------------------------------------------------------------------------------------------ spherical harmonics
+// ---- spherical harmonics
 
 // Real spherical harmonics of degree <= 3 at a unit direction; `count` is 1, 4, 9 or 16.
-template <class R> SPLAT_FN void sh_basis(Vec<R> d, int count, R b[16]) {
+template <class R>
+SPLAT_FN void sh_basis(Vec<R> d, int count, R b[16]) {
     const R x = d.x, y = d.y, z = d.z;
     b[0] = R(0.28209479177387814);
     if (count < 4) return;
@@ -111,7 +146,8 @@ template <class R> SPLAT_FN void sh_basis(Vec<R> d, int count, R b[16]) {
 }
 
 // sum over k of w[k] d(basis k)/d(direction): the gradient of the polynomials above.
-template <class R> SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
+template <class R>
+SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
     Vec<R> g{0, 0, 0};
     if (count < 4) return g;
     const R x = d.x, y = d.y, z = d.z;
@@ -125,9 +161,10 @@ template <class R> SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16
     g.z += c2 * (-y * w[5] - x * w[7]) + 4 * c20 * z * w[6];
     if (count < 16) return g;
     const R xx = x * x, yy = y * y, zz = z * z;
-    const R k9 = R(-0.5900435899266435) * w[9], k10 = R(2.890611442640554) * w[10], k11 = R(-0.4570457994644658) * w[11],
-            k12 = R(0.3731763325901154) * w[12], k13 = R(-0.4570457994644658) * w[13],
-            k14 = R(1.445305721320277) * w[14], k15 = R(-0.5900435899266435) * w[15];
+    const R k9 = R(-0.5900435899266435) * w[9], k10 = R(2.890611442640554) * w[10],
+            k11 = R(-0.4570457994644658) * w[11], k12 = R(0.3731763325901154) * w[12],
+            k13 = R(-0.4570457994644658) * w[13], k14 = R(1.445305721320277) * w[14],
+            k15 = R(-0.5900435899266435) * w[15];
     g.x += 6 * x * y * k9 + y * z * k10 - 2 * x * y * k11 - 6 * x * z * k12 + (4 * zz - 3 * xx - yy) * k13 +
            2 * x * z * k14 + 3 * (xx - yy) * k15;
     g.y += 3 * (xx - yy) * k9 + x * z * k10 + (4 * zz - xx - 3 * yy) * k11 - 6 * y * z * k12 - 2 * x * y * k13 -
@@ -136,16 +173,19 @@ template <class R> SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16
     return g;
 }
 
-// ------------------------------------------------------------------------------------------------- one splat, its parts
+// ---- one splat, its parts
+// parts
 
-template <class R> struct SplatIn {
+template <class R>
+struct SplatIn {
     Vec<R> mean;
     R quat[4];
     R scale[3];  // the third is unused by surfels
     R opacity;
 };
 
-template <class R> struct SplatGrad {
+template <class R>
+struct SplatGrad {
     Vec<R> mean{0, 0, 0};
     R quat[4]{0, 0, 0, 0};
     R scale[3]{0, 0, 0};
@@ -156,22 +196,26 @@ template <class R> struct SplatGrad {
 
 // The region of the image in which alpha >= kAlphaMin: an ellipse about (mx, my) with the matrix (hxx, hxy, hyy), and a
 // disc about (dx, dy) (surfels' low-pass filter; r2 < 0 if there is none). Pixels.
-template <class R> struct Bound {
+template <class R>
+struct Bound {
     R mx, my, hxx, hxy, hyy;
     R dx, dy, r2;
 };
 
 // Camera-frame quantities that the forward and the backward of both kinds share.
-template <class R> struct Posed {
-    Vec<R> c;      // centre
-    Mat<R> axes;   // columns of the rotation
-    R length;      // of the quaternion
+template <class R>
+struct Posed {
+    Vec<R> c;     // centre
+    Mat<R> axes;  // columns of the rotation
+    R length;     // of the quaternion
 };
 
-template <class R> SPLAT_FN Posed<R> pose(const SplatIn<R>& s, const CameraModel<R>& cam) {
+template <class R>
+SPLAT_FN Posed<R> pose(const SplatIn<R>& s, const CameraModel<R>& cam) {
     Posed<R> p;
     p.c = mul(cam.turn, s.mean) + cam.shift;
-    p.length = square_root(s.quat[0] * s.quat[0] + s.quat[1] * s.quat[1] + s.quat[2] * s.quat[2] + s.quat[3] * s.quat[3]);
+    p.length =
+        square_root(s.quat[0] * s.quat[0] + s.quat[1] * s.quat[1] + s.quat[2] * s.quat[2] + s.quat[3] * s.quat[3]);
     const Mat<R> r = rotation(s.quat[0] / p.length, s.quat[1] / p.length, s.quat[2] / p.length, s.quat[3] / p.length);
     p.axes = {mul(cam.turn, r.c0), mul(cam.turn, r.c1), mul(cam.turn, r.c2)};
     return p;
@@ -187,10 +231,11 @@ SPLAT_FN void pose_backward(const SplatIn<R>& s, const CameraModel<R>& cam, R le
     rotation_backward(s.quat, length, dr, out.quat);
 }
 
-// ------------------------------------------------------------------------------------------------------------- surfels
+// ---- surfels
 
 // Rows of the homography from the disc's (u, v, 1) to (x w, y w, w) (2DGS, eq. 7 f.).
-template <class R> struct Homography {
+template <class R>
+struct Homography {
     Vec<R> u, v, w;
 };
 
@@ -204,11 +249,13 @@ SPLAT_FN Homography<R> homography(const SplatIn<R>& s, const Posed<R>& p, const 
 
 // The box of the k-sigma contour: its centre, and f with centre = (f.(Tu Tw), f.(Tv Tw)). False if it meets the camera
 // plane.
-template <class R> struct Contour {
+template <class R>
+struct Contour {
     Vec<R> t, f;
     R d, x, y;
 };
-template <class R> SPLAT_FN bool contour(const Homography<R>& h, R k_squared, Contour<R>& out) {
+template <class R>
+SPLAT_FN bool contour(const Homography<R>& h, R k_squared, Contour<R>& out) {
     out.t = {k_squared, k_squared, R(-1)};
     out.d = dot(out.t, times(h.w, h.w));
     if (!(out.d < 0)) return false;
@@ -218,14 +265,15 @@ template <class R> SPLAT_FN bool contour(const Homography<R>& h, R k_squared, Co
     return true;
 }
 
-template <class R> struct Surfel {
+template <class R>
+struct Surfel {
     Homography<R> h;
-    Contour<R> low;        // 3 sigma: its centre is the low-pass filter's
-    Vec<R> a, b, c;        // p = x a + y b + c about the anchor, divided by `unit`
-    R unit, det;           // det of the homography / unit: z = det / p.z
-    R ax, ay;              // anchor: a pixel centre near the splat, so that offsets stay small
+    Contour<R> low;  // 3 sigma: its centre is the low-pass filter's
+    Vec<R> a, b, c;  // p = x a + y b + c about the anchor, divided by `unit`
+    R unit, det;     // det of the homography / unit: z = det / p.z
+    R ax, ay;        // anchor: a pixel centre near the splat, so that offsets stay small
     R z_low, z_high;
-    R flip;                // sign that turns the normal to the camera
+    R flip;  // sign that turns the normal to the camera
     Bound<R> bound;
 };
 
@@ -239,9 +287,14 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     if (!contour(o.h, R(kCutoffSquared), edge) || !contour(o.h, R(9), o.low)) return false;
     const R k2 = smallest(2 * natural_log(s.opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5), R(kCutoffSquared));
     if (!contour(o.h, k2, edge)) return false;
-    o.bound = {edge.x, edge.y, edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
+    o.bound = {edge.x,
+               edge.y,
+               edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
                edge.x * edge.y - dot(edge.f, times(o.h.u, o.h.v)),
-               edge.y * edge.y - dot(edge.f, times(o.h.v, o.h.v)), o.low.x, o.low.y, k2 / 2};
+               edge.y * edge.y - dot(edge.f, times(o.h.v, o.h.v)),
+               o.low.x,
+               o.low.y,
+               k2 / 2};
     const R limit = R(1 << 22);
     o.ax = whole(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
     o.ay = whole(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
@@ -264,7 +317,8 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
 }
 
 // What the pixels hand back for a surfel: cotangents of a, b, c, det, the low-pass centre, colour, normal, opacity.
-template <class R> struct SurfelSums {
+template <class R>
+struct SurfelSums {
     Vec<R> a, b, c;
     R det;
     R low[2];
@@ -309,26 +363,33 @@ SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const Came
     pose_backward(s, cam, p.length, dc, Mat<R>{s.scale[0] * da, s.scale[1] * db, o.flip * g.normal}, out);
 }
 
-// ----------------------------------------------------------------------------------------------------------- gaussians
+// ---- gaussians
 
-template <class R> struct Gaussian {
-    R x, y;                // projected centre, pixels
-    R l00, l01, l11;       // rho = (l00 dx + l01 dy)^2 + (l11 dy)^2
-    R compensation;        // factor on the opacity (antialias)
-    R slope_x, slope_y;    // depth per pixel
+template <class R>
+struct Gaussian {
+    R x, y;              // projected centre, pixels
+    R l00, l01, l11;     // rho = (l00 dx + l01 dy)^2 + (l11 dy)^2
+    R compensation;      // factor on the opacity (antialias)
+    R slope_x, slope_y;  // depth per pixel
     R z, z_low, z_high;
     Vec<R> normal;
-    int thin;              // the axis of the smallest scale
+    int thin;  // the axis of the smallest scale
     R flip;
     Bound<R> bound;
     // for the backward
-    R cov[3], raw[2];      // footprint xx, xy, yy; xx and yy before dilation
-    R jx, jy;              // x / z and y / z as the Jacobian sees them
+    R cov[3], raw[2];  // footprint xx, xy, yy; xx and yy before dilation
+    R jx, jy;          // x / z and y / z as the Jacobian sees them
     bool clamped_x, clamped_y;
 };
 
-template <class R> SPLAT_FN R axis_scale(const SplatIn<R>& s, int k) { return s.scale[k]; }
-template <class R> SPLAT_FN Vec<R> column(const Mat<R>& m, int k) { return k == 0 ? m.c0 : k == 1 ? m.c1 : m.c2; }
+template <class R>
+SPLAT_FN R axis_scale(const SplatIn<R>& s, int k) {
+    return s.scale[k];
+}
+template <class R>
+SPLAT_FN Vec<R> column(const Mat<R>& m, int k) {
+    return k == 0 ? m.c0 : k == 1 ? m.c1 : m.c2;
+}
 
 template <class R>
 SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, bool antialias,
@@ -348,7 +409,8 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     o.thin = 0;
     for (int k = 0; k < 3; k++) {
         const Vec<R> r = column(p.axes, k);
-        const R mx = s.scale[k] * cam.fx / c.z * (r.x - o.jx * r.z), my = s.scale[k] * cam.fy / c.z * (r.y - o.jy * r.z);
+        const R mx = s.scale[k] * cam.fx / c.z * (r.x - o.jx * r.z),
+                my = s.scale[k] * cam.fy / c.z * (r.y - o.jy * r.z);
         xx += mx * mx;
         xy += mx * my;
         yy += my * my;
@@ -396,11 +458,12 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
 }
 
 // What the pixels hand back for a gaussian: moments of e = dL/d(power) about the centre, and the rest.
-template <class R> struct GaussianSums {
+template <class R>
+struct GaussianSums {
     R e_x, e_y, e_xx, e_xy, e_yy;
     R z, z_x, z_y;  // sums of dL/dz, and of it times the offset
     Vec<R> normal;
-    R opacity;      // of the compensated opacity
+    R opacity;  // of the compensated opacity
     R chosen_x, chosen_y, chosen_z;
 };
 
@@ -422,7 +485,8 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
     if (antialias) {
         const R det = qa > 0 ? o.cov[2] / qa : R(1), raw_det = largest(o.raw[0] * o.raw[1] - o.cov[1] * o.cov[1], R(0));
         if (raw_det / det > R(kAntialiasFloor)) {
-            const R dratio = g.opacity * s.opacity / (2 * o.compensation), d0 = dratio / det, d1 = -dratio * raw_det / det / det;
+            const R dratio = g.opacity * s.opacity / (2 * o.compensation), d0 = dratio / det,
+                    d1 = -dratio * raw_det / det / det;
             dxx += d0 * o.raw[1] + d1 * o.cov[2];
             dyy += d0 * o.raw[0] + d1 * o.cov[0];
             dxy += -(d0 + d1) * o.cov[1];
@@ -486,22 +550,26 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
     pose_backward(s, cam, p.length, dc, daxes, out);
 }
 
-// ------------------------------------------------------------------------------------------------------- tiles and rows
+// ---- tiles and rows
+// rows
 
 // What of a bound does not change from line to line.
-template <class R> struct Outline {
-    R hx, hy;    // half sides of the ellipse's box
-    R tilt;      // x of the ellipse's middle, per line
-    R wide;      // square of its half width on the line through its centre
-    R turn;      // the right-most point's ordinate
+template <class R>
+struct Outline {
+    R hx, hy;  // half sides of the ellipse's box
+    R tilt;    // x of the ellipse's middle, per line
+    R wide;    // square of its half width on the line through its centre
+    R turn;    // the right-most point's ordinate
 };
-template <class R> SPLAT_FN Outline<R> outline(const Bound<R>& b) {
+template <class R>
+SPLAT_FN Outline<R> outline(const Bound<R>& b) {
     const R hx = square_root(b.hxx), tilt = b.hxy / b.hyy;
     return {hx, square_root(b.hyy), tilt, largest(b.hxx - b.hxy * tilt, R(0)), b.hxy / hx};
 }
 
 // The pixels x in [low, high] of the bound on the lines y0 <= y <= y1; false if there are none.
-template <class R> SPLAT_FN bool bound_span(const Bound<R>& b, const Outline<R>& o, R y0, R y1, R& low, R& high) {
+template <class R>
+SPLAT_FN bool bound_span(const Bound<R>& b, const Outline<R>& o, R y0, R y1, R& low, R& high) {
     bool any = false;
     const R a = largest(y0 - b.my, -o.hy), z = smallest(y1 - b.my, o.hy);
     if (a <= z) {
@@ -522,11 +590,13 @@ template <class R> SPLAT_FN bool bound_span(const Bound<R>& b, const Outline<R>&
     return any;
 }
 
-// ----------------------------------------------------------------------------------------------------------- per pixel
+// ---- per pixel
 
 // rho of a surfel and its depth at (x, y) about the anchor. `on_disc` where the ray meets the disc nearer than the
-// low-pass filter, `free_z` where the depth is not clamped. u, v, inv are only meaningful on the disc, inv where free_z.
-template <class V> struct SurfelHit {
+// low-pass filter, `free_z` where the depth is not clamped. u, v, inv are only meaningful on the disc, inv where
+// free_z.
+template <class V>
+struct SurfelHit {
     V u, v, inv, rho, z, dx, dy;
 };
 template <class V, class S, class M>
@@ -546,7 +616,8 @@ SPLAT_FN SurfelHit<V> surfel_hit(const S& s, V x, V y, M& on_disc) {
     o.rho = select(on_disc, disc, low_rho);
     return o;
 }
-template <class V, class S, class M> SPLAT_FN V surfel_depth(const S& s, const SurfelHit<V>& hit, M& free_z) {
+template <class V, class S, class M>
+SPLAT_FN V surfel_depth(const S& s, const SurfelHit<V>& hit, M& free_z) {
     const V z = s.det * hit.inv;
     free_z = less_equal(s.z_low, z) & less_equal(z, s.z_high);
     return select(free_z, z, select(less_equal(s.z_high, z), s.z_high, s.z_low));

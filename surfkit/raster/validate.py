@@ -27,7 +27,7 @@ def validate(splats: Splats, values: bool = True) -> None:
     if not values:
         return
     for name, tensor in splats.tensors().items():
-        rows = tensor.detach().reshape(count, -1)
+        rows = tensor.detach().reshape(count, tensor[:1].numel() if count else 1)
         _refuse(~torch.isfinite(rows).all(1), name, "not finite")
         if name == "scales":
             _refuse(~(rows > 0).all(1), name, "not positive")

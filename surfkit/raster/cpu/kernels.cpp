@@ -1,14 +1,14 @@
-// The per-pixel kernels. Compiled three times (AVX-512, AVX2, baseline) with SURFKIT_KERNELS naming the table to define.
+// The per-pixel kernels. Compiled three times (AVX-512, AVX2, baseline) with SURFKIT_KERNELS naming the table to
+// define.
 //
 // A tile of 16 x 16 pixels is cut into blocks of 4 x (lanes / 4), one vector each. For each splat the rows of its
 // footprint tell which blocks it can touch; blocks whose rays have all ended are left out.
-#include <vector>
-
 #include "simd.h"
 
 #define SPLAT_FN static inline
 #include "../splat_math.h"
 #include "kernels.h"
+#include "images.h"
 
 namespace surfkit {
 namespace {
@@ -17,7 +17,7 @@ using splat::kAlphaMax;
 using splat::kAlphaMin;
 using splat::kTransmittanceMin;
 
-constexpr int kBlockRows = kLanes / 4;         // pixel rows in a block
+constexpr int kBlockRows = kLanes / 4;  // pixel rows in a block
 constexpr int kBlocksDown = kTile / kBlockRows;
 constexpr int kBlocks = 4 * kBlocksDown;
 constexpr float kMiddle = (kTile - 1) / 2.0f;
@@ -50,13 +50,21 @@ struct Tile {
     int64_t begin, end;
 
     Tile(const Job& j, int64_t index)
-        : job(j), x0((int)(index % j.tiles_x) * kTile), y0((int)(index / j.tiles_x) * kTile), ox(x0 + kTile / 2.0f), oy(y0 + kTile / 2.0f),
-          plane((size_t)j.width * j.height), begin(j.offsets[index]), end(j.offsets[index + 1]) {}
+        : job(j),
+          x0((int)(index % j.tiles_x) * kTile),
+          y0((int)(index / j.tiles_x) * kTile),
+          ox(x0 + kTile / 2.0f),
+          oy(y0 + kTile / 2.0f),
+          plane((size_t)j.width * j.height),
+          begin(j.offsets[index]),
+          end(j.offsets[index + 1]) {}
 
-    template <class T> void read(const T* from, int block, T* to) const {
+    template <class T>
+    void read(const T* from, int block, T* to) const {
         each_row(block, [&](size_t at, int lane, int n) { std::memcpy(to + lane, from + at, n * sizeof(T)); });
     }
-    template <class T> void write(T* to, int block, const T* from) const {
+    template <class T>
+    void write(T* to, int block, const T* from) const {
         each_row(block, [&](size_t at, int lane, int n) { std::memcpy(to + at, from + lane, n * sizeof(T)); });
     }
     Floats read(const float* from, int block) const {
@@ -83,7 +91,8 @@ struct Tile {
     }
 
   private:
-    template <class F> void each_row(int block, F f) const {
+    template <class F>
+    void each_row(int block, F f) const {
         const int x = x0 + block / kBlocksDown * 4, y = y0 + block % kBlocksDown * kBlockRows;
         const int n = job.width - x < 4 ? job.width - x : 4;
         if (n <= 0) return;
@@ -91,15 +100,18 @@ struct Tile {
     }
 };
 
-// The blocks a record's footprint touches, bit 16 * column + row of pixels. (sx, sy): the tile's centre less the anchor.
-template <class Record> inline uint64_t touched_blocks(const Record& s, float sx, float sy) {
+// The blocks a record's footprint touches, bit 16 * column + row of pixels. (sx, sy): the tile's centre less the
+// anchor.
+template <class Record>
+inline uint64_t touched_blocks(const Record& s, float sx, float sy) {
     const Floats far = broadcast(1e30f), tiny = broadcast(1e-20f);
     const float more = 1.0005f;  // the roots are rough
     uint64_t hit = 0;
     for (int v = 0; v < kTile / kLanes; v++) {
         const Floats y = lanes().count[v] + sy;
         const Floats dy = y - s.my, left = madd(dy * dy, -s.flat, broadcast(1.0f));
-        const Floats half = rough_root(higher(left * (s.wide * more), tiny)), mid = madd(dy, s.tilt, broadcast(s.mx - sx));
+        const Floats half = rough_root(higher(left * (s.wide * more), tiny)),
+                     mid = madd(dy, s.tilt, broadcast(s.mx - sx));
         const Mask on = less_equal(0.0f, left);
         Floats low = select(on, mid - half, far), high = select(on, mid + half, -far);
         if (s.disc_r2 > 0) {
@@ -110,7 +122,8 @@ template <class Record> inline uint64_t touched_blocks(const Record& s, float sx
             high = higher(high, select(disc, (s.disc_x - sx) + reach, -far));
         }
         for (int j = 0; j < 4; j++)
-            hit |= (uint64_t)bits(less_equal(low, 4.0f * j + 3 - kMiddle) & less_equal(4.0f * j - kMiddle, high)) << (16 * j + v * kLanes);
+            hit |= (uint64_t)bits(less_equal(low, 4.0f * j + 3 - kMiddle) & less_equal(4.0f * j - kMiddle, high))
+                   << (16 * j + v * kLanes);
     }
     if (kBlockRows > 1) hit |= hit >> 1;
     if (kBlockRows > 2) hit |= hit >> 2;
@@ -118,7 +131,7 @@ template <class Record> inline uint64_t touched_blocks(const Record& s, float sx
 }
 inline int block_at(int bit) { return bit / 16 * kBlocksDown + bit % 16 / kBlockRows; }
 
-// ------------------------------------------------------------------------------- the two kinds, at pixels of one tile
+// ---- the two kinds, at pixels of one tile
 
 struct LocalSurfel {
     float a[4], b[4], c[4], det, low_x, low_y, z_low, z_high, opacity;
@@ -134,8 +147,17 @@ struct LocalSurfel {
 struct LocalGaussian {
     float x, y, l00, l01, l11, z, slope_x, slope_y, z_low, z_high, opacity;
     LocalGaussian(const GaussianRecord& s, float sx, float sy)
-        : x(s.x - sx), y(s.y - sy), l00(s.l00), l01(s.l01), l11(s.l11), z(s.z), slope_x(s.slope_x), slope_y(s.slope_y),
-          z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {}
+        : x(s.x - sx),
+          y(s.y - sy),
+          l00(s.l00),
+          l01(s.l01),
+          l11(s.l11),
+          z(s.z),
+          slope_x(s.slope_x),
+          slope_y(s.slope_y),
+          z_low(s.z_low),
+          z_high(s.z_high),
+          opacity(s.opacity) {}
 };
 
 struct SurfelPixel {
@@ -178,20 +200,24 @@ struct Gaussians {
     static constexpr int sums = kGaussianSums, sums_chosen = kGaussianSumsChosen;
 };
 
-// Fetches into the cache what the entry `ahead` of k will need: records lie in the order of the splats, not of the tile.
-template <class K, int ahead> inline void fetch(const Tile& tile, int64_t k) {
+// Fetches into the cache what the entry `ahead` of k will need: records lie in the order of the splats, not of the
+// tile.
+template <class K, int ahead>
+inline void fetch(const Tile& tile, int64_t k) {
     const int64_t next = k + ahead;
     if (next < tile.begin || next >= tile.end) return;
     const char* at = (const char*)((const typename K::Record*)tile.job.records + tile.job.entries[next].record);
     for (size_t line = 0; line < sizeof(typename K::Record); line += 64) __builtin_prefetch(at + line);
 }
-template <class K> inline const typename K::Record& record_of(const Tile& tile, int64_t k) {
+template <class K>
+inline const typename K::Record& record_of(const Tile& tile, int64_t k) {
     return ((const typename K::Record*)tile.job.records)[tile.job.entries[k].record];
 }
 
-// -------------------------------------------------------------------------------------------------------------- forward
+// ---- forward
 
-template <class K, int level> void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
+template <class K, int level>
+void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
     Floats open[kBlocks], color[3][kBlocks], depth[kBlocks], median[kBlocks], normal[3][kBlocks];
     Floats bend[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
     Ints last[kBlocks], middle[kBlocks];
@@ -199,7 +225,8 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
     uint64_t rays = tile.inside();  // blocks with a ray that has not ended
     for (int b = 0; b < kBlocks; b++) {
         open[b] = broadcast(1.0f);
-        color[0][b] = color[1][b] = color[2][b] = depth[b] = median[b] = normal[0][b] = normal[1][b] = normal[2][b] = Floats{};
+        color[0][b] = color[1][b] = color[2][b] = depth[b] = median[b] = normal[0][b] = normal[1][b] = normal[2][b] =
+            Floats{};
         bend[b] = shift[b] = m1[b] = m2[b] = Floats{};
         last[b] = middle[b] = Ints{} - 1;
         alive[b] = tile.inside(b);
@@ -212,39 +239,39 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
         const Ints here = Ints{} + (int32_t)(k - tile.begin);
         uint64_t blended = 0;
         for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
-                const int bit = __builtin_ctzll(todo), b = block_at(bit);
-                typename K::Pixel at;
-                at.shape(local, lanes().x[b], lanes().y[b]);
-                const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
-                Mask m = less_equal(kAlphaMin, alpha) & alive[b];
-                if (!any(m)) continue;
-                const Floats before = open[b], after = before * (1.0f - alpha);
-                const Mask ends = m & lesser(after, kTransmittanceMin);
-                alive[b] = without(alive[b], ends);
-                if (!any(alive[b])) rays &= ~(1ull << bit);
-                m = without(m, ends);
-                blended |= (uint64_t)any(m) << bit;
-                const Floats w = keep(m, alpha * before);
-                for (int c = 0; c < 3; c++) color[c][b] = madd(w, s.color[c], color[c][b]);
-                if (level >= kGeometry) {
-                    at.depth(local);
-                    depth[b] = madd(w, at.z, depth[b]);
-                    for (int c = 0; c < 3; c++) normal[c][b] = madd(w, s.normal[c], normal[c][b]);
-                    const Mask half = m & lesser(0.5f, before);
-                    median[b] = select(half, at.z, median[b]);
-                    middle[b] = select(half, here, middle[b]);
-                }
-                if (level >= kDistortion) {
-                    const Floats m_z = reciprocal(at.z);
-                    shift[b] = select(m & equal(last[b], Ints{} - 1), m_z, shift[b]);
-                    const Floats d = m_z - shift[b], wd = w * d;
-                    bend[b] = bend[b] + w * madd(d * d, 1.0f - before, m2[b] - 2.0f * d * m1[b]);
-                    m1[b] = m1[b] + wd;
-                    m2[b] = madd(wd, d, m2[b]);
-                }
-                open[b] = select(m, after, before);
-                last[b] = select(m, here, last[b]);
+            const int bit = __builtin_ctzll(todo), b = block_at(bit);
+            typename K::Pixel at;
+            at.shape(local, lanes().x[b], lanes().y[b]);
+            const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+            Mask m = less_equal(kAlphaMin, alpha) & alive[b];
+            if (!any(m)) continue;
+            const Floats before = open[b], after = before * (1.0f - alpha);
+            const Mask ends = m & lesser(after, kTransmittanceMin);
+            alive[b] = without(alive[b], ends);
+            if (!any(alive[b])) rays &= ~(1ull << bit);
+            m = without(m, ends);
+            blended |= (uint64_t)any(m) << bit;
+            const Floats w = keep(m, alpha * before);
+            for (int c = 0; c < 3; c++) color[c][b] = madd(w, s.color[c], color[c][b]);
+            if (level >= kGeometry) {
+                at.depth(local);
+                depth[b] = madd(w, at.z, depth[b]);
+                for (int c = 0; c < 3; c++) normal[c][b] = madd(w, s.normal[c], normal[c][b]);
+                const Mask half = m & lesser(0.5f, before);
+                median[b] = select(half, at.z, median[b]);
+                middle[b] = select(half, here, middle[b]);
             }
+            if (level >= kDistortion) {
+                const Floats m_z = reciprocal(at.z);
+                shift[b] = select(m & equal(last[b], Ints{} - 1), m_z, shift[b]);
+                const Floats d = m_z - shift[b], wd = w * d;
+                bend[b] = bend[b] + w * madd(d * d, 1.0f - before, m2[b] - 2.0f * d * m1[b]);
+                m1[b] = m1[b] + wd;
+                m2[b] = madd(wd, d, m2[b]);
+            }
+            open[b] = select(m, after, before);
+            last[b] = select(m, here, last[b]);
+        }
         saved.blocks[k] = blended;
         if (!rays) break;
     }
@@ -272,10 +299,11 @@ template <class K, int level> void forward_tile(const Tile& tile, const Planes& 
     }
 }
 
-// ------------------------------------------------------------------------------------------------------------- backward
+// ---- backward
 
 // The cotangents of one group of losses over a tile, and the running sum of what lies behind.
-template <int level> struct Cotangents {
+template <int level>
+struct Cotangents {
     Floats color[3][kBlocks], depth[kBlocks], median[kBlocks], normal[3][kBlocks], bend[kBlocks], behind[kBlocks];
 
     void read(const Tile& tile, const Planes& p, const Floats* open, int b) {
@@ -293,7 +321,8 @@ template <int level> struct Cotangents {
     inline Floats per_weight(const Record& s, int b, Floats z, Floats d, Floats all, Floats m1, Floats m2) const {
         Floats dot = madd(color[0][b], s.color[0], madd(color[1][b], s.color[1], color[2][b] * s.color[2]));
         if (level >= kGeometry) {
-            dot = madd(normal[0][b], s.normal[0], madd(normal[1][b], s.normal[1], madd(normal[2][b], s.normal[2], dot)));
+            dot =
+                madd(normal[0][b], s.normal[0], madd(normal[1][b], s.normal[1], madd(normal[2][b], s.normal[2], dot)));
             dot = madd(depth[b], z, dot);
         }
         if (level >= kDistortion) dot = madd(bend[b], madd(d * d, all, m2 - 2.0f * d * m1), dot);
@@ -308,7 +337,8 @@ template <int level> struct Cotangents {
 };
 
 // Sums over the pixels of a tile for one splat; the order is that of the structs in splat_math.h.
-template <int level, int chosen> struct SurfelAdder {
+template <int level, int chosen>
+struct SurfelAdder {
     Floats s[chosen ? kSurfelSumsChosen : kSurfelSums] = {};
     inline void add(const SurfelPixel& at, Floats x, Floats y, Mask m, Floats e, Floats dz) {
         const Mask disc = at.on_disc & m;
@@ -365,7 +395,8 @@ template <int level, int chosen> struct SurfelAdder {
             }
     }
 };
-template <int level, int chosen> struct GaussianAdder {
+template <int level, int chosen>
+struct GaussianAdder {
     Floats s[chosen ? kGaussianSumsChosen : kGaussianSums] = {};
     // `e` is dL/d(rho / 2); the moments are of dL/d(power) = -e.
     inline void add(const GaussianPixel& at, Floats, Floats, Mask m, Floats e, Floats dz) {
@@ -392,10 +423,12 @@ template <int level, int chosen> struct GaussianAdder {
     inline void add_color(int c, Floats v) { s[12 + c] += v; }
     void finish(float, float, float* out) const { sum_lanes(s, chosen ? kGaussianSumsChosen : kGaussianSums, out); }
 };
-template <class K, int level, int chosen> struct AdderOf {
+template <class K, int level, int chosen>
+struct AdderOf {
     using Type = SurfelAdder<level, chosen>;
 };
-template <int level, int chosen> struct AdderOf<Gaussians, level, chosen> {
+template <int level, int chosen>
+struct AdderOf<Gaussians, level, chosen> {
     using Type = GaussianAdder<level, chosen>;
 };
 
@@ -434,47 +467,47 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
         const Ints here = Ints{} + (int32_t)(k - tile.begin);
         typename AdderOf<K, level, chosen>::Type adder;
         for (uint64_t todo = blended; todo; todo &= todo - 1) {
-                const int b = block_at(__builtin_ctzll(todo));
-                const Floats x = lanes().x[b], y = lanes().y[b];
-                typename K::Pixel at;
-                at.shape(local, x, y);
-                const Floats fall = exp_negative(-at.half_rho), raw = local.opacity * fall;
-                const Floats alpha = lower(raw, broadcast(kAlphaMax));
-                const Mask m = less_equal(kAlphaMin, alpha) & less_equal(here, last[b]);
-                const Floats ra = reciprocal(1.0f - alpha), before = open[b] * ra, w = keep(m, alpha * before);
-                open[b] = select(m, before, open[b]);
-                Floats m_z{}, d{}, z{};
-                if (level >= kGeometry) {
-                    at.depth(local);
-                    z = at.z;
-                }
-                if (level >= kDistortion) {
-                    m_z = reciprocal(z);
-                    d = m_z - shift[b];
-                }
-                const Floats per_weight = total.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
-                const Mask smooth = m & lesser(raw, kAlphaMax);
-                const Floats da = keep(smooth, before * per_weight - total.behind[b] * ra);
-                total.behind[b] = madd(w, per_weight, total.behind[b]);
-                adder.add_opacity(da * fall);
-                for (int c = 0; c < 3; c++) adder.add_color(c, w * total.color[c][b]);
-                Floats dz{};
-                Mask mid = m;
-                if (level >= kGeometry) {
-                    mid = m & equal(here, middle[b]);
-                    dz = total.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
-                    for (int c = 0; c < 3; c++) adder.add_normal(c, w * total.normal[c][b]);
-                }
-                adder.add(at, x, y, m, -(da * raw), dz);
-                if (chosen) {
-                    const Floats pw = part.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
-                    const Floats pa = keep(smooth, before * pw - part.behind[b] * ra);
-                    part.behind[b] = madd(w, pw, part.behind[b]);
-                    Floats pz{};
-                    if (chosen_level >= kGeometry) pz = part.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
-                    adder.add_chosen(at, x, y, m, -(pa * raw), pz);
-                }
+            const int b = block_at(__builtin_ctzll(todo));
+            const Floats x = lanes().x[b], y = lanes().y[b];
+            typename K::Pixel at;
+            at.shape(local, x, y);
+            const Floats fall = exp_negative(-at.half_rho), raw = local.opacity * fall;
+            const Floats alpha = lower(raw, broadcast(kAlphaMax));
+            const Mask m = less_equal(kAlphaMin, alpha) & less_equal(here, last[b]);
+            const Floats ra = reciprocal(1.0f - alpha), before = open[b] * ra, w = keep(m, alpha * before);
+            open[b] = select(m, before, open[b]);
+            Floats m_z{}, d{}, z{};
+            if (level >= kGeometry) {
+                at.depth(local);
+                z = at.z;
             }
+            if (level >= kDistortion) {
+                m_z = reciprocal(z);
+                d = m_z - shift[b];
+            }
+            const Floats per_weight = total.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
+            const Mask smooth = m & lesser(raw, kAlphaMax);
+            const Floats da = keep(smooth, before * per_weight - total.behind[b] * ra);
+            total.behind[b] = madd(w, per_weight, total.behind[b]);
+            adder.add_opacity(da * fall);
+            for (int c = 0; c < 3; c++) adder.add_color(c, w * total.color[c][b]);
+            Floats dz{};
+            Mask mid = m;
+            if (level >= kGeometry) {
+                mid = m & equal(here, middle[b]);
+                dz = total.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
+                for (int c = 0; c < 3; c++) adder.add_normal(c, w * total.normal[c][b]);
+            }
+            adder.add(at, x, y, m, -(da * raw), dz);
+            if (chosen) {
+                const Floats pw = part.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
+                const Floats pa = keep(smooth, before * pw - part.behind[b] * ra);
+                part.behind[b] = madd(w, pw, part.behind[b]);
+                Floats pz{};
+                if (chosen_level >= kGeometry) pz = part.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
+                adder.add_chosen(at, x, y, m, -(pa * raw), pz);
+            }
+        }
         const uint32_t slot = tile.job.entries[k].slot;
         float row[width];
         adder.finish(sx, sy, row);
@@ -483,7 +516,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
     }
 }
 
-// --------------------------------------------------------------------------------------------------------- contribution
+// ---- contribution
 
 template <class K>
 void contribution_tile(const Tile& tile, float alpha_power, float open_power, float* sums, uint8_t* touched_slots) {
@@ -502,23 +535,24 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
         const typename K::Local local(s, sx, sy);
         Floats sum[4] = {Floats{}, Floats{}, Floats{}, Floats{}};
         for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
-                const int bit = __builtin_ctzll(todo), b = block_at(bit);
-                typename K::Pixel at;
-                at.shape(local, lanes().x[b], lanes().y[b]);
-                const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
-                Mask m = less_equal(kAlphaMin, alpha) & alive[b];
-                if (!any(m)) continue;
-                const Floats before = open[b], after = before * (1.0f - alpha);
-                const Mask ends = m & lesser(after, kTransmittanceMin);
-                alive[b] = without(alive[b], ends);
-                if (!any(alive[b])) rays &= ~(1ull << bit);
-                m = without(m, ends);
-                const Floats term = root_mean ? root(alpha * before)
-                                              : exp_negative(madd(log_positive(alpha), alpha_power, log_positive(before) * open_power));
-                sum[0] += keep(m, term);
-                sum[1] += keep(m, broadcast(1.0f));
-                open[b] = select(m, after, before);
-            }
+            const int bit = __builtin_ctzll(todo), b = block_at(bit);
+            typename K::Pixel at;
+            at.shape(local, lanes().x[b], lanes().y[b]);
+            const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+            Mask m = less_equal(kAlphaMin, alpha) & alive[b];
+            if (!any(m)) continue;
+            const Floats before = open[b], after = before * (1.0f - alpha);
+            const Mask ends = m & lesser(after, kTransmittanceMin);
+            alive[b] = without(alive[b], ends);
+            if (!any(alive[b])) rays &= ~(1ull << bit);
+            m = without(m, ends);
+            const Floats term =
+                root_mean ? root(alpha * before)
+                          : exp_negative(madd(log_positive(alpha), alpha_power, log_positive(before) * open_power));
+            sum[0] += keep(m, term);
+            sum[1] += keep(m, broadcast(1.0f));
+            open[b] = select(m, after, before);
+        }
         float total[4];
         sum_lanes(sum, 4, total);
         if (total[1] > 0) {
@@ -531,269 +565,56 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
     }
 }
 
-// ----------------------------------------------------------------------------------------------------------------- SSIM
+// ---- dispatch
 
-constexpr int kRadius = 5;  // of the 11 x 11 window
-
-struct Window {
-    float w[kRadius + 1];
-    Window() {
-        double sum = 0, v[kRadius + 1];
-        for (int i = 0; i <= kRadius; i++) {
-            v[i] = std::exp(-i * i / (2 * 1.5 * 1.5));
-            sum += i ? 2 * v[i] : v[i];
-        }
-        for (int i = 0; i <= kRadius; i++) w[i] = (float)(v[i] / sum);
-    }
-};
-const Window& window() {
-    static const Window table;
-    return table;
-}
-
-// Rows with zeros around them, rounded up to whole vectors; row i replaces row i - count.
-struct Rows {
-    static constexpr int margin = kLanes < kRadius ? 2 * kLanes : kLanes;
-    int stride, count;
-    std::vector<float> data, nothing;
-    Rows(int width, int rows)
-        : stride((width + kLanes - 1) / kLanes * kLanes + 2 * margin), count(rows), data((size_t)stride * rows), nothing(stride) {}
-    float* row(int i) { return data.data() + (size_t)(i % count) * stride + margin; }
-};
-static_assert(kRadius <= Rows::margin, "the margin must hold the window");
-
-inline Floats across(const float* p) {
-    const float* w = window().w;
-    Floats v = load(p) * w[0];
-    for (int i = 1; i <= kRadius; i++) v = madd(load(p - i) + load(p + i), w[i], v);
-    return v;
-}
-// The rows of the window about row y, nothing (zeros) beyond the image.
-struct Column {
-    const float* row[2 * kRadius + 1];
-    Column(Rows& rows, int y, int height) {
-        for (int i = -kRadius; i <= kRadius; i++)
-            row[i + kRadius] = y + i >= 0 && y + i < height ? rows.row(y + i) : rows.nothing.data();
-    }
-    inline Floats blurred(int x) const {
-        const float* w = window().w;
-        Floats v = load(row[kRadius] + x) * w[0];
-        for (int i = 1; i <= kRadius; i++) v = madd(load(row[kRadius - i] + x) + load(row[kRadius + i] + x), w[i], v);
-        return v;
-    }
-};
-
-double ssim_rows(const float* px, const float* py, int width, int height, int y0, int y1, float* d_mean, float* d_square,
-                 float* d_cross) {
-    const float c1 = 0.01f * 0.01f, c2 = 0.03f * 0.03f;
-    const int ring = 2 * kRadius + 1;
-    Rows x(width, 1), y(width, 1), square(width, 1), product(width, 1);
-    Rows mx(width, ring), my(width, ring), ms(width, ring), mp(width, ring);
-    double sum = 0;
-    int next = y0 - kRadius < 0 ? 0 : y0 - kRadius;
-    for (int row = y0; row < y1; row++) {
-        for (; next <= row + kRadius && next < height; next++) {
-            std::memcpy(x.row(0), px + (size_t)next * width, width * sizeof(float));
-            std::memcpy(y.row(0), py + (size_t)next * width, width * sizeof(float));
-            for (int i = 0; i < width; i += kLanes) {
-                const Floats a = load(x.row(0) + i), b = load(y.row(0) + i);
-                store(square.row(0) + i, madd(a, a, b * b));
-                store(product.row(0) + i, a * b);
-            }
-            for (int i = 0; i < width; i += kLanes) {
-                store(mx.row(next) + i, across(x.row(0) + i));
-                store(my.row(next) + i, across(y.row(0) + i));
-                store(ms.row(next) + i, across(square.row(0) + i));
-                store(mp.row(next) + i, across(product.row(0) + i));
-            }
-        }
-        Floats row_sum{};
-        const Column cx(mx, row, height), cy(my, row, height), cs(ms, row, height), cp(mp, row, height);
-        for (int i = 0; i < width; i += kLanes) {
-            const Floats a = cx.blurred(i), b = cy.blurred(i);
-            const Floats means = madd(a, a, b * b), ab = a * b;
-            const Floats p1 = 2.0f * ab + c1, q1 = means + c1;
-            const Floats p2 = 2.0f * (cp.blurred(i) - ab) + c2, q2 = cs.blurred(i) - means + c2;
-            const Floats inv1 = reciprocal(q1), inv2 = reciprocal(q2), inv = inv1 * inv2, s = p1 * p2 * inv;
-            // S as a function of the blurred x, x^2 + y^2 and x y.
-            const Floats dm = 2.0f * inv * (b * (p2 - p1)) - 2.0f * s * a * (inv1 - inv2);
-            const Floats ds = -(s * inv2), dc = 2.0f * p1 * inv;
-            const int n = width - i < kLanes ? width - i : kLanes;
-            const size_t at = (size_t)row * width + i;
-            std::memcpy(d_mean + at, &dm, n * sizeof(float));
-            std::memcpy(d_square + at, &ds, n * sizeof(float));
-            std::memcpy(d_cross + at, &dc, n * sizeof(float));
-            Floats whole{};
-            std::memcpy(&whole, &s, n * sizeof(float));
-            row_sum += whole;
-        }
-        double total = 0;
-        for (int l = 0; l < kLanes; l++) total += row_sum[l];
-        sum += total;
-    }
-    return sum;
-}
-
-void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, const float* d_square, const float* d_cross,
-                        int width, int height, int y0, int y1, float scale, float* out) {
-    const int ring = 2 * kRadius + 1;
-    Rows line(width, 3);
-    Rows bm(width, ring), bs(width, ring), bc(width, ring);
-    int next = y0 - kRadius < 0 ? 0 : y0 - kRadius;
-    for (int row = y0; row < y1; row++) {
-        for (; next <= row + kRadius && next < height; next++) {
-            const size_t at = (size_t)next * width;
-            std::memcpy(line.row(0), d_mean + at, width * sizeof(float));
-            std::memcpy(line.row(1), d_square + at, width * sizeof(float));
-            std::memcpy(line.row(2), d_cross + at, width * sizeof(float));
-            for (int i = 0; i < width; i += kLanes) {
-                store(bm.row(next) + i, across(line.row(0) + i));
-                store(bs.row(next) + i, across(line.row(1) + i));
-                store(bc.row(next) + i, across(line.row(2) + i));
-            }
-        }
-        const Column cm(bm, row, height), cs(bs, row, height), cc(bc, row, height);
-        for (int i = 0; i < width; i += kLanes) {
-            const int n = width - i < kLanes ? width - i : kLanes;
-            const size_t at = (size_t)row * width + i;
-            Floats x{}, y{};
-            std::memcpy(&x, px + at, n * sizeof(float));
-            std::memcpy(&y, py + at, n * sizeof(float));
-            const Floats g = scale * madd(2.0f * x, cs.blurred(i), madd(y, cc.blurred(i), cm.blurred(i)));
-            std::memcpy(out + at, &g, n * sizeof(float));
-        }
-    }
-}
-
-// ------------------------------------------------------------------------------------------- normals against a depth map
-
-// Loads or stores n of the lanes, n > 0.
-inline Floats load_part(const float* p, int n) {
-    if (n == kLanes) return load(p);
-    Floats v{};
-    std::memcpy(&v, p, n * sizeof(float));
-    return v;
-}
-inline void store_part(float* p, Floats v, int n) { std::memcpy(p, &v, n * sizeof(float)); }
-
-double normal_rows(const NormalJob& j, int y0, int y1) {
-    const size_t plane = (size_t)j.width * j.height;
-    double sum = 0;
-    for (int y = y0; y < y1; y++) {
-        const float ry = (y + 0.5f - j.cy) / j.fy, step_y = 1 / j.fy;
-        Floats row_sum{};
-        for (int x = 1; x < j.width - 1; x += kLanes) {
-            const int n = j.width - 1 - x < kLanes ? j.width - 1 - x : kLanes;
-            const size_t at = (size_t)y * j.width + x;
-            Floats rx;
-            for (int l = 0; l < kLanes; l++) rx[l] = (x + l + 0.5f - j.cx) / j.fx;
-            const float step_x = 1 / j.fx;
-            const Floats right = load_part(j.depth + at + 1, n), left = load_part(j.depth + at - 1, n);
-            const Floats below = load_part(j.depth + at + j.width, n), above = load_part(j.depth + at - j.width, n);
-            const Mask valid = lesser(0.0f, right) & lesser(0.0f, left) & lesser(0.0f, below) & lesser(0.0f, above);
-            // Differences of the points depth * (rx, ry, 1) across and down; the normal is down x across.
-            const Floats across[3] = {right * (rx + step_x) - left * (rx - step_x), (right - left) * ry, right - left};
-            const Floats down[3] = {(below - above) * rx, below * (ry + step_y) - above * (ry - step_y), below - above};
-            Floats m[3], unit[3], g[3], gm[3];
-            for (int c = 0; c < 3; c++) {
-                const int a = (c + 1) % 3, b = (c + 2) % 3;
-                m[c] = down[a] * across[b] - down[b] * across[a];
-            }
-            const Floats length2 = higher(m[0] * m[0] + m[1] * m[1] + m[2] * m[2], broadcast(1e-30f));
-            const Floats inv = reciprocal(root(length2));
-            const Floats alpha = keep(valid, load_part(j.alpha + at, n));
-            Floats agreement{};
-            for (int c = 0; c < 3; c++) {
-                unit[c] = m[c] * inv;
-                g[c] = -(alpha * load_part(j.normal + c * plane + at, n));
-                agreement = madd(g[c], unit[c], agreement);
-                store_part(j.d_normal + c * plane + at, -(keep(valid, alpha * unit[c]) * j.scale), n);
-            }
-            row_sum += keep(valid, 1.0f + agreement);
-            for (int c = 0; c < 3; c++) gm[c] = keep(valid, (g[c] - unit[c] * agreement) * inv * j.scale);
-            Floats d_down[3], d_across[3];
-            for (int c = 0; c < 3; c++) {
-                const int a = (c + 1) % 3, b = (c + 2) % 3;
-                d_down[c] = across[a] * gm[b] - across[b] * gm[a];
-                d_across[c] = gm[a] * down[b] - gm[b] * down[a];
-            }
-            const Floats flat = d_across[1] * ry + d_across[2], steep = d_down[0] * rx + d_down[2];
-            store_part(j.to_right + at, madd(d_across[0], rx + step_x, flat), n);
-            store_part(j.to_left + at, -madd(d_across[0], rx - step_x, flat), n);
-            store_part(j.to_below + at, madd(d_down[1], ry + step_y, steep), n);
-            store_part(j.to_above + at, -madd(d_down[1], ry - step_y, steep), n);
-        }
-        for (int l = 0; l < kLanes; l++) sum += row_sum[l];
-    }
-    return sum;
-}
-
-// ----------------------------------------------------------------------------------------------------------------- Adam
-
-void adam(int64_t count, float* value, const float* gradient, float* first, float* second, float rate, float share1,
-          float share2, float second_correction, float epsilon) {
-    auto update = [&](Floats g, Floats& m, Floats& v, Floats& p) {
-        m = madd(g - m, share1, m);
-        v = madd(madd(g, g, -v), broadcast(share2), v);
-        p = p - rate * m / (root(v) * second_correction + epsilon);
-    };
-    int64_t i = 0;
-    for (; i + kLanes <= count; i += kLanes) {
-        Floats m = load(first + i), v = load(second + i), p = load(value + i);
-        update(load(gradient + i), m, v, p);
-        store(first + i, m);
-        store(second + i, v);
-        store(value + i, p);
-    }
-    if (const int64_t n = count - i) {
-        Floats g{}, m{}, v{}, p{};
-        std::memcpy(&g, gradient + i, n * sizeof(float));
-        std::memcpy(&m, first + i, n * sizeof(float));
-        std::memcpy(&v, second + i, n * sizeof(float));
-        std::memcpy(&p, value + i, n * sizeof(float));
-        update(g, m, v, p);
-        std::memcpy(first + i, &m, n * sizeof(float));
-        std::memcpy(second + i, &v, n * sizeof(float));
-        std::memcpy(value + i, &p, n * sizeof(float));
-    }
-}
-
-// ------------------------------------------------------------------------------------------------------------- dispatch
-
-template <class K> void forward_of(Level level, const Tile& tile, const Planes& out, const Saved& saved) {
+template <class K>
+void forward_of(Level level, const Tile& tile, const Planes& out, const Saved& saved) {
     switch (level) {
-        case kColor: return forward_tile<K, kColor>(tile, out, saved);
-        case kGeometry: return forward_tile<K, kGeometry>(tile, out, saved);
-        case kDistortion: return forward_tile<K, kDistortion>(tile, out, saved);
+        case kColor:
+            return forward_tile<K, kColor>(tile, out, saved);
+        case kGeometry:
+            return forward_tile<K, kGeometry>(tile, out, saved);
+        case kDistortion:
+            return forward_tile<K, kDistortion>(tile, out, saved);
     }
 }
 template <class K, int level>
-void backward_of(Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved, float* sums, uint8_t* touched) {
+void backward_of(Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved, float* sums,
+                 uint8_t* touched) {
     switch (chosen) {
-        case kNone: return backward_tile<K, level, kNone>(tile, a, b, saved, sums, touched);
-        case kChosenColor: return backward_tile<K, level, kChosenColor>(tile, a, b, saved, sums, touched);
-        case kChosenAll: return backward_tile<K, level, kChosenAll>(tile, a, b, saved, sums, touched);
+        case kNone:
+            return backward_tile<K, level, kNone>(tile, a, b, saved, sums, touched);
+        case kChosenColor:
+            return backward_tile<K, level, kChosenColor>(tile, a, b, saved, sums, touched);
+        case kChosenAll:
+            return backward_tile<K, level, kChosenAll>(tile, a, b, saved, sums, touched);
     }
 }
 template <class K>
-void backward_of(Level level, Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved, float* sums, uint8_t* touched) {
+void backward_of(Level level, Chosen chosen, const Tile& tile, const Planes& a, const Planes& b, const Saved& saved,
+                 float* sums, uint8_t* touched) {
     switch (level) {
-        case kColor: return backward_of<K, kColor>(chosen, tile, a, b, saved, sums, touched);
-        case kGeometry: return backward_of<K, kGeometry>(chosen, tile, a, b, saved, sums, touched);
-        case kDistortion: return backward_of<K, kDistortion>(chosen, tile, a, b, saved, sums, touched);
+        case kColor:
+            return backward_of<K, kColor>(chosen, tile, a, b, saved, sums, touched);
+        case kGeometry:
+            return backward_of<K, kGeometry>(chosen, tile, a, b, saved, sums, touched);
+        case kDistortion:
+            return backward_of<K, kDistortion>(chosen, tile, a, b, saved, sums, touched);
     }
 }
 
 void forward(Kind kind, Level level, const Job& job, int64_t tile, const Planes& out, const Saved& saved) {
-    kind == kSurfel ? forward_of<Surfels>(level, Tile(job, tile), out, saved) : forward_of<Gaussians>(level, Tile(job, tile), out, saved);
+    kind == kSurfel ? forward_of<Surfels>(level, Tile(job, tile), out, saved)
+                    : forward_of<Gaussians>(level, Tile(job, tile), out, saved);
 }
-void backward(Kind kind, Level level, Chosen chosen, const Job& job, int64_t tile, const Planes& a, const Planes& b, const Saved& saved,
-              float* sums, uint8_t* touched) {
+void backward(Kind kind, Level level, Chosen chosen, const Job& job, int64_t tile, const Planes& a, const Planes& b,
+              const Saved& saved, float* sums, uint8_t* touched) {
     if (job.offsets[tile] == job.offsets[tile + 1]) return;
     kind == kSurfel ? backward_of<Surfels>(level, chosen, Tile(job, tile), a, b, saved, sums, touched)
                     : backward_of<Gaussians>(level, chosen, Tile(job, tile), a, b, saved, sums, touched);
 }
-void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, float open_power, float* sums, uint8_t* touched) {
+void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, float open_power, float* sums,
+                  uint8_t* touched) {
     kind == kSurfel ? contribution_tile<Surfels>(Tile(job, tile), alpha_power, open_power, sums, touched)
                     : contribution_tile<Gaussians>(Tile(job, tile), alpha_power, open_power, sums, touched);
 }
@@ -805,7 +626,14 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
 #define SURFKIT_TABLE_(x) kernels_##x
 #define SURFKIT_TABLE(x) SURFKIT_TABLE_(x)
 const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
-    static const Kernels table{SURFKIT_NAME(SURFKIT_KERNELS), forward, backward, contribution, ssim_rows, ssim_gradient_rows, normal_rows, adam};
+    static const Kernels table{SURFKIT_NAME(SURFKIT_KERNELS),
+                               forward,
+                               backward,
+                               contribution,
+                               ssim_rows,
+                               ssim_gradient_rows,
+                               normal_rows,
+                               adam};
     return table;
 }
 

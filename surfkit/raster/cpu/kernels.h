@@ -38,9 +38,9 @@ struct Planes {
 
 // What the forward keeps for the backward, each a plane of H x W.
 struct Saved {
-    float* open;       // transmittance at the end
-    int32_t* last;     // index in the tile's list of the last splat blended, -1 if none
-    int32_t* middle;   // the same of the median depth
+    float* open;               // transmittance at the end
+    int32_t* last;             // index in the tile's list of the last splat blended, -1 if none
+    int32_t* middle;           // the same of the median depth
     float *m_shift, *m1, *m2;  // inverse depth of the first splat, and moments about it
     uint64_t* blocks;          // per entry, the blocks of the tile that it was blended into; zero to begin with
 };

@@ -31,10 +31,17 @@ Planes planes(const std::vector<Optional>& maps) {  // in the order of api.Maps
 }
 
 SplatArrays arrays(const std::vector<Array>& s) {  // in the order of api.Splats.tensors
-    return {(int64_t)s.at(0).shape(0), (int)s.at(4).shape(1), s[0].data(), s[1].data(), s[2].data(), s[3].data(), s[4].data()};
+    return {(int64_t)s.at(0).shape(0),
+            (int)s.at(4).shape(1),
+            s[0].data(),
+            s[1].data(),
+            s[2].data(),
+            s[3].data(),
+            s[4].data()};
 }
 
-splat::CameraModel<double> camera(const std::vector<double>& pose, const std::vector<double>& lens, int width, int height, double near) {
+splat::CameraModel<double> camera(const std::vector<double>& pose, const std::vector<double>& lens, int width,
+                                  int height, double near) {
     splat::CameraModel<double> c;
     const auto& m = pose;  // 4 x 4 by rows
     c.turn = {{m.at(0), m.at(4), m.at(8)}, {m.at(1), m.at(5), m.at(9)}, {m.at(2), m.at(6), m.at(10)}};
@@ -59,7 +66,8 @@ std::vector<const Kernels*> runnable_kernels() {
     std::vector<const Kernels*> found;
 #if defined(SURFKIT_X86)
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw"))
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+        __builtin_cpu_supports("avx512bw"))
         found.push_back(&kernels_avx512());
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) found.push_back(&kernels_avx2());
 #endif
@@ -74,15 +82,14 @@ NB_MODULE(_native, m) {
     use_kernels(*runnable_kernels().front());
 
     nb::class_<Pass>(m, "Pass")
-        .def(
-            "__init__",
-            [](Pass* self, bool surfel, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens, int width,
-               int height, double near, bool antialias, Flags seen, Array radii, int threads) {
-                const auto s = arrays(splats);
-                const auto c = camera(pose, lens, width, height, near);
-                nb::gil_scoped_release free;
-                new (self) Pass(surfel ? kSurfel : kGaussian, s, c, antialias, threads, seen.data(), radii.data());
-            })
+        .def("__init__",
+             [](Pass* self, bool surfel, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens,
+                int width, int height, double near, bool antialias, Flags seen, Array radii, int threads) {
+                 const auto s = arrays(splats);
+                 const auto c = camera(pose, lens, width, height, near);
+                 nb::gil_scoped_release free;
+                 new (self) Pass(surfel ? kSurfel : kGaussian, s, c, antialias, threads, seen.data(), radii.data());
+             })
         .def_ro("first_invalid", &Pass::first_invalid)
         .def_prop_ro("pairs", &Pass::pairs)
         .def("forward",
@@ -91,41 +98,52 @@ NB_MODULE(_native, m) {
                  nb::gil_scoped_release free;
                  self.forward((Level)level, p, threads);
              })
-        .def("backward",
-             [](Pass& self, std::vector<Array> splats, std::vector<Optional> total, std::vector<Optional> chosen, std::vector<Array> out,
-                Array signal, Optional chosen_signal, int threads) {
-                 const auto s = arrays(splats);
-                 const Planes t = planes(total), c = chosen.empty() ? Planes{} : planes(chosen);
-                 const GradientArrays g{out.at(0).data(), out.at(1).data(), out.at(2).data(), out.at(3).data(), out.at(4).data(), signal.data(), data(chosen_signal)};
-                 const bool part = !chosen.empty();
+        .def(
+            "backward",
+            [](Pass& self, std::vector<Array> splats, std::vector<Optional> total, std::vector<Optional> chosen,
+               std::vector<Array> out, Array signal, Optional chosen_signal, int threads) {
+                const auto s = arrays(splats);
+                const Planes t = planes(total), c = chosen.empty() ? Planes{} : planes(chosen);
+                const GradientArrays g{out.at(0).data(), out.at(1).data(), out.at(2).data(),   out.at(3).data(),
+                                       out.at(4).data(), signal.data(),    data(chosen_signal)};
+                const bool part = !chosen.empty();
+                nb::gil_scoped_release free;
+                self.backward(s, t, part ? &c : nullptr, g, threads);
+            },
+            nb::arg("splats"), nb::arg("total"), nb::arg("chosen"), nb::arg("out"), nb::arg("signal"),
+            nb::arg("chosen_signal").none(), nb::arg("threads"))
+        .def("contribution",
+             [](Pass& self, double alpha_power, double open_power, Array sum, Counts count, int threads) {
                  nb::gil_scoped_release free;
-                 self.backward(s, t, part ? &c : nullptr, g, threads);
-             },
-             nb::arg("splats"), nb::arg("total"), nb::arg("chosen"), nb::arg("out"), nb::arg("signal"), nb::arg("chosen_signal").none(), nb::arg("threads"))
-        .def("contribution", [](Pass& self, double alpha_power, double open_power, Array sum, Counts count, int threads) {
-            nb::gil_scoped_release free;
-            self.contribution((float)alpha_power, (float)open_power, sum.data(), count.data(), threads);
-        });
+                 self.contribution((float)alpha_power, (float)open_power, sum.data(), count.data(), threads);
+             });
 
-    m.def("kernels", [] {
-        std::vector<std::string> names;
-        for (const Kernels* k : runnable_kernels()) names.push_back(k->name);
-        return names;
-    }, "Compilations of the kernels that this machine can run, best first.");
+    m.def(
+        "kernels",
+        [] {
+            std::vector<std::string> names;
+            for (const Kernels* k : runnable_kernels()) names.push_back(k->name);
+            return names;
+        },
+        "Compilations of the kernels that this machine can run, best first.");
     m.def("kernels_in_use", [] { return std::string(kernels().name); });
     m.def("use_kernels", [](const std::string& name) {
         for (const Kernels* k : runnable_kernels())
             if (name == k->name) return use_kernels(*k);
         throw nb::value_error(("no kernels named " + name).c_str());
     });
-    m.def("ssim", [](Array x, Array y, Optional gradient, int threads) {
-        const int channels = (int)x.shape(0), height = (int)x.shape(1), width = (int)x.shape(2);
-        const float *px = x.data(), *py = y.data();
-        float* g = data(gradient);
-        nb::gil_scoped_release free;
-        return ssim(px, py, channels, width, height, g, threads);
-    }, nb::arg("x"), nb::arg("y"), nb::arg("gradient").none(), nb::arg("threads"));
-    m.def("normal_disagreement", [](Array depth, Array alpha, Array normal, std::vector<double> lens, Array d_depth, Array d_normal, int threads) {
+    m.def(
+        "ssim",
+        [](Array x, Array y, Optional gradient, int threads) {
+            const int channels = (int)x.shape(0), height = (int)x.shape(1), width = (int)x.shape(2);
+            const float *px = x.data(), *py = y.data();
+            float* g = data(gradient);
+            nb::gil_scoped_release free;
+            return ssim(px, py, channels, width, height, g, threads);
+        },
+        nb::arg("x"), nb::arg("y"), nb::arg("gradient").none(), nb::arg("threads"));
+    m.def("normal_disagreement", [](Array depth, Array alpha, Array normal, std::vector<double> lens, Array d_depth,
+                                    Array d_normal, int threads) {
         NormalJob job{};
         job.depth = depth.data();
         job.alpha = alpha.data();
@@ -141,14 +159,16 @@ NB_MODULE(_native, m) {
         nb::gil_scoped_release free;
         return normal_disagreement(job, g, threads);
     });
-    m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2, double second_correction, double epsilon, int threads) {
+    m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2,
+                     double second_correction, double epsilon, int threads) {
         const int64_t n = (int64_t)value.size(), piece = 1 << 16;
         float *p = value.data(), *m1 = first.data(), *m2 = second.data();
         const float* g = gradient.data();
         nb::gil_scoped_release free;
         parallel((n + piece - 1) / piece, threads, [&](int64_t i) {
             const int64_t at = i * piece;
-            kernels().adam(std::min(piece, n - at), p + at, g + at, m1 + at, m2 + at, (float)rate, (float)(1 - beta1), (float)(1 - beta2), (float)second_correction, (float)epsilon);
+            kernels().adam(std::min(piece, n - at), p + at, g + at, m1 + at, m2 + at, (float)rate, (float)(1 - beta1),
+                           (float)(1 - beta2), (float)second_correction, (float)epsilon);
         });
     });
 }

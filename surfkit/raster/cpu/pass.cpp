@@ -63,7 +63,8 @@ Shade shade(const SplatArrays& s, int64_t i, const SplatIn<double>& in, const Ca
     }
     return o;
 }
-void shade_backward(const SplatArrays& s, int64_t i, const Shade& o, const double rgb[3], SplatGrad<double>& out, float* sh_out) {
+void shade_backward(const SplatArrays& s, int64_t i, const Shade& o, const double rgb[3], SplatGrad<double>& out,
+                    float* sh_out) {
     double g[3], weight[16] = {};
     for (int c = 0; c < 3; c++) g[c] = o.rgb[c] > 0 ? rgb[c] : 0;
     const float* sh = s.sh + 3 * s.coefficients * i;
@@ -86,14 +87,17 @@ Bound<double> widened(Bound<double> b) {
     if (b.r2 > 0) {
         b.r2 = b.r2 * more + pad;
         // A disc inside the ellipse says nothing new.
-        const double half = (b.hxx + b.hyy) / 2, spread = std::sqrt((b.hxx - b.hyy) * (b.hxx - b.hyy) / 4 + b.hxy * b.hxy);
-        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::sqrt((b.dx - b.mx) * (b.dx - b.mx) + (b.dy - b.my) * (b.dy - b.my)))
+        const double half = (b.hxx + b.hyy) / 2,
+                     spread = std::sqrt((b.hxx - b.hyy) * (b.hxx - b.hyy) / 4 + b.hxy * b.hxy);
+        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::sqrt((b.dx - b.mx) * (b.dx - b.mx) +
+                                                                                    (b.dy - b.my) * (b.dy - b.my)))
             b.r2 = -1;
     }
     return b;
 }
 
-template <class Record> void fill_bound(Record& r, const Bound<double>& b) {
+template <class Record>
+void fill_bound(Record& r, const Bound<double>& b) {
     const double tilt = b.hxy / b.hyy, ax = r.ax, ay = r.ay;
     r.mx = (float)(b.mx - ax);
     r.my = (float)(b.my - ay);
@@ -104,7 +108,8 @@ template <class Record> void fill_bound(Record& r, const Bound<double>& b) {
     r.disc_y = (float)(b.dy - ay);
     r.disc_r2 = (float)b.r2;
 }
-template <class Record> void fill_look(Record& r, double opacity, const Shade& look, Vec<double> normal) {
+template <class Record>
+void fill_look(Record& r, double opacity, const Shade& look, Vec<double> normal) {
     r.opacity = (float)opacity;
     for (int c = 0; c < 3; c++) r.color[c] = (float)std::max(look.rgb[c], 0.0);
     r.normal[0] = (float)normal.x;
@@ -114,7 +119,8 @@ template <class Record> void fill_look(Record& r, double opacity, const Shade& l
 
 double whole(double x) { return std::floor(x); }
 
-bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool, SurfelRecord& r, Bound<double>& bound) {
+bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool, SurfelRecord& r,
+                 Bound<double>& bound) {
     const Posed<double> p = splat::pose(in, cam);
     Surfel<double> s;
     if (!splat::surfel_project(in, p, cam, whole, s)) return false;
@@ -137,12 +143,14 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     fill_look(r, in.opacity, Shade{}, s.flip * p.axes.c2);
     return true;
 }
-bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool antialias, GaussianRecord& r, Bound<double>& bound) {
+bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool antialias, GaussianRecord& r,
+                 Bound<double>& bound) {
     const Posed<double> p = splat::pose(in, cam);
     Gaussian<double> g;
     if (!splat::gaussian_project(in, p, cam, antialias, g)) return false;
     bound = g.bound;
-    const double limit = 1 << 22, ax = whole(std::clamp(g.x, -limit, limit)) + 0.5, ay = whole(std::clamp(g.y, -limit, limit)) + 0.5;
+    const double limit = 1 << 22, ax = whole(std::clamp(g.x, -limit, limit)) + 0.5,
+                 ay = whole(std::clamp(g.y, -limit, limit)) + 0.5;
     r.x = (float)(g.x - ax);
     r.y = (float)(g.y - ay);
     r.l00 = (float)g.l00;
@@ -160,13 +168,20 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
 }
 
 // Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + 0.5 ... 16 t + 15.5.
-template <class F> void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
-    const auto first = [](double low, int tiles) { return (int)std::clamp(std::ceil((low - 15.5) / kTile), 0.0, (double)tiles); };
-    const auto end = [](double high, int tiles) { return (int)std::clamp(std::floor((high - 0.5) / kTile) + 1, 0.0, (double)tiles); };
+template <class F>
+void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
+    const auto first = [](double low, int tiles) {
+        return (int)std::clamp(std::ceil((low - 15.5) / kTile), 0.0, (double)tiles);
+    };
+    const auto end = [](double high, int tiles) {
+        return (int)std::clamp(std::floor((high - 0.5) / kTile) + 1, 0.0, (double)tiles);
+    };
     const splat::Outline<double> o = splat::outline(b);
     const double disc = b.r2 > 0 ? std::sqrt(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
-    const int y0 = first(std::min(b.my - o.hy, dy - disc), tiles_y), y1 = end(std::max(b.my + o.hy, dy + disc), tiles_y);
-    const int left = first(std::min(b.mx - o.hx, dx - disc), tiles_x), right = end(std::max(b.mx + o.hx, dx + disc), tiles_x);
+    const int y0 = first(std::min(b.my - o.hy, dy - disc), tiles_y),
+              y1 = end(std::max(b.my + o.hy, dy + disc), tiles_y);
+    const int left = first(std::min(b.mx - o.hx, dx - disc), tiles_x),
+              right = end(std::max(b.mx + o.hx, dx + disc), tiles_x);
     if (left >= right) return;
     for (int y = y0; y < y1; y++) {
         double low, high;
@@ -199,20 +214,28 @@ std::vector<uint32_t> order_of(const std::vector<float>& keys) {
 
 }  // namespace
 
-template <class F> void Pass::each_seen(int threads, F f) const {
+template <class F>
+void Pass::each_seen(int threads, F f) const {
     parallel((int64_t)seen_in_.size(), threads, [&](int64_t c) {
         for (int64_t r = c * kChunk; r < c * kChunk + seen_in_[c]; r++) f(r);
     });
 }
 
-Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, bool antialias, int threads, bool* seen, float* radii)
-    : kind_(kind), camera_(camera), antialias_(antialias), count_(splats.count),
-      tiles_x_((camera.width + kTile - 1) / kTile), tiles_y_((camera.height + kTile - 1) / kTile) {
-    kind == kSurfel ? project<SurfelRecord>(splats, threads, seen, radii) : project<GaussianRecord>(splats, threads, seen, radii);
+Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, bool antialias, int threads,
+           bool* seen, float* radii)
+    : kind_(kind),
+      camera_(camera),
+      antialias_(antialias),
+      count_(splats.count),
+      tiles_x_((camera.width + kTile - 1) / kTile),
+      tiles_y_((camera.height + kTile - 1) / kTile) {
+    kind == kSurfel ? project<SurfelRecord>(splats, threads, seen, radii)
+                    : project<GaussianRecord>(splats, threads, seen, radii);
     if (first_invalid < 0) bin(threads);
 }
 
-template <class Record> void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* radii) {
+template <class Record>
+void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* radii) {
     const int64_t n = splats.count, chunks = chunks_of(n, kChunk);
     const int columns = scale_columns(kind_);
     records_.reset(new char[n * sizeof(Record)]);
@@ -275,11 +298,13 @@ void Pass::bin(int threads) {
     const std::vector<uint32_t> order = order_of(keys);
     const int64_t seen = (int64_t)at.size();
     const int tiles = tiles_x_ * tiles_y_;
-    if (pairs > std::numeric_limits<uint32_t>::max()) throw std::length_error("more than 2^32 pairs of a splat and a tile in one view");
+    if (pairs > std::numeric_limits<uint32_t>::max())
+        throw std::length_error("more than 2^32 pairs of a splat and a tile in one view");
     entries_.resize(pairs);
     offsets_.assign(tiles + 1, 0);
     // Counting sort by tile, stable in depth: pieces of the depth order count, then place.
-    const int64_t pieces = std::min<int64_t>(std::max(1, threads), chunks_of(seen, 1024)), size = pieces ? chunks_of(seen, pieces) : 0;
+    const int64_t pieces = std::min<int64_t>(std::max(1, threads), chunks_of(seen, 1024)),
+                  size = pieces ? chunks_of(seen, pieces) : 0;
     std::vector<uint32_t> tile_of(pairs);  // by slot
     int64_t copied = 0;
     for (const auto& tiles_of : tiles_of_) {
@@ -309,14 +334,19 @@ void Pass::bin(int threads) {
         int64_t* place = next.data() + p * tiles;
         for (int64_t k = p * size; k < std::min(seen, (p + 1) * size); k++) {
             const uint32_t r = at[order[k]];
-            for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) entries_[place[tile_of[slot]]++] = {r, slot};
+            for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++)
+                entries_[place[tile_of[slot]]++] = {r, slot};
         }
     });
 }
 
-Job Pass::job() const { return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.data(), offsets_.data()}; }
+Job Pass::job() const {
+    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.data(), offsets_.data()};
+}
 
-Saved Pass::saved() { return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data(), blocks_.data()}; }
+Saved Pass::saved() {
+    return {open_.data(), last_.data(), middle_.data(), m_shift_.data(), m1_.data(), m2_.data(), blocks_.data()};
+}
 
 void Pass::forward(Level level, const Planes& out, int threads) {
     const size_t pixels = (size_t)camera_.width * camera_.height;
@@ -330,14 +360,25 @@ void Pass::forward(Level level, const Planes& out, int threads) {
     const Saved kept = saved();
     const Job work = job();
     const Kernels& k = kernels();
-    parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) { k.forward(kind_, level, work, tile, out, kept); });
+    parallel((int64_t)tiles_x_ * tiles_y_, threads,
+             [&](int64_t tile) { k.forward(kind_, level, work, tile, out, kept); });
 }
 
 namespace {
 
 splat::SurfelSums<double> surfel_sums(const double* s) {
-    return {{s[0], s[1], s[2]}, {s[3], s[4], s[5]}, {s[6], s[7], s[8]}, s[9], {s[10], s[11]}, {s[12], s[13], s[14]}, s[15],
-            {s[20], s[21]}, {s[22], s[23]}, {s[24], s[25]}, {s[26], s[27]}, s[28]};
+    return {{s[0], s[1], s[2]},
+            {s[3], s[4], s[5]},
+            {s[6], s[7], s[8]},
+            s[9],
+            {s[10], s[11]},
+            {s[12], s[13], s[14]},
+            s[15],
+            {s[20], s[21]},
+            {s[22], s[23]},
+            {s[24], s[25]},
+            {s[26], s[27]},
+            s[28]};
 }
 splat::GaussianSums<double> gaussian_sums(const double* s) {
     return {s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], {s[8], s[9], s[10]}, s[11], s[16], s[17], s[18]};
@@ -345,7 +386,8 @@ splat::GaussianSums<double> gaussian_sums(const double* s) {
 
 }  // namespace
 
-void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out, int threads) {
+void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out,
+                    int threads) {
     // Only what has a cotangent costs time.
     const Planes part = chosen ? *chosen : Planes{};
     Level level = kColor;
@@ -353,8 +395,10 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     if (total.distortion || part.distortion) level = kDistortion;
     if (level > level_) throw std::invalid_argument("a cotangent was given for a map that was not rendered");
     Chosen what = kNone;
-    if (chosen) what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
-    const int width = kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
+    if (chosen)
+        what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
+    const int width =
+        kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
     const int color_at = kind_ == kSurfel ? 16 : 12;
     std::unique_ptr<float[]> sums(new float[(size_t)pairs() * width]);
     std::vector<uint8_t> touched(pairs(), 0);
@@ -407,8 +451,9 @@ void Pass::contribution(float alpha_power, float open_power, float* sum, int64_t
     std::vector<uint8_t> touched(pairs(), 0);
     const Job work = job();
     const Kernels& k = kernels();
-    parallel((int64_t)tiles_x_ * tiles_y_, threads,
-             [&](int64_t tile) { k.contribution(kind_, work, tile, alpha_power, open_power, sums.get(), touched.data()); });
+    parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
+        k.contribution(kind_, work, tile, alpha_power, open_power, sums.get(), touched.data());
+    });
     each_seen(threads, [&](int64_t r) {
         double total = 0, pixels = 0;
         for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++)
@@ -438,7 +483,8 @@ double ssim(const float* x, const float* y, int channels, int width, int height,
         parallel((int64_t)channels * bands, threads, [&](int64_t i) {
             const size_t at = (i / bands) * plane;
             const int y0 = (int)(i % bands) * band, y1 = std::min(height, y0 + band);
-            k.ssim_gradient_rows(x + at, y + at, mean + at, square + at, cross + at, width, height, y0, y1, (float)scale, gradient + at);
+            k.ssim_gradient_rows(x + at, y + at, mean + at, square + at, cross + at, width, height, y0, y1,
+                                 (float)scale, gradient + at);
         });
     double sum = 0;
     for (double s : sums) sum += s;
@@ -460,7 +506,9 @@ double normal_disagreement(NormalJob job, float* d_depth, int threads) {
     job.to_above = job.to_below + plane;
     std::vector<double> sums(bands);
     const Kernels& k = kernels();
-    parallel(bands, threads, [&](int64_t b) { sums[b] = k.normal_rows(job, 1 + (int)b * band, std::min(h - 1, 1 + (int)(b + 1) * band)); });
+    parallel(bands, threads, [&](int64_t b) {
+        sums[b] = k.normal_rows(job, 1 + (int)b * band, std::min(h - 1, 1 + (int)(b + 1) * band));
+    });
     parallel((h + band - 1) / band, threads, [&](int64_t b) {
         for (int y = (int)b * band; y < std::min(h, (int)(b + 1) * band); y++)
             for (int x = 0; x < w; x++) {

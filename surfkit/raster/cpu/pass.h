@@ -31,18 +31,21 @@ class Pass {
          bool* seen, float* radii);
 
     void forward(Level level, const Planes& out, int threads);
-    void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out, int threads);
+    void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out,
+                  int threads);
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
 
     int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
     int64_t pairs() const { return (int64_t)entries_.size(); }
 
   private:
-    template <class Record> void project(const SplatArrays& splats, int threads, bool* seen, float* radii);
+    template <class Record>
+    void project(const SplatArrays& splats, int threads, bool* seen, float* radii);
     void bin(int threads);
     Job job() const;
     Saved saved();
-    template <class F> void each_seen(int threads, F f) const;
+    template <class F>
+    void each_seen(int threads, F f) const;
 
     Kind kind_;
     splat::CameraModel<double> camera_;

@@ -44,10 +44,14 @@ static inline Mask lesser(Floats a, Floats b) { return {_mm512_cmp_ps_mask((__m5
 static inline Mask less_equal(Floats a, Floats b) { return {_mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ)}; }
 static inline Mask less_equal(Ints a, Ints b) { return {_mm512_cmple_epi32_mask((__m512i)a, (__m512i)b)}; }
 static inline Mask equal(Ints a, Ints b) { return {_mm512_cmpeq_epi32_mask((__m512i)a, (__m512i)b)}; }
-static inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm512_mask_blend_ps(m.m, (__m512)b, (__m512)a); }
+static inline Floats select(Mask m, Floats a, Floats b) {
+    return (Floats)_mm512_mask_blend_ps(m.m, (__m512)b, (__m512)a);
+}
 static inline Ints select(Mask m, Ints a, Ints b) { return (Ints)_mm512_mask_blend_epi32(m.m, (__m512i)b, (__m512i)a); }
 static inline Floats keep(Mask m, Floats a) { return (Floats)_mm512_maskz_mov_ps(m.m, (__m512)a); }
-static inline Floats madd(Floats a, Floats b, Floats c) { return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
+static inline Floats madd(Floats a, Floats b, Floats c) {
+    return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+}
 static inline Floats root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
 static inline Floats rough_root(Floats a) {  // within 1e-4, a > 0
     return a * (Floats)_mm512_rsqrt14_ps((__m512)a);
@@ -87,7 +91,9 @@ static inline Floats keep(Mask m, Floats a) { return (Floats)((Ints)a & m.m); }
 static inline Floats lower(Floats a, Floats b) { return select(lesser(a, b), a, b); }
 static inline Floats higher(Floats a, Floats b) { return select(lesser(b, a), a, b); }
 #if defined(__AVX2__)
-static inline Floats madd(Floats a, Floats b, Floats c) { return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
+static inline Floats madd(Floats a, Floats b, Floats c) {
+    return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+}
 static inline Floats root(Floats a) { return (Floats)_mm256_sqrt_ps((__m256)a); }
 #else
 static inline Floats madd(Floats a, Floats b, Floats c) { return a * b + c; }
@@ -176,7 +182,8 @@ static inline void sum_lanes(const Floats* v, int count, float* out) {
         __m128 q[4];
         for (int j = 0; j < 4; j++) {
 #if defined(__AVX512F__)
-            const __m256 h = _mm256_add_ps(_mm512_castps512_ps256((__m512)v[i + j]), _mm512_extractf32x8_ps((__m512)v[i + j], 1));
+            const __m256 h =
+                _mm256_add_ps(_mm512_castps512_ps256((__m512)v[i + j]), _mm512_extractf32x8_ps((__m512)v[i + j], 1));
 #else
             const __m256 h = (__m256)v[i + j];
 #endif
