@@ -18,6 +18,7 @@ from surfkit.raster.api import (
     ALPHA_MAX,
     ALPHA_MIN,
     CUTOFF,
+    EDGE_ON,
     T_MIN,
     Gradients,
     Maps,
@@ -163,6 +164,7 @@ def surfels(splats: Splats, camera: Camera, near: float) -> Footprints:
         radius = torch.maximum(half.amax(1), k / 2**0.5)
         half = torch.maximum(half, (middle - low_pass).abs() + (k / 2**0.5)[:, None])
         reach = CUTOFF * t_w[:, :2].norm(dim=1)
+        edge_on = (axes[:, :, 2] * centre).sum(1).abs() < EDGE_ON * centre.norm(dim=1)
         z = centre[:, 2]
         z_low, z_high = (z - reach).clamp_min(near)[:, None], (z + reach)[:, None]
 
@@ -171,6 +173,7 @@ def surfels(splats: Splats, camera: Camera, near: float) -> Footprints:
         ray = torch.linalg.cross(x[None, :, None] * w_row - u_row, y[None, :, None] * w_row - v_row)
         # Where the ray misses the plane, or so nearly that a slope leaves the range, no infinity enters the graph.
         meets = torch.isfinite(ray.detach()[..., :2] / ray.detach()[..., 2:] / ray.detach()[..., 2:]).all(-1)
+        meets = meets & ~edge_on[rows][:, None]
         ray = torch.where(meets[..., None], ray, 1.0)
         uv = ray[..., :2] / ray[..., 2:]
         rho_disc = (uv**2).sum(-1)
@@ -298,7 +301,12 @@ def _in_tile(prints: Footprints, tile: tuple[int, int, int, int], cull: bool) ->
 
 
 def _alphas(prints: Footprints, rows: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-    """Alpha of the blended splats (else 0), transmittance before each, depth; pixels near a threshold, rows touching."""
+    """What is blended, and where.
+
+    Returns:
+        Alpha of what is blended (else 0), transmittance before it and depth, (n, P) each; (P,) pixels near a
+        threshold; (n,) rows whose footprint holds a pixel, be it hidden or not.
+    """
     rho, depth, opacity = prints.at(rows, x, y)
     raw = opacity * torch.exp(-rho / 2)
     alpha = torch.where(raw >= ALPHA_MIN, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))

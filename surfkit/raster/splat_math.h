@@ -18,6 +18,7 @@ constexpr float kAlphaMax = 0.99f;
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr double kCutoffSquared = 11.082527090316832;  // 2 ln 255: opacity 1 falls to kAlphaMin at this many sigmas^2
+constexpr double kEdgeOn = 1e-3;                        // radians between a disc's plane and its centre's ray
 constexpr double kDilation = 0.3;                      // px^2, added to a gaussian's footprint
 constexpr double kAntialiasFloor = 2.5e-5;
 
@@ -174,7 +175,6 @@ SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
 }
 
 // ---- one splat, its parts
-// parts
 
 template <class R>
 struct SplatIn {
@@ -309,6 +309,13 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     o.b = (1 / size) * b;
     o.c = (1 / size) * c;
     o.det = dot(u, a) / size;
+    // Seen edge-on, rays and disc share a plane and do not meet in a point: only the low-pass filter draws.
+    const R lean = dot(p.axes.c2, p.c);
+    if (lean * lean < R(kEdgeOn * kEdgeOn) * dot(p.c, p.c)) {
+        o.a = o.b = {0, 0, 0};
+        o.c = {1, 1, 0};
+        o.det = 0;
+    }
     const R reach = square_root(R(kCutoffSquared) * (o.h.w.x * o.h.w.x + o.h.w.y * o.h.w.y));
     o.z_low = largest(p.c.z - reach, cam.near);
     o.z_high = p.c.z + reach;
@@ -551,7 +558,6 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
 }
 
 // ---- tiles and rows
-// rows
 
 // What of a bound does not change from line to line.
 template <class R>

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from surfkit.core.check import BadInput
@@ -27,7 +29,7 @@ def validate(splats: Splats, values: bool = True) -> None:
     if not values:
         return
     for name, tensor in splats.tensors().items():
-        rows = tensor.detach().reshape(count, tensor[:1].numel() if count else 1)
+        rows = tensor.detach().reshape(count, math.prod(tensor.shape[1:]))
         _refuse(~torch.isfinite(rows).all(1), name, "not finite")
         if name == "scales":
             _refuse(~(rows > 0).all(1), name, "not positive")

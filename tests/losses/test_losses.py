@@ -107,11 +107,13 @@ def test_normal_consistency_is_zero_where_splats_lie_in_the_surface():
     assert NormalConsistency(depth="median")(turned, sample()).item() == pytest.approx(2.0, abs=1e-5)
 
 
-def test_normal_consistency_does_not_pull_alpha():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # the native pass, and plain torch
+def test_normal_consistency_does_not_pull_alpha(dtype):
     maps = random_maps()
-    alpha = maps.alpha.clone().requires_grad_()
-    loss = NormalConsistency(depth="median")(Maps(alpha=alpha, median=maps.median, normal=maps.normal), sample())
-    assert not loss.requires_grad or torch.autograd.grad(loss, alpha, allow_unused=True)[0] is None
+    alpha, normal = (t.to(dtype, copy=True).requires_grad_() for t in (maps.alpha, maps.normal))
+    loss = NormalConsistency(depth="median")(Maps(alpha=alpha, median=maps.median.to(dtype), normal=normal), sample())
+    by_alpha, by_normal = torch.autograd.grad(loss, (alpha, normal), allow_unused=True)
+    assert by_alpha is None and by_normal.abs().sum() > 0
 
 
 def test_photometric_losses():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, T_MIN, Splats
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, EDGE_ON, T_MIN, Splats
 from surfkit.scene.camera import Camera
 
 
@@ -104,12 +104,13 @@ def surfel(centre, axes, scales, camera: Camera, near: float):
     (ax, ay, az), (bx, by, bz) = (axes[:, 0] / scales[0]).tolist(), (axes[:, 1] / scales[1]).tolist()
     cx, cy, cz = centre.tolist()
     low, high = max(cz - reach, near), cz + reach
+    edge_on = abs(level) < EDGE_ON * math.sqrt(cx * cx + cy * cy + cz * cz)
 
     def shape(x: float, y: float) -> tuple[float, float]:
         dx, dy = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
         rho_low = 2 * ((x - mid_x) ** 2 + (y - mid_y) ** 2)
         steep = nx * dx + ny * dy + nz
-        if steep == 0:  # the ray lies in the plane or never meets it
+        if steep == 0 or edge_on:  # the ray lies in the plane or never meets it
             return rho_low, low
         z = level / steep
         px, py, pz = z * dx - cx, z * dy - cy, z - cz

@@ -102,10 +102,61 @@ def test_a_splat_at_the_centre_of_the_camera_gives_finite_gradients(kind):
     view = replace(axis_camera(24, 20), world_to_camera=torch.eye(4, dtype=torch.float64))
     shown.means[:4] = torch.tensor([0.1, 0.1, 1.5]).double()
     shown.means[4:] = 0
-    gradients = Reference().render(shown, view, NEAR).backward(Maps(color=torch.ones(3, 20, 24).double()))
+    render = Reference().render(shown, view, NEAR)
+    gradients = render.backward(Maps(**{key: torch.ones_like(value) for key, value in render.maps.present().items()}))
     assert all(torch.isfinite(value).all() for value in gradients.tensors().values())
     assert gradients.means[:4].abs().sum() > 0
     assert not gradients.means[4:].any()
+
+
+@pytest.mark.parametrize("share", [1e-4, 1e-8, 1e-12, 1e-16, 1e-20])
+@pytest.mark.parametrize(("kind", "antialias"), [("surfel", False), ("gaussian", False), ("gaussian", True)])
+def test_float32_stays_finite_for_splats_of_almost_no_size(kind, antialias, share):
+    shown, view = make("plain", kind)
+    shown, view = replace(rows(shown, slice(0, 50)), antialias=antialias), crop(view, 24, 20, 16, 14)
+    render = Reference().render(replace(shown, scales=share * shown.scales), view, NEAR)
+    assert antialias or render.seen.sum() > 5
+    made, draws = render.maps.present(), Draw(0)
+    gradients = render.backward(Maps(**{key: draws.normal(*value.shape).float() for key, value in made.items()}))
+    assert all(torch.isfinite(value).all() for value in [*made.values(), *gradients.tensors().values()])
+
+
+@pytest.mark.parametrize("length", [1e-25, 1e25])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_length_of_a_quaternion_does_not_count(kind, length):
+    shown, view = make("plain", kind)
+    maps = [Reference().render(replace(shown, quats=q), view, NEAR).maps for q in (shown.quats, length * shown.quats)]
+    assert maps[0].alpha.max() > 0.1
+    assert (maps[0].color - maps[1].color).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hidden_splats_are_seen(kind):
+    """Seen says where the footprint is, as in the native rasterizer; densification averages over it."""
+    count, scales = 6, torch.tensor([3.0, 3.0, 0.3])[: 2 if kind == "surfel" else 3]
+    means = torch.linspace(1, 2, count)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    means[-1] += torch.tensor([90.0, 0.0, 0.0])  # beside the image
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4)
+    wall = Splats(kind, means, quats, scales.expand(count, -1), torch.full((count,), 0.999), torch.zeros(count, 1, 3))
+    render = Reference().render(wall, axis_camera(24, 20), NEAR)
+    assert not Reference().contribution(wall, axis_camera(24, 20), NEAR, 1, 1)[1][2:].any()  # two of 0.99 end a ray
+    assert render.seen.tolist() == 5 * [True] + [False]
+    assert ((render.radii > 0) == render.seen).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_graph_of_a_view_holds_nothing_per_splat_and_pixel(kind):
+    """Or a view of ordinary size would not fit into memory where there is no compiler."""
+    shown, view = make("faint", kind)
+    held = []
+
+    def keep(tensor):
+        held.append(tensor.numel())
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        draw(leaves(shown), view, NEAR)
+    assert held and max(held) <= max(48 * len(shown), 10 * view.width * view.height)
 
 
 def test_spherical_harmonics_equal_legendre_functions():

@@ -148,7 +148,6 @@ void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, c
 }
 
 // ---- normals against a depth map
-// map
 
 // Loads or stores n of the lanes, n > 0.
 inline Floats load_part(const float* p, int n) {
