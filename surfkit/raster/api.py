@@ -29,7 +29,7 @@ T_MIN = float(np.float32(1e-4))
 CUTOFF = math.sqrt(2 * math.log(255))
 """Sigmas at which a splat of opacity 1 falls to ALPHA_MIN."""
 
-EDGE_ON = 1e-3
+EDGE_ON = 2e-3
 """Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
 
 Kind = Literal["surfel", "gaussian"]
