@@ -52,10 +52,13 @@ def rendered(c: Case) -> Render:
 
 
 def different_maps(found: Maps, true: Maps, clear: Tensor) -> dict[str, float]:
-    """Maps that differ by more than FORWARD and by how much. Distortion has the unit of 1 / z^2, here up to 400."""
+    """Maps that differ by more than FORWARD and by how much; of the largest value where that is more than 1.
+
+    Depth has the unit of z and distortion that of 1 / z^2, here up to 400.
+    """
     errors = {}
     for key, value in true.present().items():
-        size = max(1.0, value.abs().max().item()) if key == "distortion" else 1.0
+        size = max(1.0, value.abs().max().item()) if key in ("depth", "distortion") else 1.0
         error = ((getattr(found, key).double() - value.double()).abs() * clear).max().item() / size
         if not error <= FORWARD:
             errors[key] = error
@@ -112,7 +115,7 @@ def test_gradients_equal_the_reference_for_each_map(name, kind):
     for key, value in c.cotangents.items():
         total = Maps(**{key: value})
         found = render.backward(total, total)
-        assert (found.chosen - found.signal).norm() <= 1e-6 * found.signal.norm(), key
+        assert (found.chosen - found.signal).norm() <= 2e-5 * found.signal.norm(), key
         if errors := different_gradients(found, c.true.backward(total)):
             wrong[key] = errors
     assert not wrong

@@ -68,9 +68,9 @@ class Recording:
     def __init__(self, inner):
         self.inner, self.geometry, self.backwards = inner, [], []
 
-    def render(self, splats, camera, near, geometry=True):
+    def render(self, splats, camera, near, geometry=True, distortion=True):
         self.geometry.append(geometry)
-        render, outer = self.inner.render(splats, camera, near, geometry), self
+        render, outer = self.inner.render(splats, camera, near, geometry, distortion), self
 
         class Noted:
             maps, seen, radii = render.maps, render.seen, render.radii
