@@ -376,7 +376,7 @@ struct SurfelAdder {
         const Floats f = keep(without(m, at.on_disc), -2.0f * e);
         s[26] = madd(f, at.hit.dx, s[26]);
         s[27] = madd(f, at.hit.dy, s[27]);
-        if (chosen == kChosenAll) s[28] += keep(at.free_z & m, dz * at.hit.inv);
+        if (chosen == kChosenAll && level >= kGeometry) s[28] += keep(at.free_z & m, dz * at.hit.inv);
     }
     inline void add_normal(int c, Floats v) { s[12 + c] += v; }
     inline void add_opacity(Floats v) { s[15] += v; }
@@ -416,7 +416,7 @@ struct GaussianAdder {
     inline void add_chosen(const GaussianPixel& at, Floats, Floats, Mask m, Floats e, Floats dz) {
         s[16] = s[16] - e * at.dx;
         s[17] = s[17] - e * at.dy;
-        if (chosen == kChosenAll) s[18] += keep(at.free_z & m, dz);
+        if (chosen == kChosenAll && level >= kGeometry) s[18] += keep(at.free_z & m, dz);
     }
     inline void add_normal(int c, Floats v) { s[8 + c] += v; }
     inline void add_opacity(Floats v) { s[11] += v; }
