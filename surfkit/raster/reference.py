@@ -14,18 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from surfkit.raster.api import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    CUTOFF,
-    EDGE_ON,
-    T_MIN,
-    Gradients,
-    Maps,
-    Rasterizer,
-    Render,
-    Splats,
-)
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, EDGE_ON, T_MIN, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 

@@ -18,7 +18,7 @@ constexpr float kAlphaMax = 0.99f;
 constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr double kCutoffSquared = 11.082527090316832;  // 2 ln 255: opacity 1 falls to kAlphaMin at this many sigmas^2
-constexpr double kEdgeOn = 2e-3;                        // radians between a disc's plane and its centre's ray
+constexpr double kEdgeOn = 2e-3;                       // radians between a disc's plane and its centre's ray
 constexpr double kDilation = 0.3;                      // px^2, added to a gaussian's footprint
 constexpr double kAntialiasFloor = 2.5e-5;
 

@@ -2,13 +2,24 @@
 // like it compiled once per instruction set.
 #pragma once
 
-#include <vector>
-
+#include "buffer.h"
 #include "simd.h"
 #include "kernels.h"
 
 namespace surfkit {
 namespace {
+
+// The first n lanes, n > 0.
+inline Floats load_part(const float* p, int n) {
+    if (n >= kLanes) return load(p);
+    Floats v{};
+    std::memcpy(&v, p, n * sizeof(float));
+    return v;
+}
+inline void store_part(float* p, Floats v, int n) {
+    if (n >= kLanes) return store(p, v);
+    std::memcpy(p, &v, n * sizeof(float));
+}
 
 // ---- SSIM
 
@@ -32,15 +43,15 @@ const Window& window() {
 
 // Rows with zeros around them, rounded up to whole vectors; row i replaces row i - count.
 struct Rows {
-    static constexpr int margin = kLanes < kRadius ? 2 * kLanes : kLanes;
+    static constexpr int margin = 16;
     int stride, count;
-    std::vector<float> data, nothing;
+    Buffer<float> data;  // one row more than `count`, which stays zero; 64-byte aligned, as the stride should be
     Rows(int width, int rows)
-        : stride((width + kLanes - 1) / kLanes * kLanes + 2 * margin),
-          count(rows),
-          data((size_t)stride * rows),
-          nothing(stride) {}
-    float* row(int i) { return data.data() + (size_t)(i % count) * stride + margin; }
+        : stride((width + 15) / 16 * 16 + 2 * margin), count(rows), data(buffer<float>((int64_t)stride * (rows + 1))) {
+        std::memset(data.get(), 0, sizeof(float) * stride * (rows + 1));
+    }
+    float* row(int i) { return data.get() + (size_t)(i % count) * stride + margin; }
+    const float* nothing() { return data.get() + (size_t)count * stride + margin; }
 };
 static_assert(kRadius <= Rows::margin, "the margin must hold the window");
 
@@ -55,7 +66,7 @@ struct Column {
     const float* row[2 * kRadius + 1];
     Column(Rows& rows, int y, int height) {
         for (int i = -kRadius; i <= kRadius; i++)
-            row[i + kRadius] = y + i >= 0 && y + i < height ? rows.row(y + i) : rows.nothing.data();
+            row[i + kRadius] = y + i >= 0 && y + i < height ? rows.row(y + i) : rows.nothing();
     }
     inline Floats blurred(int x) const {
         const float* w = window().w;
@@ -100,14 +111,12 @@ double ssim_rows(const float* px, const float* py, int width, int height, int y0
             // S as a function of the blurred x, x^2 + y^2 and x y.
             const Floats dm = 2.0f * inv * (b * (p2 - p1)) - 2.0f * s * a * (inv1 - inv2);
             const Floats ds = -(s * inv2), dc = 2.0f * p1 * inv;
-            const int n = width - i < kLanes ? width - i : kLanes;
+            const int n = width - i;
             const size_t at = (size_t)row * width + i;
-            std::memcpy(d_mean + at, &dm, n * sizeof(float));
-            std::memcpy(d_square + at, &ds, n * sizeof(float));
-            std::memcpy(d_cross + at, &dc, n * sizeof(float));
-            Floats whole{};
-            std::memcpy(&whole, &s, n * sizeof(float));
-            row_sum += whole;
+            store_part(d_mean + at, dm, n);
+            store_part(d_square + at, ds, n);
+            store_part(d_cross + at, dc, n);
+            row_sum += n >= kLanes ? s : load_part((const float*)&s, n);
         }
         double total = 0;
         for (int l = 0; l < kLanes; l++) total += row_sum[l];
@@ -136,40 +145,30 @@ void ssim_gradient_rows(const float* px, const float* py, const float* d_mean, c
         }
         const Column cm(bm, row, height), cs(bs, row, height), cc(bc, row, height);
         for (int i = 0; i < width; i += kLanes) {
-            const int n = width - i < kLanes ? width - i : kLanes;
+            const int n = width - i;
             const size_t at = (size_t)row * width + i;
-            Floats x{}, y{};
-            std::memcpy(&x, px + at, n * sizeof(float));
-            std::memcpy(&y, py + at, n * sizeof(float));
+            const Floats x = load_part(px + at, n), y = load_part(py + at, n);
             const Floats g = scale * madd(2.0f * x, cs.blurred(i), madd(y, cc.blurred(i), cm.blurred(i)));
-            std::memcpy(out + at, &g, n * sizeof(float));
+            store_part(out + at, g, n);
         }
     }
 }
 
 // ---- normals against a depth map
 
-// Loads or stores n of the lanes, n > 0.
-inline Floats load_part(const float* p, int n) {
-    if (n == kLanes) return load(p);
-    Floats v{};
-    std::memcpy(&v, p, n * sizeof(float));
-    return v;
-}
-inline void store_part(float* p, Floats v, int n) { std::memcpy(p, &v, n * sizeof(float)); }
-
 double normal_rows(const NormalJob& j, int y0, int y1) {
     const size_t plane = (size_t)j.width * j.height;
+    const float step_x = 1 / j.fx;
+    Floats lane;
+    for (int l = 0; l < kLanes; l++) lane[l] = (float)l;
     double sum = 0;
     for (int y = y0; y < y1; y++) {
         const float ry = (y + 0.5f - j.cy) / j.fy, step_y = 1 / j.fy;
         Floats row_sum{};
         for (int x = 1; x < j.width - 1; x += kLanes) {
-            const int n = j.width - 1 - x < kLanes ? j.width - 1 - x : kLanes;
+            const int n = j.width - 1 - x;
             const size_t at = (size_t)y * j.width + x;
-            Floats rx;
-            for (int l = 0; l < kLanes; l++) rx[l] = (x + l + 0.5f - j.cx) / j.fx;
-            const float step_x = 1 / j.fx;
+            const Floats rx = (((float)x + 0.5f - j.cx) + lane) * step_x;
             const Floats right = load_part(j.depth + at + 1, n), left = load_part(j.depth + at - 1, n);
             const Floats below = load_part(j.depth + at + j.width, n), above = load_part(j.depth + at - j.width, n);
             const Mask valid = lesser(0.0f, right) & lesser(0.0f, left) & lesser(0.0f, below) & lesser(0.0f, above);

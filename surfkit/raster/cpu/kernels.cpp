@@ -92,9 +92,13 @@ struct Tile {
 
   private:
     template <class F>
-    void each_row(int block, F f) const {
+    SURFKIT_INLINE void each_row(int block, F f) const {
         const int x = x0 + block / kBlocksDown * 4, y = y0 + block % kBlocksDown * kBlockRows;
         const int n = job.width - x < 4 ? job.width - x : 4;
+        if (n == 4 && y + kBlockRows <= job.height) {
+            for (int r = 0; r < kBlockRows; r++) f((size_t)(y + r) * job.width + x, 4 * r, 4);
+            return;
+        }
         if (n <= 0) return;
         for (int r = 0; r < kBlockRows && y + r < job.height; r++) f((size_t)(y + r) * job.width + x, 4 * r, n);
     }
@@ -103,12 +107,13 @@ struct Tile {
 // The blocks a record's footprint touches, bit 16 * column + row of pixels. (sx, sy): the tile's centre less the
 // anchor.
 template <class Record>
-inline uint64_t touched_blocks(const Record& s, float sx, float sy) {
+SURFKIT_INLINE uint64_t touched_blocks(const Record& s, float sx, float sy) {
+    const Lanes& grid = lanes();
     const Floats far = broadcast(1e30f), tiny = broadcast(1e-20f);
     const float more = 1.0005f;  // the roots are rough
     uint64_t hit = 0;
     for (int v = 0; v < kTile / kLanes; v++) {
-        const Floats y = lanes().count[v] + sy;
+        const Floats y = grid.count[v] + sy;
         const Floats dy = y - s.my, left = madd(dy * dy, -s.flat, broadcast(1.0f));
         const Floats half = rough_root(higher(left * (s.wide * more), tiny)),
                      mid = madd(dy, s.tilt, broadcast(s.mx - sx));
@@ -134,10 +139,10 @@ inline int block_at(int bit) { return bit / 16 * kBlocksDown + bit % 16 / kBlock
 // ---- the two kinds, at pixels of one tile
 
 struct LocalSurfel {
-    float a[4], b[4], c[4], det, low_x, low_y, z_low, z_high, opacity;
-    LocalSurfel(const SurfelRecord& s, float sx, float sy)
+    float a[3], b[3], c[3], det, low_x, low_y, z_low, z_high, opacity;
+    SURFKIT_INLINE LocalSurfel(const SurfelRecord& s, float sx, float sy)
         : det(s.det), low_x(s.low_x - sx), low_y(s.low_y - sy), z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {
-        for (int i = 0; i < 4; i++) {
+        for (int i = 0; i < 3; i++) {
             a[i] = (float)s.a[i];
             b[i] = (float)s.b[i];
             c[i] = (float)(s.c[i] + sx * s.a[i] + sy * s.b[i]);
@@ -146,7 +151,7 @@ struct LocalSurfel {
 };
 struct LocalGaussian {
     float x, y, l00, l01, l11, z, slope_x, slope_y, z_low, z_high, opacity;
-    LocalGaussian(const GaussianRecord& s, float sx, float sy)
+    SURFKIT_INLINE LocalGaussian(const GaussianRecord& s, float sx, float sy)
         : x(s.x - sx),
           y(s.y - sy),
           l00(s.l00),
@@ -203,7 +208,7 @@ struct Gaussians {
 // Fetches into the cache what the entry `ahead` of k will need: records lie in the order of the splats, not of the
 // tile.
 template <class K, int ahead>
-inline void fetch(const Tile& tile, int64_t k) {
+SURFKIT_INLINE void fetch(const Tile& tile, int64_t k) {
     const int64_t next = k + ahead;
     if (next < tile.begin || next >= tile.end) return;
     const char* at = (const char*)((const typename K::Record*)tile.job.records + tile.job.entries[next].record);
@@ -223,6 +228,7 @@ void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
     Ints last[kBlocks], middle[kBlocks];
     Mask alive[kBlocks];
     uint64_t rays = tile.inside();  // blocks with a ray that has not ended
+    const Lanes& grid = lanes();
     for (int b = 0; b < kBlocks; b++) {
         open[b] = broadcast(1.0f);
         color[0][b] = color[1][b] = color[2][b] = depth[b] = median[b] = normal[0][b] = normal[1][b] = normal[2][b] =
@@ -232,7 +238,7 @@ void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
         alive[b] = tile.inside(b);
     }
     for (int64_t k = tile.begin; k < tile.end; k++) {
-        fetch<K, 4>(tile, k);
+        fetch<K, 8>(tile, k);
         const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
@@ -241,7 +247,7 @@ void forward_tile(const Tile& tile, const Planes& out, const Saved& saved) {
         for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
             const int bit = __builtin_ctzll(todo), b = block_at(bit);
             typename K::Pixel at;
-            at.shape(local, lanes().x[b], lanes().y[b]);
+            at.shape(local, grid.x[b], grid.y[b]);
             const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
             Mask m = less_equal(kAlphaMin, alpha) & alive[b];
             if (!any(m)) continue;
@@ -441,6 +447,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
     Ints last[kBlocks], middle[kBlocks];
     Cotangents<level> total;
     Cotangents<chosen_level> part;
+    const Lanes& grid = lanes();
     for (int b = 0; b < kBlocks; b++) {
         open[b] = tile.read(saved.open, b);
         last[b] = middle[b] = Ints{} - 1;
@@ -457,7 +464,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
     }
     for (int64_t k = tile.end - 1; k >= tile.begin; k--) {
         const uint64_t blended = saved.blocks[k];
-        fetch<K, -4>(tile, k);
+        fetch<K, -8>(tile, k);
         if (!blended) continue;
         float* const out = sums + (size_t)tile.job.entries[k].slot * width;
         for (int i = 0; i < width; i += 16) __builtin_prefetch(out + i, 1);
@@ -468,7 +475,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
         typename AdderOf<K, level, chosen>::Type adder;
         for (uint64_t todo = blended; todo; todo &= todo - 1) {
             const int b = block_at(__builtin_ctzll(todo));
-            const Floats x = lanes().x[b], y = lanes().y[b];
+            const Floats x = grid.x[b], y = grid.y[b];
             typename K::Pixel at;
             at.shape(local, x, y);
             const Floats fall = exp_negative(-at.half_rho), raw = local.opacity * fall;
@@ -524,12 +531,13 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
     Floats open[kBlocks];
     Mask alive[kBlocks];
     uint64_t rays = tile.inside();  // blocks with a ray that has not ended
+    const Lanes& grid = lanes();
     for (int b = 0; b < kBlocks; b++) {
         open[b] = broadcast(1.0f);
         alive[b] = tile.inside(b);
     }
     for (int64_t k = tile.begin; k < tile.end; k++) {
-        fetch<K, 4>(tile, k);
+        fetch<K, 8>(tile, k);
         const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
@@ -537,7 +545,7 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
         for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
             const int bit = __builtin_ctzll(todo), b = block_at(bit);
             typename K::Pixel at;
-            at.shape(local, lanes().x[b], lanes().y[b]);
+            at.shape(local, grid.x[b], grid.y[b]);
             const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
             Mask m = less_equal(kAlphaMin, alpha) & alive[b];
             if (!any(m)) continue;

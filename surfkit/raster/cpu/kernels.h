@@ -13,8 +13,8 @@ struct Entry {
 };
 
 // What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
-struct SurfelRecord {
-    double a[4], b[4], c[4];  // three and a zero, double so that the origin moves to each tile without loss
+struct alignas(64) SurfelRecord {
+    double a[3], b[3], c[3];  // double so that the origin moves to each tile without loss
     float det;
     float low_x, low_y, z_low, z_high;
     float opacity, color[3], normal[3];
@@ -23,7 +23,7 @@ struct SurfelRecord {
     float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
 };
 
-struct GaussianRecord {
+struct alignas(64) GaussianRecord {
     float x, y, l00, l01, l11;
     float z, slope_x, slope_y, z_low, z_high;
     float opacity, color[3], normal[3];

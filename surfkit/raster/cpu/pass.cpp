@@ -133,7 +133,6 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
         to[k][0] = m[k].x;
         to[k][1] = m[k].y;
         to[k][2] = m[k].z;
-        to[k][3] = 0;
     }
     r.det = (float)s.det;
     r.low_x = (float)(s.low.x - s.ax);
@@ -238,17 +237,18 @@ template <class Record>
 void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* radii) {
     const int64_t n = splats.count, chunks = chunks_of(n, kChunk);
     const int columns = scale_columns(kind_);
-    records_.reset(new char[n * sizeof(Record)]);
+    records_ = buffer<char>(n * sizeof(Record));
     tiles_of_.assign(chunks, {});
-    index_.reset(new int64_t[n]);
-    depth_.reset(new float[n]);
-    slot_.reset(new uint32_t[n]);
-    tiles_.reset(new uint32_t[n]);
+    index_ = buffer<int64_t>(n);
+    depth_ = buffer<float>(n);
+    slot_ = buffer<uint32_t>(n);
+    tiles_ = buffer<uint32_t>(n);
     seen_in_.assign(chunks, 0);
     Record* records = (Record*)records_.get();
     std::vector<int64_t> invalid(chunks, -1);
     parallel(chunks, threads, [&](int64_t c) {
         int64_t at = c * kChunk;
+        std::vector<uint32_t> touched;  // moved at the end: neighbours in tiles_of_ share cache lines between threads
         for (int64_t i = c * kChunk; i < std::min(n, (c + 1) * kChunk); i++) {
             seen[i] = false;
             radii[i] = 0;
@@ -263,9 +263,9 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
             b = widened(b);
             fill_bound(r, b);
-            const size_t before = tiles_of_[c].size();
-            each_tile(b, tiles_x_, tiles_y_, [&](uint32_t tile) { tiles_of_[c].push_back(tile); });
-            const uint32_t tiles = (uint32_t)(tiles_of_[c].size() - before);
+            const size_t before = touched.size();
+            each_tile(b, tiles_x_, tiles_y_, [&](uint32_t tile) { touched.push_back(tile); });
+            const uint32_t tiles = (uint32_t)(touched.size() - before);
             if (!tiles) continue;
             const Shade look = shade(splats, i, in, camera_);
             if (!std::isfinite(look.rgb[0] + look.rgb[1] + look.rgb[2]) && invalid[c] < 0) invalid[c] = i;
@@ -278,6 +278,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             radii[i] = (float)radius;
             at++;
         }
+        tiles_of_[c] = std::move(touched);
         seen_in_[c] = (int32_t)(at - c * kChunk);
     });
     for (int64_t i : invalid)
@@ -300,7 +301,8 @@ void Pass::bin(int threads) {
     const int tiles = tiles_x_ * tiles_y_;
     if (pairs > std::numeric_limits<uint32_t>::max())
         throw std::length_error("more than 2^32 pairs of a splat and a tile in one view");
-    entries_.resize(pairs);
+    pairs_ = pairs;
+    entries_ = buffer<Entry>(pairs);
     offsets_.assign(tiles + 1, 0);
     // Counting sort by tile, stable in depth: pieces of the depth order count, then place.
     const int64_t pieces = std::min<int64_t>(std::max(1, threads), chunks_of(seen, 1024)),
@@ -341,7 +343,7 @@ void Pass::bin(int threads) {
 }
 
 Job Pass::job() const {
-    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.data(), offsets_.data()};
+    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.get(), offsets_.data()};
 }
 
 Saved Pass::saved() {
@@ -356,7 +358,7 @@ void Pass::forward(Level level, const Planes& out, int threads) {
     if (level >= kGeometry) middle_.resize(pixels);
     if (level >= kDistortion)
         for (auto* plane : {&m_shift_, &m1_, &m2_}) plane->resize(pixels);
-    blocks_.assign(entries_.size(), 0);
+    blocks_.assign(pairs_, 0);
     const Saved kept = saved();
     const Job work = job();
     const Kernels& k = kernels();
@@ -400,7 +402,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     const int width =
         kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
     const int color_at = kind_ == kSurfel ? 16 : 12;
-    std::unique_ptr<float[]> sums(new float[(size_t)pairs() * width]);
+    const Buffer<float> sums = buffer<float>(pairs_ * width);
     std::vector<uint8_t> touched(pairs(), 0);
     const Saved kept = saved();
     const Job work = job();
@@ -447,7 +449,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
 }
 
 void Pass::contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads) {
-    std::unique_ptr<float[]> sums(new float[(size_t)pairs() * 2]);
+    const Buffer<float> sums = buffer<float>(pairs_ * 2);
     std::vector<uint8_t> touched(pairs(), 0);
     const Job work = job();
     const Kernels& k = kernels();
@@ -470,7 +472,7 @@ double ssim(const float* x, const float* y, int channels, int width, int height,
     const int band = 48, bands = (height + band - 1) / band;
     const size_t plane = (size_t)width * height;
     std::vector<double> sums((size_t)channels * bands);
-    std::unique_ptr<float[]> d(new float[3 * plane * channels]);
+    const Buffer<float> d = buffer<float>(3 * plane * channels);
     float *mean = d.get(), *square = mean + plane * channels, *cross = square + plane * channels;
     const Kernels& k = kernels();
     parallel((int64_t)channels * bands, threads, [&](int64_t i) {
@@ -499,8 +501,8 @@ double normal_disagreement(NormalJob job, float* d_depth, int threads) {
     if (w < 3 || h < 3) return 0;
     const double count = (double)(w - 2) * (h - 2);
     job.scale = (float)(1 / count);
-    std::vector<float> sent(4 * plane, 0.0f);
-    job.to_right = sent.data();
+    const Buffer<float> sent = buffer<float>(4 * plane);  // written for inner pixels, and read for those alone
+    job.to_right = sent.get();
     job.to_left = job.to_right + plane;
     job.to_below = job.to_left + plane;
     job.to_above = job.to_below + plane;
@@ -510,16 +512,18 @@ double normal_disagreement(NormalJob job, float* d_depth, int threads) {
         sums[b] = k.normal_rows(job, 1 + (int)b * band, std::min(h - 1, 1 + (int)(b + 1) * band));
     });
     parallel((h + band - 1) / band, threads, [&](int64_t b) {
-        for (int y = (int)b * band; y < std::min(h, (int)(b + 1) * band); y++)
-            for (int x = 0; x < w; x++) {
-                const size_t at = (size_t)y * w + x;
-                float g = 0;
-                if (x > 0) g += job.to_right[at - 1];
-                if (x < w - 1) g += job.to_left[at + 1];
-                if (y > 0) g += job.to_below[at - w];
-                if (y < h - 1) g += job.to_above[at + w];
-                d_depth[at] = g;
-            }
+        for (int y = (int)b * band; y < std::min(h, (int)(b + 1) * band); y++) {
+            const size_t row = (size_t)y * w;
+            const bool inner = y > 0 && y < h - 1;
+            if (inner)
+                for (int x = 2; x < w; x++) d_depth[row + x] += job.to_right[row + x - 1];
+            if (inner)
+                for (int x = 0; x < w - 2; x++) d_depth[row + x] += job.to_left[row + x + 1];
+            if (y > 1)
+                for (int x = 1; x < w - 1; x++) d_depth[row + x] += job.to_below[row + x - w];
+            if (y < h - 2)
+                for (int x = 1; x < w - 1; x++) d_depth[row + x] += job.to_above[row + x + w];
+        }
     });
     double sum = 0;
     for (double s : sums) sum += s;

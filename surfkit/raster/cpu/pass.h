@@ -3,12 +3,12 @@
 
 #include <cmath>
 #include <cstdint>
-#include <memory>
 #include <vector>
 
 static inline double square_root(double x) { return std::sqrt(x); }
 static inline double natural_log(double x) { return std::log(x); }
 #include "../splat_math.h"
+#include "buffer.h"
 #include "kernels.h"
 
 namespace surfkit {
@@ -36,7 +36,7 @@ class Pass {
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
 
     int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
-    int64_t pairs() const { return (int64_t)entries_.size(); }
+    int64_t pairs() const { return pairs_; }
 
   private:
     template <class Record>
@@ -53,13 +53,14 @@ class Pass {
     int64_t count_;
     int tiles_x_, tiles_y_;
     // Per projected splat; those of chunk c start at c * kChunk, their numbers are in seen_in_.
-    std::unique_ptr<char[]> records_;
-    std::unique_ptr<int64_t[]> index_;
-    std::unique_ptr<float[]> depth_;
-    std::unique_ptr<uint32_t[]> slot_, tiles_;
+    Buffer<char> records_;
+    Buffer<int64_t> index_;
+    Buffer<float> depth_;
+    Buffer<uint32_t> slot_, tiles_;
     std::vector<int32_t> seen_in_;
     std::vector<std::vector<uint32_t>> tiles_of_;  // per chunk, until they are sorted
-    std::vector<Entry> entries_;
+    Buffer<Entry> entries_;
+    int64_t pairs_ = 0;
     std::vector<int64_t> offsets_;
     // Saved by forward.
     Level level_ = kColor;

@@ -9,6 +9,9 @@
 #include <immintrin.h>
 #endif
 
+// For what must not become a call: vectors would pass through memory, and GCC drops calls that do nothing but prefetch.
+#define SURFKIT_INLINE __attribute__((always_inline)) inline
+
 namespace {
 
 #if defined(__AVX512F__)
@@ -176,7 +179,7 @@ static inline Floats log_positive(Floats x) {
 }
 
 // Sum of the lanes of `count` vectors into out[0 .. count), count a multiple of 4. The order of the sum is fixed.
-static inline void sum_lanes(const Floats* v, int count, float* out) {
+SURFKIT_INLINE void sum_lanes(const Floats* v, int count, float* out) {
 #if defined(__AVX2__) || defined(__AVX512F__)
     for (int i = 0; i < count; i += 4) {
         __m128 q[4];
