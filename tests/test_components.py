@@ -1,12 +1,15 @@
 """Every component and recipe that is offered, built in or installed, is tested from the day it arrives."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 import surfkit
+from surfkit.cli import main
 from surfkit.cli.recipes import about, recipes
 from surfkit.core.codec import dump, load
+from surfkit.core import registry
 from surfkit.core.registry import components, kind_of, offered
 from surfkit.core.schedule import rescale
 from surfkit.densify.base import Policy
@@ -53,3 +56,16 @@ def test_public_names():
         assert getattr(surfkit, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'Prunes'"):
         surfkit.Prunes  # noqa: B018
+
+
+def test_the_page_of_components_is_current(monkeypatch, capsys):
+    monkeypatch.setenv("SURFKIT_PLUGINS", "none")
+    registry.reload()
+    try:
+        assert main(["components", "--markdown"]) == 0
+    finally:
+        monkeypatch.undo()
+        registry.reload()
+    page = Path(__file__).parents[1] / "docs" / "components.md"
+    # Written by `SURFKIT_PLUGINS=none surfkit components --markdown > docs/components.md`.
+    assert capsys.readouterr().out == page.read_text()
