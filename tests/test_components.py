@@ -8,8 +8,8 @@ import pytest
 import surfkit
 from surfkit.cli import main
 from surfkit.cli.recipes import about, recipes
-from surfkit.core.codec import dump, load
 from surfkit.core import registry
+from surfkit.core.codec import dump, load
 from surfkit.core.registry import components, kind_of, offered
 from surfkit.core.schedule import rescale
 from surfkit.densify.base import Policy
