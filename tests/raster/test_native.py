@@ -5,7 +5,6 @@ from functools import cache
 
 import pytest
 import torch
-from scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
 from torch import Tensor
 
 from surfkit.core.check import BadInput
@@ -15,6 +14,8 @@ from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference, draw, gaussians, surfels
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera
+
+from .scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
 
 pytestmark = pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
 each_case = pytest.mark.parametrize(("name", "kind"), CASES)

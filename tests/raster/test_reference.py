@@ -6,8 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from plain import evaluate, harmonics
-from scenes import (
+
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
+
+from .plain import evaluate, harmonics, rotation
+from .scenes import (
     CASES,
     KINDS,
     NEAR,
@@ -23,9 +27,6 @@ from scenes import (
     rows,
     splats,
 )
-
-from surfkit.raster.api import Maps, Splats
-from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
 
 MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
 each_case = pytest.mark.parametrize(("name", "kind"), CASES)
@@ -263,8 +264,6 @@ def test_depth_of_a_gaussian_is_where_its_density_on_the_ray_is_largest():
 
 
 def turned(quat):
-    from plain import rotation
-
     return torch.from_numpy(rotation(quat.numpy()))
 
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from scenes import Draw
 
 from surfkit.raster import native
 from surfkit.raster.ssim import ssim, ssim_reference
+
+from .scenes import Draw
 
 SIZES = [(3, 47, 61), (1, 11, 11), (3, 5, 64), (2, 1, 1), (3, 3, 40), (3, 16, 16), (1, 33, 7), (3, 130, 70)]
 

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import KINDS, NEAR, make
 
 from surfkit.core.check import BadInput
 from surfkit.raster.reference import Reference
 from surfkit.raster.validate import validate
+
+from .scenes import KINDS, NEAR, make
 
 NAN, INF = float("nan"), float("inf")
 
