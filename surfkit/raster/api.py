@@ -106,7 +106,8 @@ class Gradients:
     Attributes:
         means, quats, scales, opacities, sh: Shapes of `Splats`.
         signal: (N, 2) of the total loss.
-        chosen: (N, 2) of the chosen losses; None if no second cotangent was given.
+        chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels; None if no second
+            cotangent was given.
     """
 
     means: Tensor
@@ -136,8 +137,14 @@ class Render(ABC):
     radii: Tensor
 
     @abstractmethod
-    def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:
-        """Gradients from cotangents of the maps, in one pass; the signal of `chosen` comes beside them."""
+    def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
+        """Gradients from cotangents of the maps, in one pass; the signal of `chosen` comes beside them.
+
+        Args:
+            total: Of all losses.
+            chosen: Of the losses that drive densification.
+            absolute: Sum the absolute values of the pixels' shares of that signal, component by component (AbsGS).
+        """
 
 
 class Rasterizer(ABC):

@@ -93,7 +93,7 @@ class NativeRender(Render):
         )
         self.maps = Maps(**maps)
 
-    def backward(self, total: Maps, chosen: Maps | None = None) -> Gradients:
+    def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
         arrays = self._pass.arrays
         grads = [torch.zeros_like(a) for a in arrays]
         signal = torch.zeros(len(arrays[0]), 2)
@@ -102,6 +102,7 @@ class NativeRender(Render):
             arrays,
             self._cotangents(total),
             [] if chosen is None else self._cotangents(chosen),
+            absolute,
             grads,
             signal,
             chosen_signal,

@@ -323,6 +323,23 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     return true;
 }
 
+// How the sums over pixels (or the share of one pixel) become the screen-space gradient, in both directions.
+template <class R>
+struct SignalRow {
+    R x[6], y[6];
+};
+
+// Factors of the sums of: q0 Y (q0 X for y), q0, q1 Y (q1 X), q1, dL/d(det), dL/d(low-pass centre); X, Y about the
+// anchor, q the cotangents of p = X a + Y b + c.
+template <class R>
+SPLAT_FN SignalRow<R> surfel_signal(const CameraModel<R>& cam, const Surfel<R>& o) {
+    const Vec<R> w = o.h.w, u = o.h.u - o.ax * w, v = o.h.v - o.ay * w;
+    const R half_w = w.z * R(0.5) * R(cam.width), half_h = w.z * R(0.5) * R(cam.height);
+    const R fx = half_w / o.unit, fy = half_h / o.unit, low = o.low.f.z * w.z;
+    return {{fx * w.y, -fx * v.y, -fx * w.x, fx * v.x, fx * (v.x * w.y - v.y * w.x), half_w * low},
+            {-fy * w.y, fy * u.y, fy * w.x, -fy * u.x, fy * (w.x * u.y - w.y * u.x), half_h * low}};
+}
+
 // What the pixels hand back for a surfel: cotangents of a, b, c, det, the low-pass centre, colour, normal, opacity.
 template <class R>
 struct SurfelSums {
@@ -354,12 +371,11 @@ SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const Came
     const R half_w = w.z * R(0.5) * R(cam.width), half_h = w.z * R(0.5) * R(cam.height);
     out.signal[0] = du.z * half_w;
     out.signal[1] = dv.z * half_h;
-    const R cu = inv * (g.chosen_b[0] * w.y - g.chosen_b[1] * w.x + v.x * g.chosen_c[1] - v.y * g.chosen_c[0] +
-                        g.chosen_det * (v.x * w.y - v.y * w.x));
-    const R cv = inv * (w.x * g.chosen_a[1] - w.y * g.chosen_a[0] + g.chosen_c[0] * u.y - g.chosen_c[1] * u.x +
-                        g.chosen_det * (w.x * u.y - w.y * u.x));
-    out.chosen[0] = (cu + g.chosen_low[0] * o.low.f.z * w.z) * half_w;
-    out.chosen[1] = (cv + g.chosen_low[1] * o.low.f.z * w.z) * half_h;
+    const SignalRow<R> f = surfel_signal(cam, o);
+    out.chosen[0] = f.x[0] * g.chosen_b[0] + f.x[1] * g.chosen_c[0] + f.x[2] * g.chosen_b[1] + f.x[3] * g.chosen_c[1] +
+                    f.x[4] * g.chosen_det + f.x[5] * g.chosen_low[0];
+    out.chosen[1] = f.y[0] * g.chosen_a[0] + f.y[1] * g.chosen_c[0] + f.y[2] * g.chosen_a[1] + f.y[3] * g.chosen_c[1] +
+                    f.y[4] * g.chosen_det + f.y[5] * g.chosen_low[1];
     const Vec<R> da{cam.fx * du.x, cam.fy * dv.x, cam.cx * du.x + cam.cy * dv.x + dw.x};
     const Vec<R> db{cam.fx * du.y, cam.fy * dv.y, cam.cx * du.y + cam.cy * dv.y + dw.y};
     const Vec<R> dc{cam.fx * du.z, cam.fy * dv.z, cam.cx * du.z + cam.cy * dv.z + dw.z};
@@ -464,6 +480,15 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     return true;
 }
 
+// Factors of the sums of: e dx, e dy, dL/dz; the rest is 0.
+template <class R>
+SPLAT_FN SignalRow<R> gaussian_signal(const CameraModel<R>& cam, const Gaussian<R>& o) {
+    const R qa = o.l00 * o.l00, qb = o.l00 * o.l01, qc = o.l01 * o.l01 + o.l11 * o.l11;
+    const R half_w = R(0.5) * cam.width, half_h = R(0.5) * cam.height;
+    return {{half_w * qa, half_w * qb, -half_w * o.slope_x, 0, 0, 0},
+            {half_h * qb, half_h * qc, -half_h * o.slope_y, 0, 0, 0}};
+}
+
 // What the pixels hand back for a gaussian: moments of e = dL/d(power) about the centre, and the rest.
 template <class R>
 struct GaussianSums {
@@ -482,8 +507,9 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
     const R mean_x = qa * g.e_x + qb * g.e_y - o.slope_x * g.z, mean_y = qb * g.e_x + qc * g.e_y - o.slope_y * g.z;
     out.signal[0] = mean_x * R(0.5) * cam.width;
     out.signal[1] = mean_y * R(0.5) * cam.height;
-    out.chosen[0] = (qa * g.chosen_x + qb * g.chosen_y - o.slope_x * g.chosen_z) * R(0.5) * cam.width;
-    out.chosen[1] = (qb * g.chosen_x + qc * g.chosen_y - o.slope_y * g.chosen_z) * R(0.5) * cam.height;
+    const SignalRow<R> f = gaussian_signal(cam, o);
+    out.chosen[0] = f.x[0] * g.chosen_x + f.x[1] * g.chosen_y + f.x[2] * g.chosen_z;
+    out.chosen[1] = f.y[0] * g.chosen_x + f.y[1] * g.chosen_y + f.y[2] * g.chosen_z;
     // dL/d(footprint) = -Q G Q with G = -1/2 sum e d d^T.
     const R gxx = R(-0.5) * g.e_xx, gxy = R(-0.5) * g.e_xy, gyy = R(-0.5) * g.e_yy;
     const R txx = qa * gxx + qb * gxy, txy = qa * gxy + qb * gyy, tyx = qb * gxx + qc * gxy, tyy = qb * gxy + qc * gyy;

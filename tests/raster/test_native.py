@@ -10,8 +10,9 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.raster import native
 from surfkit.raster.api import ALPHA_MIN, Gradients, Maps, Render, Splats
+from surfkit.raster.footprints import gaussians, surfels
 from surfkit.raster.native import NativeRasterizer
-from surfkit.raster.reference import Reference, draw, gaussians, surfels
+from surfkit.raster.reference import Reference, draw
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera
 
@@ -130,6 +131,17 @@ def test_gradients_and_chosen_signals_equal_the_reference_for_all_maps(name, kin
         found, true = render.backward(total, chosen), c.true.backward(total, chosen)
         assert not different_gradients(found, true)
         assert (true.chosen - true.signal).norm() > 0.1 * true.signal.norm()
+
+
+@each_case
+def test_absolute_signals_equal_the_reference(name, kind):
+    c = case(name, kind)
+    render, total = rendered(c), Maps(**c.cotangents)
+    for chosen in (Maps(color=c.cotangents["color"]), total):
+        found = render.backward(total, chosen, absolute=True)
+        true = c.true.backward(total, chosen, absolute=True)
+        assert not different_gradients(found, true)
+        assert (found.chosen >= 0.99 * render.backward(total, chosen).chosen.abs() - 1e-5).all()
 
 
 @each_case
@@ -299,7 +311,7 @@ def test_culling_never_loses_a_pixel(kind):
         prints = (surfels if kind == "surfel" else gaussians)(exact, view, NEAR)
         rays = view.rays(torch.float64)
         x, y = (rays[0] * view.fx + view.cx).flatten(), (rays[1] * view.fy + view.cy).flatten()
-        rho, _, opacity = prints.at(torch.arange(len(shown)), x, y)
+        rho, _, opacity = prints.at(torch.arange(len(shown)), x, y, torch.zeros(2).double())
         raw = opacity * torch.exp(-rho / 2) * prints.drawn[:, None]
         for i in range(len(shown)):
             made = NativeRasterizer().render(rows(shown, slice(i, i + 1)), view, NEAR, geometry=False).maps.alpha

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from surfkit.raster.api import Maps, Splats
-from surfkit.raster.reference import Reference, colors, draw, gaussians, sh_basis
+from surfkit.raster.footprints import colors, gaussians, sh_basis
+from surfkit.raster.reference import Reference, draw
 
 from .plain import evaluate, harmonics, rotation
 from .scenes import (
@@ -257,7 +258,7 @@ def test_depth_of_a_gaussian_is_where_its_density_on_the_ray_is_largest():
 
             bounds = (0.5 * centre[2], 1.5 * centre[2])
             true = minimize_scalar(distance, bounds=bounds, method="bounded", options={"xatol": 1e-12}).x
-            depth = lone.at(torch.tensor([0]), torch.tensor([x]).double(), torch.tensor([y]).double())[1].item()
+            depth = lone.at(torch.tensor([0]), *torch.tensor([[x], [y]]).double(), torch.zeros(2).double())[1].item()
             errors.append(abs(depth - true))
         assert errors[0] < 1e-7
         assert errors[2] < 0.3 * errors[1] + 1e-7 and errors[1] < 2e-3
@@ -308,6 +309,22 @@ def test_the_signal_of_surfels_is_the_slope_of_a_sideways_move():
                 values.append(weighted(draw(replace(shown, means=means), view, NEAR).maps, by))
             slope = (values[0] - values[1]) / 2e-5 / focal * z * size / 2
             assert gradients.signal[i, axis].item() == pytest.approx(slope.item(), rel=1e-6, abs=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_absolute_signals_are_sums_over_single_pixels(kind):
+    shown, view = make("plain", kind, 0)
+    shown, view = double(rows(shown, slice(0, 12))), crop(view, 20, 14, 20, 16)  # two tiles wide
+    given, render = cotangents(view), Reference().render(shown, view, NEAR)
+    found = render.backward(Maps(**given), Maps(**given), absolute=True).chosen
+    total = torch.zeros_like(found)
+    for y in range(view.height):
+        for x in range(view.width):
+            mask = torch.zeros(view.height, view.width, dtype=torch.float64)
+            mask[y, x] = 1
+            total += render.backward(Maps(**{key: value * mask for key, value in given.items()})).signal.abs()
+    assert (found > 0).any()
+    assert torch.allclose(found, total, rtol=1e-9, atol=1e-12)
 
 
 def test_fewer_maps_are_the_same_maps():

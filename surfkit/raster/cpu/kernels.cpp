@@ -192,16 +192,29 @@ struct GaussianPixel {
     }
 };
 
+// A SignalRow about the tile's centre.
+struct LocalSignal {
+    float x[6], y[6];
+    SURFKIT_INLINE void about(const splat::SignalRow<double>& row, float sx, float sy) {
+        for (int i = 0; i < 6; i++) {
+            x[i] = (float)(row.x[i] + (i == 1 || i == 3 ? sy * row.x[i - 1] : 0));
+            y[i] = (float)(row.y[i] + (i == 1 || i == 3 ? sx * row.y[i - 1] : 0));
+        }
+    }
+};
+
 struct Surfels {
     using Record = SurfelRecord;
     using Local = LocalSurfel;
     using Pixel = SurfelPixel;
+    static constexpr float anchored = 1;  // the signal's factors change with the origin
     static constexpr int sums = kSurfelSums, sums_chosen = kSurfelSumsChosen;
 };
 struct Gaussians {
     using Record = GaussianRecord;
     using Local = LocalGaussian;
     using Pixel = GaussianPixel;
+    static constexpr float anchored = 0;
     static constexpr int sums = kGaussianSums, sums_chosen = kGaussianSumsChosen;
 };
 
@@ -384,6 +397,24 @@ struct SurfelAdder {
         s[27] = madd(f, at.hit.dy, s[27]);
         if (chosen == kChosenAll && level >= kGeometry) s[28] += keep(at.free_z & m, dz * at.hit.inv);
     }
+    inline void add_absolute(const SurfelPixel& at, const LocalSignal& f, Floats x, Floats y, Mask m, Floats e,
+                             Floats dz) {
+        const Mask disc = at.on_disc & m;
+        const Floats ei = e * at.hit.inv;
+        const Floats q0 = keep(disc, ei * at.hit.u), q1 = keep(disc, ei * at.hit.v);
+        const Floats low = keep(without(m, at.on_disc), -2.0f * e);
+        Floats gx = madd(q0, madd(y, f.x[0], broadcast(f.x[1])), q1 * madd(y, f.x[2], broadcast(f.x[3])));
+        Floats gy = madd(q0, madd(x, f.y[0], broadcast(f.y[1])), q1 * madd(x, f.y[2], broadcast(f.y[3])));
+        gx = madd(low * at.hit.dx, f.x[5], gx);
+        gy = madd(low * at.hit.dy, f.y[5], gy);
+        if (level >= kGeometry) {
+            const Floats t = keep(at.free_z & m, dz * at.hit.inv);
+            gx = madd(t, f.x[4], gx);
+            gy = madd(t, f.y[4], gy);
+        }
+        s[20] += magnitude(gx);
+        s[21] += magnitude(gy);
+    }
     inline void add_normal(int c, Floats v) { s[12 + c] += v; }
     inline void add_opacity(Floats v) { s[15] += v; }
     inline void add_color(int c, Floats v) { s[16 + c] += v; }
@@ -394,7 +425,7 @@ struct SurfelAdder {
             out[i] += sx * out[6 + i];
             out[3 + i] += sy * out[6 + i];
         }
-        if (chosen)
+        if (chosen == kChosenColor || chosen == kChosenAll)
             for (int i = 0; i < 2; i++) {
                 out[20 + i] += sx * out[24 + i];
                 out[22 + i] += sy * out[24 + i];
@@ -424,6 +455,13 @@ struct GaussianAdder {
         s[17] = s[17] - e * at.dy;
         if (chosen == kChosenAll && level >= kGeometry) s[18] += keep(at.free_z & m, dz);
     }
+    inline void add_absolute(const GaussianPixel& at, const LocalSignal& f, Floats, Floats, Mask m, Floats e,
+                             Floats dz) {
+        const Floats ex = -(e * at.dx), ey = -(e * at.dy);
+        const Floats t = level >= kGeometry ? keep(at.free_z & m, dz) : Floats{};
+        s[16] += magnitude(madd(ex, f.x[0], madd(ey, f.x[1], t * f.x[2])));
+        s[17] += magnitude(madd(ex, f.y[0], madd(ey, f.y[1], t * f.y[2])));
+    }
     inline void add_normal(int c, Floats v) { s[8 + c] += v; }
     inline void add_opacity(Floats v) { s[11] += v; }
     inline void add_color(int c, Floats v) { s[12 + c] += v; }
@@ -442,7 +480,7 @@ template <class K, int level, int chosen>
 void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& chosen_planes, const Saved& saved,
                    float* sums, uint8_t* touched_slots) {
     constexpr int width = chosen ? K::sums_chosen : K::sums;
-    constexpr int chosen_level = chosen == kChosenAll ? level : kColor;
+    constexpr int chosen_level = chosen == kChosenAll || chosen == kChosenAbsolute ? level : kColor;
     Floats open[kBlocks], all[kBlocks], shift[kBlocks], m1[kBlocks], m2[kBlocks];
     Ints last[kBlocks], middle[kBlocks];
     Cotangents<level> total;
@@ -472,6 +510,9 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
         const Ints here = Ints{} + (int32_t)(k - tile.begin);
+        LocalSignal signal;
+        if (chosen == kChosenAbsolute)
+            signal.about(tile.job.signals[tile.job.entries[k].record], K::anchored * sx, K::anchored * sy);
         typename AdderOf<K, level, chosen>::Type adder;
         for (uint64_t todo = blended; todo; todo &= todo - 1) {
             const int b = block_at(__builtin_ctzll(todo));
@@ -512,7 +553,10 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
                 part.behind[b] = madd(w, pw, part.behind[b]);
                 Floats pz{};
                 if (chosen_level >= kGeometry) pz = part.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
-                adder.add_chosen(at, x, y, m, -(pa * raw), pz);
+                if (chosen == kChosenAbsolute)
+                    adder.add_absolute(at, signal, x, y, m, -(pa * raw), pz);
+                else
+                    adder.add_chosen(at, x, y, m, -(pa * raw), pz);
             }
         }
         const uint32_t slot = tile.job.entries[k].slot;
@@ -596,6 +640,8 @@ void backward_of(Chosen chosen, const Tile& tile, const Planes& a, const Planes&
             return backward_tile<K, level, kChosenColor>(tile, a, b, saved, sums, touched);
         case kChosenAll:
             return backward_tile<K, level, kChosenAll>(tile, a, b, saved, sums, touched);
+        case kChosenAbsolute:
+            return backward_tile<K, level, kChosenAbsolute>(tile, a, b, saved, sums, touched);
     }
 }
 template <class K>

@@ -1,4 +1,5 @@
 // What the per-pixel kernels read and write, and the table through which one of their compilations is chosen.
+// After splat_math.h.
 #pragma once
 
 #include <cstdint>
@@ -49,14 +50,16 @@ struct Job {
     int width, height, tiles_x, tiles_y;
     const void* records;
     const Entry* entries;
-    const int64_t* offsets;  // tiles + 1
+    const int64_t* offsets;                   // tiles + 1
+    const splat::SignalRow<double>* signals;  // per record; for kChosenAbsolute alone
 };
 
 enum Kind { kSurfel = 0, kGaussian = 1 };
 // Which maps a pass has to do with.
 enum Level { kColor = 0, kGeometry = 1, kDistortion = 2 };
-// What is said of the chosen losses: nothing, cotangents of colour, cotangents of every map.
-enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2 };
+// What is said of the chosen losses: nothing, cotangents of colour, cotangents of every map; and of every map where the
+// shares of the pixels are summed without their signs.
+enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2, kChosenAbsolute = 3 };
 
 constexpr int kSurfelSums = 20, kSurfelSumsChosen = 32;
 constexpr int kGaussianSums = 16, kGaussianSumsChosen = 20;

@@ -343,7 +343,8 @@ void Pass::bin(int threads) {
 }
 
 Job Pass::job() const {
-    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.get(), offsets_.data()};
+    return {camera_.width,  camera_.height, tiles_x_,        tiles_y_,
+            records_.get(), entries_.get(), offsets_.data(), nullptr};
 }
 
 Saved Pass::saved() {
@@ -388,8 +389,26 @@ splat::GaussianSums<double> gaussian_sums(const double* s) {
 
 }  // namespace
 
-void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out,
-                    int threads) {
+Buffer<splat::SignalRow<double>> Pass::signals(const SplatArrays& splats, int threads) const {
+    Buffer<splat::SignalRow<double>> rows = buffer<splat::SignalRow<double>>(count_);
+    each_seen(threads, [&](int64_t r) {
+        const SplatIn<double> in = read_splat(splats, index_[r], scale_columns(kind_));
+        const Posed<double> p = splat::pose(in, camera_);
+        if (kind_ == kSurfel) {
+            Surfel<double> o;
+            splat::surfel_project(in, p, camera_, whole, o);
+            rows[r] = splat::surfel_signal(camera_, o);
+        } else {
+            Gaussian<double> o;
+            splat::gaussian_project(in, p, camera_, antialias_, o);
+            rows[r] = splat::gaussian_signal(camera_, o);
+        }
+    });
+    return rows;
+}
+
+void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute,
+                    const GradientArrays& out, int threads) {
     // Only what has a cotangent costs time.
     const Planes part = chosen ? *chosen : Planes{};
     Level level = kColor;
@@ -399,13 +418,19 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     Chosen what = kNone;
     if (chosen)
         what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
+    Buffer<splat::SignalRow<double>> rows;
+    if (chosen && absolute) {
+        what = kChosenAbsolute;
+        rows = signals(splats, threads);
+    }
     const int width =
         kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
-    const int color_at = kind_ == kSurfel ? 16 : 12;
+    const int color_at = kind_ == kSurfel ? 16 : 12, chosen_at = kind_ == kSurfel ? 20 : 16;
     const Buffer<float> sums = buffer<float>(pairs_ * width);
     std::vector<uint8_t> touched(pairs(), 0);
     const Saved kept = saved();
-    const Job work = job();
+    Job work = job();
+    work.signals = rows.get();
     const Kernels& k = kernels();
     parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
         k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
@@ -443,7 +468,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         out.opacities[i] = (float)g.opacity;
         for (int q = 0; q < 2; q++) {
             out.signal[2 * i + q] = (float)g.signal[q];
-            if (out.chosen) out.chosen[2 * i + q] = (float)g.chosen[q];
+            if (out.chosen) out.chosen[2 * i + q] = (float)(what == kChosenAbsolute ? s[chosen_at + q] : g.chosen[q]);
         }
     });
 }

@@ -31,8 +31,9 @@ class Pass {
          bool* seen, float* radii);
 
     void forward(Level level, const Planes& out, int threads);
-    void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, const GradientArrays& out,
-                  int threads);
+    // `absolute`: the pixels' shares of the chosen signal are summed without their signs.
+    void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute,
+                  const GradientArrays& out, int threads);
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
 
     int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
@@ -46,6 +47,7 @@ class Pass {
     Saved saved();
     template <class F>
     void each_seen(int threads, F f) const;
+    Buffer<splat::SignalRow<double>> signals(const SplatArrays& splats, int threads) const;
 
     Kind kind_;
     splat::CameraModel<double> camera_;

@@ -178,6 +178,8 @@ static inline Floats log_positive(Floats x) {
     return madd(n, 0.693359375f, f + y);
 }
 
+static inline Floats magnitude(Floats a) { return (Floats)((Ints)a & 0x7fffffff); }
+
 // Sum of the lanes of `count` vectors into out[0 .. count), count a multiple of 4. The order of the sum is fixed.
 SURFKIT_INLINE void sum_lanes(const Floats* v, int count, float* out) {
 #if defined(__AVX2__) || defined(__AVX512F__)
