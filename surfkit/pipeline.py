@@ -107,7 +107,7 @@ def run(
             say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
             return read_json(this.metrics, Any)
         if not this.cloud.exists():
-            export(this, state.points, scene)
+            export(this, state, scene)
         return evaluate(this, state, scene, rasterizer)
 
 
@@ -204,9 +204,10 @@ def optimise(
     return state
 
 
-def export(this: Run, points: Points, scene: Scene) -> None:
+def export(this: Run, state: StageState, scene: Scene) -> None:
     """Write the points in the frame of the input."""
-    write_splats(this.cloud, to_table(this.recipe.primitive, points.params).in_input_frame(scene.frame))
+    params = this.recipe.pretrain.finished(state)
+    write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame))
     emit(FileWritten(this.cloud, "points"))
 
 
@@ -214,7 +215,7 @@ def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer)
     """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
     degree = min(primitive.sh_degree, state.index // stage.sh_every)
-    splats = primitive.shape(state.points.params, degree)
+    splats = primitive.shape(stage.finished(state), degree)
 
     def draw(view: View) -> Maps:
         return rasterizer.render(splats, view.camera, stage.near).maps
@@ -225,7 +226,8 @@ def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer)
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
 
-    measured = evaluate_views(scene.held_out, Photos(scene.held_out), draw, timed=colors, show=show)
+    photos, changing = Photos(scene.held_out), stage.appearance is not None
+    measured = evaluate_views(scene.held_out, photos, draw, timed=colors, show=show, correct_color=changing)
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),

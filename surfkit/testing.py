@@ -64,8 +64,13 @@ def check_policy(policy: Policy, points: Points, step: Step) -> None:
         return
     assert first.max_opacity == second.max_opacity, f"{name}.edit is not repeatable"
     assert first.max_opacity is None or 0 < first.max_opacity < 1, f"{name}: max_opacity must lie between 0 and 1"
-    for key in ("drop", "clone", "split"):
-        _check_mask(f"{name}: {key}", getattr(first, key), getattr(second, key), len(points))
+    for key in ("drop", "clone", "split", "forget"):
+        counts = key == "clone"
+        _check_mask(f"{name}: {key}", getattr(first, key), getattr(second, key), len(points), counts)
+    for key, value in (first.nudge or {}).items():
+        assert key in points.params, f"{name} nudges {key!r}, which is none of {', '.join(points.params)}"
+        assert value.shape == points.params[key].shape, f"{name}: the nudge of {key!r} has shape {tuple(value.shape)}"
+        assert torch.equal(value, second.nudge[key]), f"{name}.edit is not repeatable; draw from `step.seed`"
 
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
@@ -177,12 +182,13 @@ def _check_splats(primitive: Primitive, params: dict[str, Tensor], degree: int) 
     assert torch.isfinite(splats.means).all() and torch.isfinite(splats.sh).all(), f"{name}: values are not finite"
 
 
-def _check_mask(what: str, mask: Tensor | None, again: Tensor | None, count: int) -> None:
+def _check_mask(what: str, mask: Tensor | None, again: Tensor | None, count: int, counts: bool) -> None:
     import torch
 
     assert (mask is None) == (again is None), f"{what} is not repeatable"
     if mask is not None and again is not None:
-        assert mask.dtype == torch.bool, f"{what} is {mask.dtype}, not bool"
+        allowed = (torch.bool, torch.int64) if counts else (torch.bool,)
+        assert mask.dtype in allowed, f"{what} is {mask.dtype}, not bool{' or int64' * counts}"
         assert mask.shape == (count,), f"{what} has shape {tuple(mask.shape)}, not ({count},)"
         assert torch.equal(mask, again), f"{what} is not repeatable"
 

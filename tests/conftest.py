@@ -144,6 +144,26 @@ def world(bare, monkeypatch):
     return types.SimpleNamespace(**globals())
 
 
+class Crowded:
+    """Answers of twenty views about points of known contribution (`densify.base.Views`)."""
+
+    def __init__(self, contribution):
+        self.contribution = contribution
+
+    def __len__(self):
+        return 20
+
+    def survey(self, alpha_power=0.5, transmittance_power=0.5):
+        from surfkit.densify.base import Tally
+
+        seen = (self.contribution > 0).long()
+        return Tally(self.contribution**alpha_power, 50 * seen, 10 * seen)
+
+    def each(self, alpha_power, transmittance_power):
+        for at in range(20):
+            yield 40 * self.contribution.roll(at) ** alpha_power, (50 * (self.contribution > 0)).long()
+
+
 @pytest.fixture
 def crowd():
     """200 random points and a step about them, at which policies with default settings act."""
@@ -167,6 +187,9 @@ def crowd():
         grad=4e-4 * torch.rand(count, generator=draw),
         radii=50 * torch.rand(count, generator=draw),
         image_px=800,
-        views=types.SimpleNamespace(contribution=lambda gamma: contribution**gamma),
+        views=Crowded(contribution),
+        since_reset=1_000,
+        rates={"means": 1e-4},
+        seed=1,
     )
     return Points.fresh(params), step

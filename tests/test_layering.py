@@ -12,7 +12,7 @@ FLOORS = (
     "scene",
     "raster",
     "primitives losses",
-    "densify",
+    "densify appearance",
     "train partition compress mesh evaluate",
     "recipe",
     "pipeline",

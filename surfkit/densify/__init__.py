@@ -4,10 +4,22 @@ from collections.abc import Mapping
 
 from surfkit.core.registry import Component, hookimpl
 from surfkit.densify.adc import ADC
-from surfkit.densify.signal import LossGradient
+from surfkit.densify.filters import CountCap, Elongation
+from surfkit.densify.prune import Faint, Importance
+from surfkit.densify.signal import AbsGradient, LossGradient
+from surfkit.densify.trim import Trim
 
 
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
-    """Policies and signals, by name."""
-    return {"adc": ADC, "loss-gradient": LossGradient}
+    """Policies, filters and signals, by name."""
+    return {
+        "adc": ADC,
+        "elongation": Elongation,
+        "count-cap": CountCap,
+        "loss-gradient": LossGradient,
+        "abs-gradient": AbsGradient,
+        "trim": Trim,
+        "importance": Importance,
+        "opacity": Faint,
+    }

@@ -11,7 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.core.schedule import StepCount, Steps
-from surfkit.densify.base import Densify, Filter, Step
+from surfkit.densify.base import Densify, Filter, Step, admitted
 from surfkit.primitives.base import SHRINK
 from surfkit.primitives.points import Edit, Points
 
@@ -55,9 +55,6 @@ class ADC(Densify):
 
     recovery: Annotated[int, StepCount(floor=100)] = 100
     """Steps after a reset before faint points are dropped again; short runs keep at least 100."""
-
-    max_points: int | None = None
-    """Never grow beyond this many points, the highest gradients first; no limit if unset."""
 
     filters: tuple[Annotated[Filter, choice(Filter)], ...] = ()
     """Conditions that a point must also meet to multiply."""
@@ -106,12 +103,4 @@ class ADC(Densify):
     def _hot(self, points: Points, step: Step) -> Tensor:
         """(N,) bool, points that should multiply."""
         mean = points.stat(GRAD) / points.stat(SEEN).clamp_min(1)
-        hot = mean >= self.threshold
-        for condition in self.filters:
-            hot &= condition.admits(step.shape.scales)
-        if self.max_points is not None:
-            room = max(0, self.max_points - len(points))
-            if room < int(hot.sum()):
-                first = mean.masked_fill(~hot, -1).topk(room).indices
-                hot = torch.zeros_like(hot).index_fill(0, first, True)
-        return hot
+        return admitted(self.filters, step, mean * (mean >= self.threshold))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
 
 from torch import Tensor
 
@@ -13,14 +14,33 @@ from surfkit.primitives.points import Edit, Points
 from surfkit.raster.api import Splats
 
 
+@dataclass(frozen=True)
+class Tally:
+    """What one pass over all training views tells of each point.
+
+    Attributes:
+        mean: (N,) mean over the views of the point's mean alpha^a T^b over the pixels it is blended into; a view that
+            does not see the point counts as 0 (CityGaussianV2, eq. 4).
+        hits: (N,) int64, pixels of all views that the point is blended into.
+        views: (N,) int64, views with such a pixel.
+    """
+
+    mean: Tensor
+    hits: Tensor
+    views: Tensor
+
+
 class Views(Protocol):
-    """What a policy may ask about all training views; computed only when asked."""
+    """What a policy may ask about all training views; computed only when asked, and once for all who ask the same."""
 
-    def contribution(self, gamma: float) -> Tensor:
-        """(N,) mean over the views of each point's mean alpha^gamma T^(1 - gamma) over the pixels it is blended into.
+    def __len__(self) -> int:
+        """Training views, the length of an epoch."""
 
-        A view that does not see a point counts as 0 (CityGaussianV2, eq. 4).
-        """
+    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
+        """The tally of alpha^a T^b."""
+
+    def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """Sum of alpha^a T^b, (N,), and count of pixels, (N,) int64, of one view after the other."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +56,9 @@ class Step:
         radii: (N,) pixels; 0 where not seen.
         image_px: Longer side of this step's view, pixels.
         views: All training views.
+        since_reset: Steps since opacities were last lowered (`Edit.max_opacity`); `index` if they never were.
+        rates: Learning rates of this step by parameter, local units.
+        seed: Differs from step to step and from run to run; for policies that draw.
     """
 
     index: int
@@ -46,6 +69,9 @@ class Step:
     radii: Tensor
     image_px: int
     views: Views
+    since_reset: int = 0
+    rates: Mapping[str, float] = field(default_factory=dict)
+    seed: int = 0
 
 
 class Policy(Component):
@@ -71,12 +97,27 @@ class Filter(Component):
     """A condition that a point must meet to multiply."""
 
     @abstractmethod
-    def admits(self, scales: Tensor) -> Tensor:
-        """(N,) bool from (N, 2 or 3) activated scales, local units."""
+    def admits(self, step: Step, want: Tensor) -> Tensor:
+        """(N,) bool, who may multiply.
+
+        Args:
+            step: About the N points.
+            want: (N,) how strongly each wants to; 0 for those that do not, and for those that are not admitted already.
+        """
+
+
+def admitted(filters: Sequence[Filter], step: Step, want: Tensor) -> Tensor:
+    """(N,) bool, the points with a `want` above 0 that pass one filter after the other."""
+    for condition in filters:
+        want = want * condition.admits(step, want)
+    return want > 0
 
 
 class Signal(Component):
     """Which gradient drives densification."""
+
+    absolute: ClassVar[bool] = False
+    """Whether the pixels' shares of the chosen gradient are to be summed without their signs."""
 
     terms: tuple[str, ...] | None
     """Losses, by name, whose gradient is wanted apart; None when only the total is needed."""

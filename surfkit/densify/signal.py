@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -33,3 +34,24 @@ class LossGradient(Signal):
         # unseen points have no gradient and both means have the same count, so sums will do, and none seen is no NaN
         ratio = total.norm(dim=-1).sum() / chosen.norm(dim=-1).sum().clamp_min(1e-30)
         return chosen * (self.boost * ratio).clamp_min(1)
+
+
+@dataclass(frozen=True)
+class AbsGradient(Signal):
+    """Sizes of the pixels' shares of the screen-space gradient, which do not cancel out as signs do (AbsGS).
+
+    Larger than the gradient itself: double the threshold of densification or more (AbsGS splits at 4e-4).
+    """
+
+    absolute: ClassVar[bool] = True
+
+    terms: tuple[str, ...] | None = None
+    """Losses, by name, that drive densification; all of them if unset."""
+
+    def __post_init__(self) -> None:
+        if self.terms == ():
+            raise BadInput("signal.terms is empty; name a loss, or leave it unset for all of them")
+
+    def combine(self, chosen: Tensor, total: Tensor) -> Tensor:
+        """The chosen one as it is."""
+        return chosen

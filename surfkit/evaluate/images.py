@@ -42,8 +42,26 @@ def psnr(render: Tensor, photo: Tensor) -> float:
     return float(-10 * error.clamp_min(SMALLEST).log10())
 
 
+def color_corrected(render: Tensor, photo: Tensor) -> Tensor:
+    """The render after the affine change of colour that brings it closest to the photograph, both (3, H, W).
+
+    For photographs of changing exposure: what a held-out one's own exposure was is not known from training.
+    """
+    colors, wanted = render.flatten(1).double().T, photo.flatten(1).double().T
+    inputs = torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
+    damped = inputs.T @ inputs + 1e-9 * torch.eye(4).to(inputs)  # a render of one colour has no unique answer
+    change = torch.linalg.solve(damped, inputs.T @ wanted)
+    return (inputs @ change).T.reshape(render.shape).to(render)
+
+
 def evaluate_views(
-    views: Sequence[View], photos: Pictures, draw: Draw, *, timed: Draw | None = None, show: Show | None = None
+    views: Sequence[View],
+    photos: Pictures,
+    draw: Draw,
+    *,
+    timed: Draw | None = None,
+    show: Show | None = None,
+    correct_color: bool = False,
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
@@ -53,15 +71,19 @@ def evaluate_views(
         draw: Makes the renders that are measured and shown.
         timed: Makes the renders whose speed counts, where it is not `draw`: colours only, for one.
         show: Called once a view, to write pictures.
+        correct_color: Also measure "psnr_corrected", of `color_corrected` renders.
     """
     per_image = {}
     for at, view in enumerate(views):
         photo, maps = photos[at], draw(view)
         render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
         per_image[view.name] = {"psnr": psnr(render, target), "ssim": float(ssim(render, target))}
+        if correct_color:
+            per_image[view.name]["psnr_corrected"] = psnr(color_corrected(render, target), target)
         if show is not None:
             show(view, photo, maps)
-    means = {name: _mean([values[name] for values in per_image.values()]) for name in ("psnr", "ssim")}
+    names = ("psnr", "ssim", *["psnr_corrected"] * correct_color)
+    means = {name: _mean([values[name] for values in per_image.values()]) for name in names}
     return {"images": {**means, "per_image": per_image}, "fps": frames_per_second(views, timed or draw)}
 
 

@@ -2,9 +2,17 @@
 
 from surfkit.core.registry import hookimpl
 from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.surface import Distortion, NormalConsistency
 
 
 @hookimpl
 def surfkit_components():
-    return {"l1": L1, "ssim": SSIM, "normal": NormalConsistency, "distortion": Distortion}
+    return {
+        "l1": L1,
+        "ssim": SSIM,
+        "normal": NormalConsistency,
+        "distortion": Distortion,
+        "mean-opacity": MeanOpacity,
+        "mean-scale": MeanScale,
+    }

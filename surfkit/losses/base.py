@@ -9,7 +9,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from surfkit.core.registry import Component
-from surfkit.raster.api import Maps
+from surfkit.raster.api import Maps, Splats
 from surfkit.scene.scene import View
 
 
@@ -41,3 +41,15 @@ class Loss(Component):
     @abstractmethod
     def __call__(self, maps: Maps, sample: Sample) -> Tensor:
         """The unweighted loss, a scalar that is differentiable in the maps."""
+
+
+class Regularizer(Component):
+    """A term of the objective that looks at the points alone, not at what is rendered."""
+
+    @abstractmethod
+    def weight_at(self, index: int, steps: int) -> float:
+        """The term's weight in step `index` of 1..`steps`; 0 leaves the term out."""
+
+    @abstractmethod
+    def __call__(self, splats: Splats) -> Tensor:
+        """The unweighted term, a scalar that is differentiable in the splats' tensors."""

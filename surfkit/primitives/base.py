@@ -81,9 +81,10 @@ def children(params: Columns, scales: Tensor, generator: torch.Generator) -> Col
 
 def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Generator) -> Points:
     """Points after an edit: the kept in their order, then clones, then children. Moments and statistics follow rows."""
-    added, keep = [], None
+    points, added, keep = _nudged(points, edit), [], None
     if edit.clone is not None and edit.clone.any():
-        added.append({name: value[edit.clone] for name, value in points.params.items()})
+        rows = torch.arange(len(points)).to(edit.clone.device).repeat_interleave(edit.clone.to(torch.int64))
+        added.append({name: value[rows] for name, value in points.params.items()})
     if edit.split is not None and edit.split.any():
         rows = {name: value[edit.split] for name, value in points.params.items()}
         added.append(primitive.split(rows, generator))
@@ -110,6 +111,17 @@ def to_table(primitive: Primitive, params: Columns) -> SplatTable:
         sh_rest=params["sh_rest"].detach(),
         antialias=splats.antialias,
     )
+
+
+def _nudged(points: Points, edit: Edit) -> Points:
+    """Points whose parameters have been moved and whose moments have been forgotten, where the edit asks for it."""
+    params, moments = points.params, [points.first, points.second]
+    if edit.nudge is not None:
+        params = params | {name: params[name] + shift for name, shift in edit.nudge.items()}
+    if edit.forget is not None and edit.forget.any():
+        kept = ~edit.forget
+        moments = [{k: v * kept.view(-1, *[1] * (v.dim() - 1)) for k, v in group.items()} for group in moments]
+    return Points(params, *moments, points.stats)
 
 
 def _dimmed(points: Points, most: float) -> Points:

@@ -68,32 +68,46 @@ class Edit:
 
     Attributes:
         drop: (N,) bool, points to remove.
-        clone: (N,) bool, points to copy.
+        clone: (N,) bool, points to copy; or int64, how many copies of each.
         split: (N,) bool, points to replace by two smaller ones.
         max_opacity: Lower every opacity to this and let the optimiser forget its past; in (0, 1).
+        nudge: Added to the raw parameters of these names, shapes as there, before points are copied.
+        forget: (N,) bool, points whose past the optimiser forgets.
     """
 
     drop: Tensor | None = None
     clone: Tensor | None = None
     split: Tensor | None = None
     max_opacity: float | None = None
+    nudge: Columns | None = None
+    forget: Tensor | None = None
 
 
 def merge(edits: Sequence[Edit | None]) -> Edit | None:
-    """One edit from several: a dropped point is neither cloned nor split, a split one not cloned; None if none asks."""
+    """One edit from several: a dropped point is neither cloned nor split, a split one not cloned; None if none asks.
+
+    Of the copies that several ask for the most are made; nudges add up.
+    """
     asked = [edit for edit in edits if edit is not None]
     if not asked:
         return None
 
-    def any_of(name: str) -> Tensor | None:
-        masks = [mask for edit in asked if (mask := getattr(edit, name)) is not None]
-        return torch.stack(masks).any(0) if masks else None
+    def given(name: str) -> list:
+        return [value for edit in asked if (value := getattr(edit, name)) is not None]
+
+    def most_of(name: str) -> Tensor | None:
+        masks = given(name)
+        if any(mask.dtype != torch.bool for mask in masks):
+            masks = [mask.to(torch.int64) for mask in masks]
+        return torch.stack(masks).amax(0) if masks else None
 
     def without(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
-        return mask if mask is None or other is None else mask & ~other
+        return mask if mask is None or other is None else mask * ~other
 
-    drop = any_of("drop")
-    split = without(any_of("split"), drop)
-    clone = without(without(any_of("clone"), drop), split)
-    caps = [edit.max_opacity for edit in asked if edit.max_opacity is not None]
-    return Edit(drop, clone, split, min(caps, default=None))
+    drop = most_of("drop")
+    split = without(most_of("split"), drop)
+    clone = without(without(most_of("clone"), drop), split)
+    nudge: Columns = {}
+    for columns in given("nudge"):
+        nudge |= {name: nudge[name] + value if name in nudge else value for name, value in columns.items()}
+    return Edit(drop, clone, split, min(given("max_opacity"), default=None), nudge or None, most_of("forget"))

@@ -14,9 +14,9 @@ from surfkit.primitives.points import Points
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
 
-FORMAT = "surfkit-stage-1"
+FORMAT = "surfkit-stage-2"
 GROUPS = ("params", "first", "second", "stats")
-FACTS = {"index", "views", "shown", "seconds", "cpu_seconds", "peak_memory_bytes"}
+FACTS = {"index", "views", "shown", "seconds", "cpu_seconds", "peak_memory_bytes", "reset_at"}
 
 
 def save(path: Path, state: StageState) -> None:
@@ -28,6 +28,7 @@ def save(path: Path, state: StageState) -> None:
         for group in GROUPS
         for name, value in getattr(state.points, group).items()
     }
+    tensors |= {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
     facts = {
         "index": state.index,
@@ -36,6 +37,7 @@ def save(path: Path, state: StageState) -> None:
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
         "peak_memory_bytes": state.peak_memory_bytes,
+        "reset_at": state.reset_at,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
@@ -48,18 +50,21 @@ def save(path: Path, state: StageState) -> None:
 def load(path: Path) -> StageState:
     """The state in a file that `save` wrote."""
     tensors, facts = _read(path)
-    groups: dict[str, dict[str, Tensor]] = {group: {} for group in GROUPS}
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks")}
     for key, value in tensors.items():
         group, _, name = key.partition(".")
         if group in groups:
             groups[group][name] = value
+    looks = groups.pop("looks")
     points = Points(**groups)
     _check(path, points, tensors["order"], facts)
     generator = torch.Generator()
     generator.set_state(tensors["generator"])
     order = Order(facts["views"], tensors["order"], facts["shown"])
     done = ("index", "seconds", "cpu_seconds", "peak_memory_bytes")
-    return StageState(points, order, generator, *(facts[name] for name in done))
+    state = StageState(points, order, generator, *(facts[name] for name in done))
+    state.looks, state.reset_at = looks, facts["reset_at"]
+    return state
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict]:

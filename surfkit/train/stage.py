@@ -11,6 +11,7 @@ from typing import Annotated, Protocol
 import torch
 from torch import Tensor
 
+from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
 from surfkit.core.events import PointsEdited, StepDone, emit
 from surfkit.core.registry import choice
@@ -18,13 +19,13 @@ from surfkit.core.schedule import Interval, Steps
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Regularizer, Sample
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.scene.scene import View
-from surfkit.train.adam import Rate, adam_step
+from surfkit.train.adam import Rate, adam_step, update
 from surfkit.train.views import Order, Survey
 
 RATES = {
@@ -36,6 +37,8 @@ RATES = {
     "sh_rest": Rate(1.25e-4),
 }
 """Of 3DGS, for a scene extent of 1."""
+GEOMETRY = {"depth", "median", "normal", "distortion"}
+"""Maps beyond the colours."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,12 @@ class Stage:
 
     losses: dict[str, Annotated[Loss, choice(Loss)]] = field(default_factory=lambda: {"l1": L1(), "ssim": SSIM()})
     """What is minimised: the weighted sum of these."""
+
+    regularizers: dict[str, Annotated[Regularizer, choice(Regularizer)]] = field(default_factory=dict)
+    """Terms on the points themselves, added to the losses."""
+
+    appearance: Annotated[Appearance | None, choice(Appearance, optional=True)] = None
+    """What may differ from photograph to photograph; none takes all colours as they are."""
 
     signal: Annotated[Signal, choice(Signal)] = LossGradient()
     """Which gradient drives densification."""
@@ -79,6 +88,12 @@ class Stage:
         """Everything that adds or removes points."""
         return (*([self.densify] if self.densify else []), *self.prune)
 
+    def finished(self, state: StageState) -> Columns:
+        """Raw parameters of the points as they leave the stage, in the colours of the mean photograph."""
+        if self.appearance is None:
+            return state.points.params
+        return self.appearance.folded(state.looks["value"], state.points.params)
+
 
 @dataclass
 class StageState:
@@ -95,6 +110,10 @@ class StageState:
     """Processor time of the steps done, all threads."""
     peak_memory_bytes: int = 0
     """Most memory held so far; 0 where the system does not tell."""
+    looks: Columns = field(default_factory=dict)
+    """Numbers of the appearance model, a row per view: "value", Adam's "first" and "second", "shown" so often."""
+    reset_at: int = 0
+    """Step that last lowered the opacities; 0 if none has."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +157,12 @@ class Trainer:
         missing = set(points.params) ^ set(self.stage.rates)
         if missing:
             raise BadInput(f"rates has {', '.join(self.stage.rates)}; the points have {', '.join(points.params)}")
-        return StageState(points, Order(len(self.views)), generator)
+        state = StageState(points, Order(len(self.views)), generator)
+        if self.stage.appearance is not None:
+            value = self.stage.appearance.begin(len(self.views))
+            state.looks = {"value": value, "first": torch.zeros_like(value), "second": torch.zeros_like(value)}
+            state.looks["shown"] = torch.zeros(len(self.views), dtype=torch.int64)
+        return state
 
     def run(self, state: StageState) -> Iterator[Done]:
         """Take the steps that are left; after each one, `state` can be saved, and the caller may stop."""
@@ -162,37 +186,51 @@ class Trainer:
         shape = self.primitive.shape(leaves, min(self.primitive.sh_degree, index // stage.sh_every))
         splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
 
-        geometry, distortion = bool(reads - {"color", "alpha"}), "distortion" in reads
+        geometry, distortion = bool(reads & GEOMETRY), "distortion" in reads
         render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry, distortion)
-        losses, total, chosen = self.cotangents(active, render.maps, sample)
+        losses, total, chosen = self.cotangents(active, render.maps, sample, self.look(state, shown))
+        terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
+        losses |= {name: float(term.detach()) for name, term in terms.items()}
         if not math.isfinite(sum(losses.values())):
             raise RuntimeError(f"step {index}, view {sample.view.name}: the losses are {losses}; lower the rates")
-        gradients = render.backward(total, chosen)
-        edit = self.wanted(state.points, self.facts(index, splats, sample, render, gradients))
-        rates = {name: rate.at(index, stage.steps) for name, rate in stage.rates.items()}
-        adam_step(state.points, pulled(shape, gradients, leaves), rates, index)
+        gradients = render.backward(total, chosen, stage.signal.absolute)
+        facts = self.facts(state, splats, sample, render, gradients)
+        edit = self.wanted(state.points, facts)
+        adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
         if edit is not None:
             state.points = self.edited(state, edit, index)
         state.index = index
         return Done(index, losses, len(state.points), render.maps, sample)
 
     def cotangents(
-        self, active: Mapping[str, float], maps: Maps, sample: Sample
+        self, active: Mapping[str, float], maps: Maps, sample: Sample, look: Look | None
     ) -> tuple[dict[str, float], Maps, Maps | None]:
         """The weighted losses, their gradient by the maps, and that of the losses which the signal asks for apart."""
         losses, terms = self.stage.losses, self.stage.signal.terms
         leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
         leafy = Maps(**leaves)
-        values = {name: weight * losses[name](leafy, sample) for name, weight in active.items()}
+        compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
+        values = {name: weight * losses[name](compared, sample) for name, weight in active.items()}
         numbers = {name: float(value.detach()) for name, value in values.items()}
+        if look is not None:
+            look.learn(list(values.values()))
         if terms is None:
-            return numbers, gradient(list(values.values()), leaves), None
+            total = gradient(list(values.values()), leaves)
+            return numbers, total, total if self.stage.signal.absolute else None
         chosen = gradient([value for name, value in values.items() if name in terms], leaves)
         others = gradient([value for name, value in values.items() if name not in terms], leaves)
         return numbers, added(chosen, others), chosen
 
-    def facts(self, index: int, splats: Splats, sample: Sample, render: Render, gradients: Gradients) -> Step:
+    def look(self, state: StageState, shown: int) -> Look | None:
+        """The look of a photograph, if the stage learns any."""
+        if self.stage.appearance is None:
+            return None
+        rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps)
+        return Look(self.stage.appearance, state.looks, shown, rate)
+
+    def facts(self, state: StageState, splats: Splats, sample: Sample, render: Render, gradients: Gradients) -> Step:
         """What the policies are told about a step."""
+        index = state.index + 1
         chosen = gradients.signal if gradients.chosen is None else gradients.chosen
         return Step(
             index=index,
@@ -203,6 +241,9 @@ class Trainer:
             radii=render.radii,
             image_px=max(sample.view.camera.width, sample.view.camera.height),
             views=Survey(self.views, self.rasterizer, splats, self.stage.near),
+            since_reset=index - state.reset_at,
+            rates={name: rate.at(index, self.stage.steps) for name, rate in self.stage.rates.items()},
+            seed=(state.generator.initial_seed() * 1_000_003 + index) % 2**63,
         )
 
     def wanted(self, points: Points, step: Step) -> Edit | None:
@@ -215,9 +256,12 @@ class Trainer:
         """The points after an edit."""
         points = apply(self.primitive, state.points, edit, state.generator)
         if len(points) == 0:
-            raise RuntimeError(f"step {index} dropped the last point; lower the culls of densify and prune")
+            raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
+        if edit.max_opacity is not None:
+            state.reset_at = index
         counts = [0 if mask is None else int(mask.sum()) for mask in (edit.drop, edit.clone, edit.split)]
-        emit(PointsEdited(index, *counts, points=len(points)))
+        if any(counts):
+            emit(PointsEdited(index, *counts, points=len(points)))
         return points
 
 
@@ -238,11 +282,41 @@ def added(a: Maps, b: Maps) -> Maps:
     return Maps(**sums)
 
 
-def pulled(shape: Splats, gradients: Gradients, leaves: Columns) -> Columns:
-    """Gradients by the raw parameters, from those by the splats; a parameter without influence is left out."""
+@dataclass
+class Look:
+    """One photograph's own numbers in one step."""
+
+    model: Appearance
+    looks: Columns
+    row: int
+    rate: float
+
+    def __post_init__(self) -> None:
+        self.numbers = self.looks["value"][self.row].clone().requires_grad_()
+
+    def shown(self, color: Tensor) -> Tensor:
+        """(3, H, W) the render as the photograph would show it."""
+        return self.model(self.numbers.to(color), color)
+
+    def learn(self, losses: list[Tensor]) -> None:
+        """Take a step of Adam, as many as the photograph was shown."""
+        (grad,) = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True)
+        self.looks["shown"][self.row] += 1
+        value, first, second = (self.looks[name][self.row] for name in ("value", "first", "second"))
+        update(value, grad, first, second, self.rate, int(self.looks["shown"][self.row]))
+
+
+def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:
+    """Gradients by the raw parameters, from those by the splats and from terms on the splats.
+
+    A parameter without influence is left out.
+    """
     splats, grads = shape.tensors(), gradients.tensors()
     names = [name for name, value in splats.items() if value.requires_grad]
     raw = torch.autograd.grad(
-        [splats[name] for name in names], list(leaves.values()), [grads[name] for name in names], allow_unused=True
+        [*(splats[name] for name in names), *terms],
+        list(leaves.values()),
+        [*(grads[name] for name in names), *(torch.ones_like(term) for term in terms)],
+        allow_unused=True,
     )
     return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from surfkit.densify.base import Tally
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.scene import View
 
@@ -42,11 +43,25 @@ class Survey:
     rasterizer: Rasterizer
     shape: Splats
     near: float
+    tallies: dict[tuple[float, float], Tally] = field(default_factory=dict)
 
-    def contribution(self, gamma: float) -> Tensor:
-        """(N,) see `Views.contribution`."""
-        total = torch.zeros_like(self.shape.opacities)
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """See `Views.each`."""
         for view in self.views:
-            amount, count = self.rasterizer.contribution(self.shape, view.camera, self.near, gamma, 1 - gamma)
-            total += amount / count.clamp_min(1)
-        return total / len(self.views)
+            yield self.rasterizer.contribution(self.shape, view.camera, self.near, alpha_power, transmittance_power)
+
+    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
+        """See `Views.survey`."""
+        powers = (alpha_power, transmittance_power)
+        if powers not in self.tallies:
+            mean = torch.zeros_like(self.shape.opacities)
+            hits, views = (torch.zeros_like(mean, dtype=torch.int64) for _ in range(2))
+            for amount, count in self.each(*powers):
+                mean += amount / count.clamp_min(1)
+                hits += count
+                views += count > 0
+            self.tallies[powers] = Tally(mean / len(self.views), hits, views)
+        return self.tallies[powers]

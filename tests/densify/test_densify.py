@@ -7,8 +7,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
-from surfkit.densify import ADC, LossGradient
-from surfkit.densify.base import Densify, Filter, Policy, Signal, Step
+from surfkit.densify import ADC, CountCap, Elongation, LossGradient
+from surfkit.densify.base import Densify, Filter, Policy, Signal, Step, Tally
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
 
@@ -16,8 +16,11 @@ from surfkit.raster.api import Splats
 class Everything:
     """Answers as training views would."""
 
-    def contribution(self, gamma: float) -> torch.Tensor:
-        return torch.ones(N)
+    def __len__(self) -> int:
+        return 10
+
+    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
+        return Tally(torch.arange(N) / N, torch.full((N,), 100), torch.ones(N, dtype=torch.int64))
 
 
 N = 60
@@ -141,8 +144,8 @@ def test_points_that_were_large_on_any_screen_since_the_last_edit_go():
 class SmallOnly(Filter):
     """Admits small points."""
 
-    def admits(self, scales):
-        return scales.amax(-1) < 0.05
+    def admits(self, step, want):
+        return step.shape.scales.amax(-1) < 0.05
 
 
 def test_filters_narrow_what_multiplies_but_not_what_is_dropped():
@@ -151,12 +154,23 @@ def test_filters_narrow_what_multiplies_but_not_what_is_dropped():
     assert torch.equal(held.clone, free.clone) and torch.equal(held.drop, free.drop)
 
 
-def test_max_points_takes_the_highest_gradients():
+def test_a_count_cap_takes_the_highest_gradients():
     grad = torch.linspace(1e-4, 1e-3, N)
-    edit = watched(ADC(max_points=N + 5), scene(), [600], grad=grad)
+    edit = watched(ADC(filters=(CountCap(N + 5),)), scene(), [600], grad=grad)
     assert (edit.clone | edit.split).nonzero().flatten().tolist() == list(range(N - 5, N))
-    full = watched(ADC(max_points=N - 10), scene(), [600], grad=grad)
+    full = watched(ADC(filters=(CountCap(N - 10),)), scene(), [600], grad=grad)
     assert not (full.clone | full.split).any()
+    both = watched(ADC(filters=(SmallOnly(), CountCap(N + 5))), scene(), [600], grad=grad)
+    small = (SIZES < 0.05).nonzero().flatten().tolist()
+    assert (both.clone | both.split).nonzero().flatten().tolist() == small[-5:], "room goes to those admitted before"
+
+
+def test_needles_do_not_multiply():
+    scales = torch.full((N, 2), 0.05)
+    scales[:, 1] = 0.05 * torch.linspace(0, 0.02, N)
+    want = torch.ones(N)
+    kept = Elongation(0.01).admits(replace(step(600), shape=replace(step(600).shape, scales=scales)), want)
+    assert torch.equal(kept, scales[:, 1] / scales[:, 0] > 0.01) and kept.any() and not kept.all()
 
 
 @pytest.mark.parametrize("setting", [dict(every=0), dict(reset_every=0), dict(reset_opacity=1.0)])

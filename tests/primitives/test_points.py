@@ -1,5 +1,7 @@
 import torch
 
+from surfkit.primitives import Surfel2D
+from surfkit.primitives.base import apply
 from surfkit.primitives.points import Edit, Points, merge
 
 
@@ -60,3 +62,27 @@ def test_merge_joins_masks_and_keeps_the_lowest_cap():
 
 def test_merge_of_nothing_is_nothing():
     assert merge([None, None]) is None and merge([]) is None
+
+
+def test_merge_adds_nudges_and_makes_the_most_copies():
+    a = Edit(clone=torch.tensor([2, 0, 1, 3]), nudge={"means": torch.ones(4, 3)}, forget=mask(0, count=4))
+    b = Edit(
+        clone=mask(1, 2, count=4), drop=mask(3, count=4), nudge={"means": torch.ones(4, 3), "scales": torch.ones(4, 2)}
+    )
+    both = merge([a, b])
+    assert both.clone.tolist() == [2, 1, 1, 0] and both.forget.tolist() == [True, False, False, False]
+    assert both.nudge["means"].tolist() == [[2.0] * 3] * 4 and both.nudge["scales"].tolist() == [[1.0] * 2] * 4
+
+
+def test_copies_inherit_the_nudge_and_only_the_named_forget():
+    points = Points.fresh({"means": torch.arange(9.0).view(3, 3), "opacities": torch.zeros(3)})
+    points.first["means"] += 1
+    edit = Edit(
+        clone=torch.tensor([0, 2, 0]), nudge={"opacities": torch.tensor([0.0, 5, 0])},
+        drop=mask(0, count=3), forget=mask(2, count=3),
+    )  # fmt: skip
+    after = apply(Surfel2D(), points, edit, torch.Generator())
+    assert after.params["opacities"].tolist() == [5, 0, 5, 5]
+    assert after.params["means"][:, 0].tolist() == [3, 6, 3, 3]
+    assert after.first["means"][:, 0].tolist() == [1, 0, 0, 0], "a copy has no past"
+    assert points.params["opacities"].tolist() == [0, 0, 0], "the points before the edit are as they were"

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.densify import ADC, LossGradient
+from surfkit.densify import ADC, AbsGradient, LossGradient
 from surfkit.densify.base import Prune
 from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.surface import NormalConsistency
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Edit
@@ -66,7 +67,7 @@ class Recording:
     """A rasterizer that notes what it is asked for."""
 
     def __init__(self, inner):
-        self.inner, self.geometry, self.backwards = inner, [], []
+        self.inner, self.geometry, self.backwards, self.absolute = inner, [], [], []
 
     def render(self, splats, camera, near, geometry=True, distortion=True):
         self.geometry.append(geometry)
@@ -75,9 +76,10 @@ class Recording:
         class Noted:
             maps, seen, radii = render.maps, render.seen, render.radii
 
-            def backward(self, total, chosen=None):
+            def backward(self, total, chosen=None, absolute=False):
                 outer.backwards.append((total, chosen))
-                return render.backward(total, chosen)
+                outer.absolute.append(absolute)
+                return render.backward(total, chosen, absolute)
 
         return Noted()
 
@@ -108,6 +110,49 @@ def test_one_backward_a_step_and_no_second_cotangent_unless_losses_are_chosen(be
     assert torch.allclose(total.color, whole.color, atol=1e-9) and not torch.allclose(total.color, chosen.color)
 
 
+def test_sizes_of_the_gradients_of_chosen_or_all_losses(begin):
+    every = recorded(begin, replace(QUIET, steps=2, signal=AbsGradient()))
+    assert every.absolute == [True] * 2 and all(chosen is total for total, chosen in every.backwards)
+    some = recorded(begin, replace(QUIET, steps=2, signal=AbsGradient(terms=("ssim",))))
+    assert some.absolute == [True] * 2 and not torch.equal(some.backwards[0][0].color, some.backwards[0][1].color)
+    assert recorded(begin, replace(QUIET, steps=2)).absolute == [False] * 2
+
+
+@dataclass(frozen=True)
+class Notebook(Prune):
+    """Notes what it is told."""
+
+    def edit(self, points, step):
+        NOTES.append((step.index, step.since_reset, step.seed, step.rates["means"]))
+        return Edit(max_opacity=0.5) if step.index == 3 else None
+
+
+NOTES: list[tuple] = []
+
+
+def test_policies_are_told_of_resets_rates_and_a_seed(begin):
+    NOTES.clear()
+    trainer, state = begin(replace(QUIET, steps=6, prune=(Notebook(),)), seed=5)
+    list(trainer.run(state))
+    assert [note[1] for note in NOTES] == [1, 2, 3, 1, 2, 3], "told before the reset of the step itself is applied"
+    assert len({note[2] for note in NOTES}) == 6 and all(0 <= note[2] < 2**63 for note in NOTES)
+    assert NOTES[0][3] > NOTES[5][3] == pytest.approx(1.6e-6)
+
+
+def test_regularizers_add_their_gradient_to_that_of_the_losses(begin):
+    stage = replace(QUIET, steps=1, losses={"l1": L1(weight=0.0), "ssim": SSIM(weight=1e-9)})
+    pull = {"opacity": MeanOpacity(weight=0.3), "size": MeanScale(weight=0.2)}
+    trainer, state = begin(replace(stage, regularizers=pull))
+    before = {name: value.clone() for name, value in state.points.params.items()}
+    done = trainer.step(state)
+    opacity, scales = before["opacities"].sigmoid(), before["scales"].exp()
+    assert done.losses["opacity"] == pytest.approx(0.3 * float(opacity.mean()))
+    assert done.losses["size"] == pytest.approx(0.2 * float(scales.mean()))
+    found = {name: state.points.first[name] * 10 for name in ("opacities", "scales")}
+    assert torch.allclose(found["opacities"], 0.3 * opacity * (1 - opacity) / len(opacity), rtol=1e-3, atol=1e-7)
+    assert torch.allclose(found["scales"], 0.2 * scales / scales.numel(), rtol=1e-3, atol=1e-7)
+
+
 def test_chosen_losses_that_are_not_yet_active_give_no_signal(begin):
     losses = {"l1": L1(), "normal": NormalConsistency(weight=0.05, start=100)}
     stage = replace(QUIET, steps=2, losses=losses, signal=LossGradient(terms=("normal",)), densify=ADC())
@@ -135,7 +180,7 @@ class DropAll(Prune):
 
 def test_a_run_without_points_stops(begin):
     trainer, state = begin(replace(QUIET, prune=(DropAll(),)))
-    with pytest.raises(RuntimeError, match="step 2 dropped the last point"):
+    with pytest.raises(BadInput, match="step 2 would drop every point; lower the culls"):
         list(trainer.run(state))
 
 

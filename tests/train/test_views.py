@@ -26,8 +26,11 @@ def test_an_order_goes_on_where_it_was_left():
 class Fixed:
     """A rasterizer whose contributions are known."""
 
+    calls = 0
+
     def contribution(self, splats, camera, near, alpha_power, transmittance_power):
         assert (near, alpha_power, transmittance_power) == (0.005, 0.25, 0.75)
+        self.calls += 1
         return torch.tensor([6.0, 0, camera]), torch.tensor([3, 0, 2])
 
 
@@ -37,4 +40,8 @@ def test_contribution_is_the_mean_over_views_of_means_over_pixels():
 
     splats = Splats("surfel", *[None] * 3, torch.ones(3), None)
     survey = Survey([View("a", 4.0, None), View("b", 8.0, None)], Fixed(), splats, 0.005)
-    assert survey.contribution(0.25).tolist() == [2, 0, 3]
+    tally = survey.survey(0.25, 0.75)
+    assert tally.mean.tolist() == [2, 0, 3] and len(survey) == 2
+    assert tally.hits.tolist() == [6, 0, 4] and tally.views.tolist() == [2, 0, 2]
+    assert survey.survey(0.25, 0.75) is tally and survey.rasterizer.calls == 2, "one pass for all who ask"
+    assert [amount.tolist() for amount, _ in survey.each(0.25, 0.75)] == [[6, 0, 4], [6, 0, 8]]

@@ -1,0 +1,12 @@
+"""What differs from photograph to photograph though the scene does not."""
+
+from collections.abc import Mapping
+
+from surfkit.appearance.exposure import Exposure
+from surfkit.core.registry import Component, hookimpl
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """Appearance models, by name."""
+    return {"exposure": Exposure}

@@ -1,0 +1,51 @@
+"""Conditions that a point must meet to multiply, whatever policy wants it to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.densify.base import Filter, Step
+
+
+@dataclass(frozen=True)
+class Elongation(Filter):
+    """Keep needle-like points from multiplying (CityGaussianV2, section 3.2).
+
+    A surfel seen nearly edge-on is as thin on the screen as a line: its gradient is that of a few pixels, always large,
+    and it multiplies without end.
+    """
+
+    min_ratio: float = 0.01
+    """Ratio of the shortest to the longest axis (eta) above which a point may multiply."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_ratio < 1:
+            raise BadInput(f"filters: elongation.min_ratio is {self.min_ratio}; it must be 0 or more and below 1")
+
+    def admits(self, step: Step, want: Tensor) -> Tensor:
+        """(N,) bool, points that are no needles."""
+        scales = step.shape.scales
+        return scales.amin(-1) > self.min_ratio * scales.amax(-1)
+
+
+@dataclass(frozen=True)
+class CountCap(Filter):
+    """Never grow beyond a number of points; those that want it most come first."""
+
+    points: int = 1_000_000
+    """The most points there may be."""
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise BadInput(f"filters: count-cap.points is {self.points}; it must be 1 or more")
+
+    def admits(self, step: Step, want: Tensor) -> Tensor:
+        """(N,) bool, as many as there is room for: each adds one."""
+        room = max(0, self.points - len(want))
+        if room >= int((want > 0).sum()):
+            return want > 0
+        return torch.zeros_like(want, dtype=torch.bool).index_fill(0, want.topk(room).indices, True)

@@ -1,0 +1,75 @@
+"""Other ways to remove points: by importance, and by opacity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import StepCount, Steps
+from surfkit.densify.base import Prune, Step
+from surfkit.densify.trim import lowest
+from surfkit.primitives.points import Edit, Points
+
+
+@dataclass(frozen=True)
+class Importance(Prune):
+    """Drop the points of least importance: opacity times pixels hit, times a power of the volume (LightGaussian)."""
+
+    at: tuple[Steps, ...] = (15_000,)
+    """Steps after which to prune."""
+
+    ratio: float = 0.66
+    """Share of the points that is dropped."""
+
+    power: float = 0.1
+    """Of the volume, or of a surfel's area, over that at the 90th percentile from the top."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ratio < 1:
+            raise BadInput(f"prune: importance.ratio is {self.ratio}; it must be 0 or more and below 1")
+
+    def edit(self, points: Points, step: Step) -> Edit | None:
+        """Drop the least important at the given steps."""
+        if step.index not in self.at:
+            return None
+        return Edit(drop=lowest(self.importance(step), self.ratio))
+
+    def importance(self, step: Step) -> Tensor:
+        """(N,) sum over views and pixels of the opacity, times (V / V90)^power."""
+        hits = step.views.survey().hits
+        volume = step.shape.scales.prod(-1)
+        large = volume.sort(descending=True).values[int(0.9 * len(volume))]
+        return hits * step.shape.opacities * (volume / large) ** self.power
+
+
+@dataclass(frozen=True)
+class Faint(Prune):
+    """Drop faint points every so often, also after densification has ended."""
+
+    below: float = 0.005
+    """Opacity that is too little."""
+
+    start: Steps = 500
+    """Steps before the first time."""
+
+    until: Steps = 30_000
+    """Last step that may drop."""
+
+    every: Annotated[int, StepCount(floor=10)] = 100
+    """Steps between two times; short runs keep at least 10."""
+
+    recovery: Annotated[int, StepCount(floor=100)] = 100
+    """Steps after a reset of the opacities without dropping; short runs keep at least 100."""
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise BadInput(f"prune: opacity.every is {self.every}; it must be 1 or more steps")
+
+    def edit(self, points: Points, step: Step) -> Edit | None:
+        """Drop what is too faint."""
+        if not self.start < step.index <= self.until or step.index % self.every or step.since_reset < self.recovery:
+            return None
+        return Edit(drop=step.shape.opacities < self.below)

@@ -1,0 +1,90 @@
+"""Trimming: what no view shows is not kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import StepCount, Steps
+from surfkit.densify.base import Prune, Step, Views
+from surfkit.primitives.points import Edit, Points
+
+RELEASED_TOP = 5
+
+
+@dataclass(frozen=True)
+class Trim(Prune):
+    """Drop the points that contribute least to the training views (CityGaussianV2, eq. 4 and 5)."""
+
+    ratio: float = 0.025
+    """Share of the points that each trim drops."""
+
+    score: Literal["mean", "released"] = "mean"
+    """Contribution: the mean over pixels and views of alpha^gamma T^(1 - gamma), or the mean of the last records of
+    alpha T over the views in their order, as the released code has it."""
+
+    gamma: float = 0.5
+    """Power of alpha in the contribution, the rest being that of the transmittance; of the mean alone."""
+
+    start: Steps = 1_000
+    """First step that may trim; before it, only points that no view sees are dropped, at the first step."""
+
+    until: Steps = 15_000
+    """Last step that may trim."""
+
+    every: Annotated[int, StepCount(floor=100)] = 500
+    """Fewest steps between trims, rounded up to whole epochs; short runs keep at least 100."""
+
+    recovery: Annotated[int, StepCount(floor=100)] = 500
+    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ratio < 1:
+            raise BadInput(f"prune: trim.ratio is {self.ratio}; it must be 0 or more and below 1")
+        if not 0 <= self.gamma <= 1:
+            raise BadInput(f"prune: trim.gamma is {self.gamma}; it must lie in 0 to 1")
+        if self.every < 1:
+            raise BadInput(f"prune: trim.every is {self.every}; it must be 1 or more steps")
+
+    def edit(self, points: Points, step: Step) -> Edit | None:
+        """Drop the lowest at the end of some epochs, and the unseen at the beginning."""
+        if step.index == 1:
+            return Edit(drop=step.views.survey(self.gamma, 1 - self.gamma).views == 0)
+        epochs = -(-self.every // len(step.views))
+        due = self.start <= step.index <= self.until and step.index % (epochs * len(step.views)) == 0
+        if not due or step.since_reset < self.recovery:
+            return None
+        return Edit(drop=lowest(self._scores(step.views), self.ratio))
+
+    def _scores(self, views: Views) -> Tensor:
+        if self.score == "released":
+            return released_score(views)
+        return views.survey(self.gamma, 1 - self.gamma).mean
+
+
+def lowest(scores: Tensor, ratio: float) -> Tensor:
+    """(N,) bool, the scores up to the one below which a share of all lies; equal ones go together."""
+    count = int(ratio * len(scores))
+    if count == 0:
+        return torch.zeros_like(scores, dtype=torch.bool)
+    return scores <= scores.kthvalue(count).values
+
+
+def released_score(views: Views) -> Tensor:
+    """(N,) mean of the five last records of alpha T over the views in their order, the highest counted twice.
+
+    The list begins with five times the value of the first view, so that later views count for less: the ranking
+    depends on the order of the views. Only here to compare with results of the released code.
+    """
+    top: list[Tensor] = []
+    for amount, count in views.each(1.0, 1.0):
+        value = amount / (count + 1e-6)
+        if not top:
+            top = [value] * RELEASED_TOP
+        record = value > top[0]
+        top = [torch.where(record, new, old) for new, old in zip([value, value, *top[1:-1]], top, strict=True)]
+    return torch.stack(top).mean(0)
