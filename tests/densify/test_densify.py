@@ -8,6 +8,7 @@ from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, LossGradient
+from surfkit.densify.filters import Elongation
 from surfkit.densify.base import Densify, Filter, Policy, Signal, Step
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
@@ -201,3 +202,8 @@ def test_no_point_seen_is_no_nan():
 def test_signals_that_make_no_sense_are_refused(setting):
     with pytest.raises(BadInput):
         LossGradient(**setting)
+
+
+def test_needles_are_not_admitted():
+    scales = torch.tensor([[1.0, 1.0], [0.02, 1.0], [1.0, 0.01], [1.0, 0.0099], [0.001, 0.5]])
+    assert Elongation(min_ratio=0.01).admits(scales).tolist() == [True, True, True, False, False]
