@@ -18,6 +18,7 @@ from surfkit.core.check import BadInput
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
+    "ablate": "Train every row of an ablation table, and compare the rows.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
     "export": "Write the result of a run for other programs.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",

@@ -8,8 +8,8 @@ from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, LossGradient
-from surfkit.densify.filters import Elongation
 from surfkit.densify.base import Densify, Filter, Policy, Signal, Step
+from surfkit.densify.filters import Elongation
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
 
