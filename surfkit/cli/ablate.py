@@ -52,8 +52,12 @@ class Ablate:
         """Run the table and show it; 1 if a row failed."""
         out = self.out or Path("runs") / f"{self.data.path.resolve().name}-ablate-{self.table.name}"
         plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device)
-        with Screen() as screen:
-            report = ablate(plan, screen)
+        try:
+            with Screen() as screen:
+                report = ablate(plan, screen)
+        except KeyboardInterrupt:
+            print(f"{out} keeps what is finished; the same command goes on from there", file=sys.stderr)
+            raise
         show(report)
         print()
         written = [("results", out / "ablation.json"), ("table", out / "ablation.md"), ("runs", out / "runs")]

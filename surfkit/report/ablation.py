@@ -77,7 +77,7 @@ def built_on(table: Table) -> dict[str, str | None]:
 
 
 def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
-    """A row's recipe when the table's base takes `steps`; a row with a longer or shorter run keeps its share of them."""
+    """A row's recipe when the table's base takes `steps`; a row with a longer or shorter run keeps its share."""
     if steps is None:
         return recipe
     share = recipe.pretrain.steps / table.base.pretrain.steps

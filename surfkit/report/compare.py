@@ -57,14 +57,19 @@ def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mappin
 
 
 def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dict[str, dict[str, Any]]:
-    """Mean and standard error of the differences between runs with the same seed, by name; {} if no seed is in both."""
+    """By name, mean and standard error of the differences between runs with the same seed, how many these are, and the
+    mean that they are to; {} if no seed is in both."""
     seeds = [seed for seed in here if seed in there]
     found = {}
     for name in MEASURED if seeds else ():
         pairs = [here[seed][name] - there[seed][name] for seed in seeds]
         spread = deviation(pairs)
-        error = None if spread is None else spread / math.sqrt(len(pairs))
-        found[name] = {"mean": statistics.fmean(pairs), "standard_error": error, "seeds": len(pairs)}
+        found[name] = {
+            "mean": statistics.fmean(pairs),
+            "standard_error": None if spread is None else spread / math.sqrt(len(pairs)),
+            "seeds": len(pairs),
+            "base": statistics.fmean(there[seed][name] for seed in seeds),
+        }
     return found
 
 

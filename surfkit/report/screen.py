@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any
 
@@ -26,19 +27,17 @@ class Screen:
         self.live: Live | None = None
         self.report: Mapping[str, Any] = {}
         self.label, self.heading = "", ""
-        self.inner = outer(self.progress)
+        self.within = ExitStack()
 
     def __enter__(self) -> Screen:
         if self.console.is_terminal:
-            self.live = Live(console=self.console, auto_refresh=False, transient=True)
-            self.live.start()
-            self.inner.__enter__()
+            live = Live(console=self.console, auto_refresh=False, transient=True)
+            self.live = self.within.enter_context(live)
+            self.within.enter_context(outer(self.progress))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self.live is not None:
-            self.inner.__exit__(kind, error, at)
-            self.live.stop()
+        self.within.close()
 
     def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
         """See `Watch.begin`."""

@@ -17,7 +17,6 @@ from surfkit import pipeline
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
-from surfkit.core.version import own_version
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.ablation import Table, build, pick, scaled
@@ -141,7 +140,7 @@ def fingerprint(recipe: Recipe, data: Data) -> str:
 def versions() -> dict[str, str]:
     """Of surfkit and of the installed plugins that offer parts of recipes."""
     offering = [plugin for plugin in records() if plugin.distribution and "surfkit_components" in plugin.hooks]
-    return {"surfkit": own_version()} | {plugin.distribution: plugin.version for plugin in offering}
+    return {plugin.distribution: plugin.version for plugin in offering}
 
 
 def finished(folder: Path) -> dict[str, float] | None:
@@ -168,7 +167,8 @@ def attempt(trial: Trial, plan: Plan) -> Outcome:
         return Outcome(failed=" ".join(str(error).split()))
     except Exception as error:
         write_text(trace, traceback.format_exc())
-        return Outcome(failed=" ".join(f"{type(error).__name__}: {error}".split()))
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        return Outcome(failed=f"{reason[:200]}; see {trace}")
     trace.unlink(missing_ok=True)
     return Outcome(figures(metrics))
 

@@ -15,8 +15,8 @@ METRICS = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3)}
 """Heads and digits of the numbers whose difference is shown as it is; that of points is shown in percent."""
 
 LEGEND = (
-    "Numbers are means over the seeds ± standard deviation. Differences are to the row that a row is built on, the last "
-    "one above that is not in brackets; ± is the standard error of the differences between runs with the same seed."
+    "Numbers are means over the seeds ± standard deviation. Differences are to the row that a row is built on, the "
+    "last one above that is not in brackets; ± is the standard error of the differences between runs of one seed."
 )
 STACKED = "Below each number are the difference and, dimmed, what was published with its difference."
 
@@ -80,8 +80,7 @@ def _own(report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
         cells.append(_spread(f"{mean[name]:.{digits}f}", sd[name], digits))
         cells.append(_difference(step[name], 1, digits) if step else "")
     cells.append(f"{mean['points']:,.0f}" + (f" ± {sd['points']:,.0f}" if sd["points"] is not None else ""))
-    # the mean of the row below is that over the same seeds, up to seeds that only one of the two has finished
-    cells.append(_difference(step["points"], 100 / (mean["points"] - step["points"]["mean"]), 1, " %") if step else "")
+    cells.append(_difference(step["points"], 100 / step["points"]["base"], 1, " %") if step else "")
     return [*cells, f"{mean['seconds'] / 60:.1f}"]
 
 
