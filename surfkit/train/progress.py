@@ -18,6 +18,8 @@ from surfkit.train.stage import Done
 PLAIN_EVERY_S = 5.0
 """Between two lines where there is no terminal to draw on."""
 DRAW_EVERY_S = 0.1
+OUTER_EVERY_S = 0.5
+"""Between two looks of a larger display, which has more to draw."""
 PSNR_EVERY = 10
 """Steps between two looks at the PSNR of the training view at hand."""
 MEMORY = 0.95
@@ -48,6 +50,7 @@ class Display:
         self.console = console or Console(stderr=True)
         self.stage, self.steps = stage, steps
         self.outer = _OUTER.get()
+        self.every = OUTER_EVERY_S if self.outer else DRAW_EVERY_S if self.console.is_terminal else PLAIN_EVERY_S
         self.loss, self.psnr, self.pace = Mean(), Mean(), Mean()
         self.last, self.drawn = time.perf_counter(), 0.0
         self.bar: Progress | None = None
@@ -74,7 +77,7 @@ class Display:
         now = time.perf_counter()
         self.pace.add(now - self.last)
         self.last = now
-        if now - self.drawn < (DRAW_EVERY_S if self.bar or self.outer else PLAIN_EVERY_S) and not last:
+        if now - self.drawn < self.every and not last:
             return
         self.drawn = now
         line = self.line(done)

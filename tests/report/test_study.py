@@ -201,7 +201,7 @@ def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
 
     class Training(Runs):
         def __call__(self, recipe, data, out, device):
-            with Display("pretrain", 1) as display:
+            with Display("pretrain", 1, console) as display:
                 assert display.bar is None, "no second live display"
                 display.outer("pretrain", 1, 1, "step 1/1")
             return super().__call__(recipe, data, out, device)
