@@ -34,7 +34,7 @@ class Ablate:
     """What to train on."""
 
     steps: int | None = None
-    """Length of each run, schedules scaled along. Below 1,000 points hardly multiply, which most rows are about."""
+    """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: all rows look alike."""
 
     seeds: int = 1
     """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
