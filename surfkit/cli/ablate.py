@@ -34,7 +34,7 @@ class Ablate:
     """What to train on."""
 
     steps: int | None = None
-    """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: all rows look alike."""
+    """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: rows look alike."""
 
     seeds: int = 1
     """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
