@@ -20,6 +20,7 @@ COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
     "export": "Write the result of a run for other programs.",
+    "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
     "components": "List the parts that recipes are made of, by kind.",
     "plugins": "List the plugins: where each comes from, what it offers, why it failed.",

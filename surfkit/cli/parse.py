@@ -13,7 +13,7 @@ from typing import TypeVar
 import tyro
 
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import choices_first, explain_choice, slots
+from surfkit.cli.slots import WHOLE, choices_first, explain_choice, slots
 from surfkit.core.check import BadInput
 
 T = TypeVar("T")
@@ -62,8 +62,11 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
 def _condensed(text: str, command: type, argv: Sequence[str], prog: str) -> str:
     """One line for the box that tyro prints: a title, then sections between rules."""
-    if (known := slots(command, argv).get("recipe")) and not any(word.startswith("recipe:") for word in argv):
-        return f"no recipe chosen: add one of {', '.join(f'recipe:{name}' for name in known)}"
+    known = slots(command, argv)
+    for whole in WHOLE:
+        slot = whole.rstrip(":")
+        if slot in known and not any(word.startswith(whole) for word in argv):
+            return f"no {slot} chosen: add one of {', '.join(whole + name for name in known[slot])}"
     title, sections = _sections(text)
     message = _reworded(" ".join(" ".join(sections[0]).split())) if sections else ""
     if title == "Unrecognized options" and (found := _unrecognised(message, sections[1:], command, argv, prog)):

@@ -9,9 +9,12 @@ from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from surfkit.cli.recipes import chosen_recipe, recipes
+from surfkit.cli.tables import chosen_table, tables
 from surfkit.core.registry import Component, components, kebab, unknown
 
 Slots = dict[str, tuple[str, ...]]
+WHOLE = ("recipe:", "table:")
+"""What a command is about as a whole, chosen before any part."""
 
 
 def slots(command: type, argv: Sequence[str]) -> Slots:
@@ -24,6 +27,8 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
             chosen = next((known[word[7:]] for word in argv if word.startswith("recipe:") and word[7:] in known), None)
             if chosen is not None:
                 found |= _below(type(chosen), chosen, "")
+        elif get_origin(hint) is Annotated and chosen_table in get_args(hint):
+            found["table"] = tuple(tables())
         else:
             found |= _below(hint, getattr(command, name, None), _flag(name))
     return found
@@ -39,7 +44,7 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
     names = {word: known.get(word.partition(":")[0], ()) for word in argv}
     choices = [word for word in argv if word.partition(":")[2] in names[word]]
     others = [word for word in argv if word.partition(":")[2] not in names[word]]
-    choices.sort(key=lambda word: (not word.startswith("recipe:"), word.partition(":")[0].count(".")))
+    choices.sort(key=lambda word: (not word.startswith(WHOLE), word.partition(":")[0].count(".")))
     return [word for word in choices if len(names[word]) > 1] + others
 
 

@@ -89,7 +89,11 @@ def read_json(path: Path, hint: Any) -> Any:
 
 def write_json(path: Path, value: Any) -> None:
     """Save a value as JSON; the file is whole or not there, also when the process dies."""
-    text = json.dumps(dump(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    write_text(path, json.dumps(dump(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Save text; the file is whole or not there, also when the process dies."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")

@@ -6,6 +6,9 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from surfkit.core.check import BadInput
 
@@ -17,7 +20,7 @@ LONGEST = 1600
 class Data:
     """A data set and how to use it."""
 
-    path: Path
+    path: Annotated[Path, tyro.conf.arg(name="data")]
     """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse."""
 
     scale: float | None = None

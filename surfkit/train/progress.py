@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 
 import torch
@@ -15,10 +18,26 @@ from surfkit.train.stage import Done
 PLAIN_EVERY_S = 5.0
 """Between two lines where there is no terminal to draw on."""
 DRAW_EVERY_S = 0.1
+OUTER_EVERY_S = 0.5
+"""Between two looks of a larger display, which has more to draw."""
 PSNR_EVERY = 10
 """Steps between two looks at the PSNR of the training view at hand."""
 MEMORY = 0.95
 """Share of the past in a smoothed number."""
+
+Draw = Callable[[str, int, int, str], None]
+"""Gets a stage, its step, its number of steps, and its other numbers in words."""
+_OUTER: ContextVar[Draw | None] = ContextVar("outer", default=None)
+
+
+@contextmanager
+def outer(draw: Draw) -> Iterator[None]:
+    """Within, displays hand their numbers to `draw` instead of drawing: a terminal has room for one live display."""
+    token = _OUTER.set(draw)
+    try:
+        yield
+    finally:
+        _OUTER.reset(token)
 
 
 class Display:
@@ -30,13 +49,15 @@ class Display:
     def __init__(self, stage: str, steps: int, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self.stage, self.steps = stage, steps
+        self.outer = _OUTER.get()
+        self.every = OUTER_EVERY_S if self.outer else DRAW_EVERY_S if self.console.is_terminal else PLAIN_EVERY_S
         self.loss, self.psnr, self.pace = Mean(), Mean(), Mean()
         self.last, self.drawn = time.perf_counter(), 0.0
         self.bar: Progress | None = None
         self.task: TaskID | None = None
 
     def __enter__(self) -> Display:
-        if self.console.is_terminal:
+        if self.outer is None and self.console.is_terminal:
             columns = TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[line]}")
             self.bar = Progress(*columns, console=self.console, auto_refresh=False)
             self.task = self.bar.add_task(self.stage, total=self.steps, line="")
@@ -56,11 +77,13 @@ class Display:
         now = time.perf_counter()
         self.pace.add(now - self.last)
         self.last = now
-        if now - self.drawn < (DRAW_EVERY_S if self.bar else PLAIN_EVERY_S) and not last:
+        if now - self.drawn < self.every and not last:
             return
         self.drawn = now
         line = self.line(done)
-        if self.bar is None:
+        if self.outer is not None:
+            self.outer(self.stage, done.index, self.steps, line)
+        elif self.bar is None:
             self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True)
         else:
             self.bar.update(self.task, completed=done.index, line=line)

@@ -11,7 +11,7 @@ def test_each_photograph_learns_its_own_exposure(begin, tmp_path):
     gains = torch.tensor([1.0, 0.5, 1.0, 0.5, 1.0, 0.5])
     stage = Stage(steps=240, densify=None, sh_every=1_000)
     plain, learned = {}, {}
-    for way, found in ((stage, plain), (replace(stage, appearance=Exposure()), learned)):
+    for way, found in ((stage, plain), (replace(stage, appearance=Exposure(5e-2, 5e-3)), learned)):
         trainer, state = begin(way)
         photos = [(photo * gain).byte() for photo, gain in zip(trainer.photos, gains, strict=True)]
         trainer = replace(trainer, photos=photos)
@@ -21,10 +21,11 @@ def test_each_photograph_learns_its_own_exposure(begin, tmp_path):
             if done.index == 100:
                 save(tmp_path / "c.safetensors", state)
         found |= {"loss": sum(losses[-60:]), "state": state, "trainer": trainer}
-    assert learned["loss"] < 0.7 * plain["loss"]
+    assert learned["loss"] < 0.65 * plain["loss"]
     value = learned["state"].looks["value"]
-    bright, dark = (value[gains == gain][:, range(3), range(3)].mean() for gain in (1.0, 0.5))
-    assert 0.4 < dark / bright < 0.65
+    grey = torch.tensor([0.4, 0.4, 0.4, 1.0])
+    bright, dark = ((value[gains == gain] @ grey).mean() for gain in (1.0, 0.5))
+    assert 0.35 < dark / bright < 0.65
     assert learned["state"].looks["shown"].tolist() == [40] * 6
     again = load(tmp_path / "c.safetensors")
     list(learned["trainer"].run(again))

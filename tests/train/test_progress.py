@@ -4,7 +4,7 @@ import torch
 from rich.console import Console
 
 from surfkit.raster.api import Maps
-from surfkit.train.progress import Display, Mean, clock, psnr
+from surfkit.train.progress import Display, Mean, clock, outer, psnr
 from surfkit.train.stage import Done
 
 
@@ -53,3 +53,12 @@ def test_on_a_terminal_there_is_a_bar():
         for index in range(1, 4):
             display.show(done(index))
     assert "━" in out.getvalue() and "step 3/3" in out.getvalue()
+
+
+def test_within_another_display_the_numbers_go_there():
+    out, drawn = io.StringIO(), []
+    with outer(lambda *numbers: drawn.append(numbers)), Display("pretrain", 3, Console(file=out)) as display:
+        for index in range(1, 4):
+            display.show(done(index))
+    assert out.getvalue() == ""
+    assert drawn[-1][:3] == ("pretrain", 3, 3) and "step 3/3" in drawn[-1][3]

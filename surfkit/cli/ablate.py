@@ -1,0 +1,82 @@
+"""`surfkit ablate`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from surfkit.cli.table import print_table
+from surfkit.cli.tables import chosen_table
+from surfkit.raster.select import Device
+from surfkit.report.ablation import Table
+from surfkit.report.screen import Screen
+from surfkit.report.study import Plan, ablate
+from surfkit.report.table import LEGEND, STACKED, drawing, failures, lines
+from surfkit.scene.data import Data
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Train every row of an ablation table on the same data, and compare each row with the one it is built on.
+
+    Rows that come to the same recipe are trained once. An interrupted table goes on when the same command is given
+    again; with more seeds or rows, what is finished is kept. A row that fails does not stop the others.
+    """
+
+    table: Annotated[Table, chosen_table]
+    """Which table."""
+
+    data: Annotated[Data, tyro.conf.arg(name="")]
+    """What to train on."""
+
+    steps: int | None = None
+    """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: rows look alike."""
+
+    seeds: int = 1
+    """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
+
+    rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
+    """Run only these rows, by number or label; what is known of the others is shown with them."""
+
+    out: Path | None = None
+    """Folder of the results; runs/DATA-ablate-TABLE by default."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    def run(self) -> int:
+        """Run the table and show it; 1 if a row failed."""
+        out = self.out or Path("runs") / f"{self.data.path.resolve().name}-ablate-{self.table.name}"
+        plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device)
+        try:
+            with Screen() as screen:
+                report = ablate(plan, screen)
+        except KeyboardInterrupt:
+            print(f"{out} keeps what is finished; the same command goes on from there", file=sys.stderr)
+            raise
+        show(report)
+        print()
+        written = [("results", out / "ablation.json"), ("table", out / "ablation.md"), ("runs", out / "runs")]
+        print_table(("written", "path"), [(what, str(path)) for what, path in written])
+        for failure in failures(report):
+            print(f"surfkit: {failure}", file=sys.stderr)
+        return 1 if failures(report) else 0
+
+
+def show(report: dict[str, Any]) -> None:
+    """Print the table: fitted to a terminal, else one line a row."""
+    if not sys.stdout.isatty():
+        print_table(*lines(report))
+        return
+    from rich.console import Console
+
+    console = Console()
+    console.print(drawing(report))
+    console.print(f"\n{LEGEND} {STACKED}", style="dim")
+
+
+COMMAND = Ablate

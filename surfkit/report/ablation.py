@@ -1,0 +1,98 @@
+"""Ablation tables as values: what each row changes, and the recipe that it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from surfkit.core.check import BadInput
+from surfkit.core.registry import unknown
+from surfkit.core.tree import evolve
+from surfkit.pipeline import with_steps
+from surfkit.recipe import Recipe
+
+
+@dataclass(frozen=True)
+class Row:
+    """A recipe that differs from the last kept row above in a few values.
+
+    Attributes:
+        label: Its name in the table.
+        change: New values, by dotted path into the recipe.
+        kept: Later rows build on this one; False for a change that was tried and given up.
+        paper: What was published for it, by the names of `surfkit.report.compare`; points as a count.
+    """
+
+    label: str
+    change: Mapping[str, Any] = field(default_factory=dict)
+    kept: bool = True
+    paper: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows that are compared, and where they start from.
+
+    Attributes:
+        name: As typed, `table:NAME`.
+        about: What it shows, in one line.
+        base: What the first row changes.
+        rows: From top to bottom.
+    """
+
+    name: str
+    about: str
+    base: Recipe
+    rows: tuple[Row, ...]
+
+    def __post_init__(self) -> None:
+        labels = [row.label for row in self.rows]
+        if twice := [label for label in labels if labels.count(label) > 1]:
+            raise BadInput(f"table:{self.name} has two rows {twice[0]!r}; each needs a label of its own")
+
+
+def build(table: Table) -> dict[str, Recipe]:
+    """The recipe of every row, by label."""
+    recipes, base = {}, table.base
+    for row in table.rows:
+        recipe = base
+        for path, value in row.change.items():
+            try:
+                recipe = evolve(recipe, path, value)
+            except BadInput as error:
+                raise BadInput(f"table:{table.name}, row {row.label!r}: {error}") from error
+        recipes[row.label] = replace(recipe, about=f"{row.label}, a row of table:{table.name}")
+        base = recipe if row.kept else base
+    return recipes
+
+
+def built_on(table: Table) -> dict[str, str | None]:
+    """The label of the row that each row is built on, by label; None for a first one."""
+    found, last = {}, None
+    for row in table.rows:
+        found[row.label] = last
+        last = row.label if row.kept else last
+    return found
+
+
+def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
+    """A row's recipe when the table's base takes `steps`; a row with a longer or shorter run keeps its share."""
+    if steps is None:
+        return recipe
+    share = recipe.pretrain.steps / table.base.pretrain.steps
+    return with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
+
+
+def pick(table: Table, names: Sequence[str]) -> list[str]:
+    """Labels of the rows that `names` give by number or label, in the order of the table; all if there are none."""
+    labels = [row.label for row in table.rows]
+    chosen = set()
+    for name in names:
+        if name.isdecimal() and 1 <= int(name) <= len(labels):
+            chosen.add(labels[int(name) - 1])
+        elif name in labels:
+            chosen.add(name)
+        else:
+            raise BadInput(f"--rows: {unknown('row', name, labels)}; or give its number, 1 to {len(labels)}")
+    return [label for label in labels if label in chosen or not names]

@@ -1,0 +1,78 @@
+"""What was measured of each row, against the row it is built on and against what was published."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping
+from typing import Any
+
+from surfkit.core.codec import dump
+from surfkit.report.ablation import Row, Table, built_on
+
+MEASURED = ("psnr", "ssim", "points", "seconds", "cpu_seconds")
+"""What is taken from the metrics of a run."""
+
+Figures = Mapping[str, float]
+"""Numbers of a run, by the names in `MEASURED`."""
+
+
+def figures(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers that are compared, out of the metrics of a run."""
+    return {name: {**metrics, **metrics["images"]}[name] for name in MEASURED}
+
+
+def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list[dict[str, Any]]:
+    """Plain data of every row of the table: means, deviations and differences.
+
+    Args:
+        table: The rows.
+        measured: Numbers of each finished run, by label and seed.
+    """
+    below, rows = built_on(table), {row.label: row for row in table.rows}
+    return [_compared(at, row, rows.get(below[row.label]), measured) for at, row in enumerate(table.rows, 1)]
+
+
+def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
+    here = measured.get(row.label, {})
+    there = measured.get(base.label, {}) if base else {}
+    columns = {name: [run[name] for run in here.values()] for name in MEASURED} if here else {}
+    return {
+        "number": at,
+        "label": row.label,
+        "built_on": base.label if base else None,
+        "kept": row.kept,
+        "change": {path: dump(value) for path, value in row.change.items()},
+        "mean": {name: statistics.fmean(values) for name, values in columns.items()},
+        "sd": {name: deviation(values) for name, values in columns.items()},
+        "difference": difference(here, there),
+        "paper": dict(row.paper),
+        "paper_difference": {
+            # as many digits as were printed: a difference of floats has more
+            name: round(value - base.paper[name], 6)
+            for name, value in row.paper.items()
+            if base and name in base.paper
+        },
+    }
+
+
+def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dict[str, dict[str, Any]]:
+    """By name, mean and standard error of the differences between runs with the same seed, how many these are, and the
+    mean that they are to; {} if no seed is in both."""
+    seeds = [seed for seed in here if seed in there]
+    found = {}
+    for name in MEASURED if seeds else ():
+        pairs = [here[seed][name] - there[seed][name] for seed in seeds]
+        spread = deviation(pairs)
+        found[name] = {
+            "mean": statistics.fmean(pairs),
+            "standard_error": None if spread is None else spread / math.sqrt(len(pairs)),
+            "seeds": len(pairs),
+            "base": statistics.fmean(there[seed][name] for seed in seeds),
+        }
+    return found
+
+
+def deviation(values: list[float]) -> float | None:
+    """The standard deviation of the population that the values are drawn from; None for a single one."""
+    return statistics.stdev(values) if len(values) > 1 else None

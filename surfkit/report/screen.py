@@ -1,0 +1,74 @@
+"""What a person sees while an ablation table is run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from surfkit.report.study import Outcome, Trial
+from surfkit.report.table import drawing
+from surfkit.train.progress import outer
+
+
+class Screen:
+    """A table that fills itself, with the progress of the run at hand below it; lines where there is no terminal."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self.live: Live | None = None
+        self.report: Mapping[str, Any] = {}
+        self.label, self.heading = "", ""
+        self.within = ExitStack()
+
+    def __enter__(self) -> Screen:
+        if self.console.is_terminal:
+            live = Live(console=self.console, auto_refresh=False, transient=True)
+            self.live = self.within.enter_context(live)
+            self.within.enter_context(outer(self.progress))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.within.close()
+
+    def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
+        """See `Watch.begin`."""
+        self.report, self.label = report, trial.label
+        self.heading = f"run {at} of {count}: {trial.label}, seed {trial.seed}"
+        if self.live is None:
+            say(f"{self.heading}, in {trial.folder}")
+        else:
+            self.draw(Text(self.heading))
+
+    def progress(self, stage: str, index: int, steps: int, line: str) -> None:
+        """Show how far the run at hand is."""
+        bar = Table.grid(padding=(0, 2, 0, 0))
+        bar.add_row(stage, ProgressBar(steps, index, width=20), line)
+        self.draw(Group(Text(self.heading), bar))
+
+    def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
+        """See `Watch.end`."""
+        self.report = report
+        if outcome.figures is None:
+            say(f"{self.heading}: failed: {outcome.failed}")
+        elif self.live is None:
+            psnr, ssim, points, seconds = (outcome.figures[name] for name in ("psnr", "ssim", "points", "seconds"))
+            say(f"{self.heading}: PSNR {psnr:.2f} dB, SSIM {ssim:.3f}, {points:,} points, {seconds / 60:.1f} minutes")
+
+    def draw(self, below: Any) -> None:
+        """Show the table with something below it."""
+        assert self.live is not None
+        self.live.update(Group(drawing(self.report, self.label), Text(), below), refresh=True)
+
+
+def say(text: str) -> None:
+    """Tell the person who watches; above the live table, where there is one."""
+    print(text, file=sys.stderr)

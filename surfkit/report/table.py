@@ -1,0 +1,108 @@
+"""An ablation table for people: as text, as Markdown, and on a terminal.
+
+All of them show `report`, the plain data that ablation.json holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+METRICS = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3)}
+"""Heads and digits of the numbers whose difference is shown as it is; that of points is shown in percent."""
+
+LEGEND = (
+    "Numbers are means over the seeds ± standard deviation. Differences are to the row that a row is built on, the "
+    "last one above that is not in brackets; ± is the standard error of the differences between runs of one seed."
+)
+STACKED = "Below each number are the difference and, dimmed, what was published with its difference."
+
+
+def lines(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of texts, with the published figures in columns of their own where there are any."""
+    head = ["", "row", "seeds", "PSNR", "diff.", "SSIM", "diff.", "points", "diff.", "minutes"]
+    head += [f"paper: {name}" for name in ("PSNR", "diff.", "SSIM", "diff.", "points", "diff.", "F1", "diff.")]
+    return head, [[*_own(report, row), *_published(report, row)] for row in report["rows"]]
+
+
+def failures(report: Mapping[str, Any]) -> list[str]:
+    """A line for each row that could not be run."""
+    return [f"{row['label']}: failed: {row['failed']}" for row in report["rows"] if row["failed"]]
+
+
+def markdown(report: Mapping[str, Any]) -> str:
+    """The table as a Markdown page."""
+    head, rows = lines(report)
+    marks = ["---:" if at != 1 else "---" for at in range(len(head))]
+    table = ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in [head, marks, *rows]]
+    data = report["data"]["path"].rpartition("/")[2]
+    what = f"{report['about']}. Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}."
+    broken = [f"- {text}" for text in failures(report)]
+    parts = [f"# table:{report['table']}", what, "\n".join(table), LEGEND, "\n".join(broken)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
+    """The table for a terminal; each number has its difference and the published figure below it.
+
+    Args:
+        report: What is known so far.
+        running: Label of the row at work.
+    """
+    table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
+    for head in ("", "row", "seeds", "PSNR", "SSIM", "points", "min"):
+        table.add_column(head, justify="left" if head == "row" else "right", no_wrap=head != "row")
+    for row in report["rows"]:
+        number, label, seeds, *own, minutes = _own(report, row)
+        paper = _published(report, row)
+        style = "red" if row["failed"] else "bold" if row["label"] == running else "" if row["kept"] else "italic"
+        cells = [_stacked(*own[i : i + 2], *paper[i : i + 2], style) for i in (0, 2, 4)]
+        table.add_row(number, Text(label, style), seeds, *cells, minutes)
+    return table
+
+
+def _stacked(value: str, step: str, paper: str, paper_step: str, style: str) -> Text:
+    text = Text("\n".join(filter(None, [value or "-", step])), style)
+    return text.append("\n" + " ".join(filter(None, [paper, paper_step])), "dim") if paper else text
+
+
+def _own(report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
+    """Number, label, seeds, then value and difference of PSNR, SSIM and points, then minutes."""
+    label = row["label"] if row["kept"] else f"({row['label']})"
+    cells = [str(row["number"]), label, "failed" if row["failed"] else f"{len(row['runs'])}/{report['seeds']}"]
+    mean, sd, step = row["mean"], row["sd"], row["difference"]
+    if not mean:
+        return [*cells, *[""] * 7]
+    for name, (_, digits) in METRICS.items():
+        cells.append(_spread(f"{mean[name]:.{digits}f}", sd[name], digits))
+        cells.append(_difference(step[name], 1, digits) if step else "")
+    cells.append(f"{mean['points']:,.0f}" + (f" ± {sd['points']:,.0f}" if sd["points"] is not None else ""))
+    cells.append(_difference(step["points"], 100 / step["points"]["base"], 1, " %") if step else "")
+    return [*cells, f"{mean['seconds'] / 60:.1f}"]
+
+
+def _published(report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
+    """Value and difference in print of PSNR, SSIM, points and F1."""
+    paper, step = row["paper"], row["paper_difference"]
+    cells = []
+    for name, digits in {"psnr": 2, "ssim": 3, "points": None, "f1": 3}.items():
+        if digits is None:
+            cells.append(f"{paper[name] / 1e6:.2f} M" if name in paper else "")
+            cells.append(f"{100 * step[name] / (paper[name] - step[name]):+.1f} %" if name in step else "")
+        else:
+            cells.append(f"{paper[name]:.{digits}f}" if name in paper else "")
+            cells.append(f"{step[name]:+.{digits}f}" if name in step else "")
+    return cells
+
+
+def _difference(step: Mapping[str, Any], factor: float, digits: int, unit: str = "") -> str:
+    error = step["standard_error"]
+    text = f"{step['mean'] * factor:+.{digits}f}"
+    return _spread(text, None if error is None else error * factor, digits) + unit
+
+
+def _spread(text: str, spread: float | None, digits: int) -> str:
+    return text if spread is None else f"{text} ± {spread:.{digits}f}"

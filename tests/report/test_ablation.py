@@ -1,0 +1,122 @@
+"""Every row of every table builds, and a table is what the paper means by one."""
+
+import json
+
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, load
+from surfkit.core.tree import evolve
+from surfkit.densify.signal import LossGradient
+from surfkit.pipeline import with_steps
+from surfkit.recipe import Recipe
+from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, TABLES
+from surfkit.report.ablation import Row, Table, build, built_on, pick, scaled
+
+ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
+LADDER = Table(
+    "ladder",
+    "A kept row, one given up, and one more.",
+    COARSE_BASELINE,
+    (
+        Row("start", {"seed": 1}),
+        Row("given up", {"seed": 2, "pretrain.sh_every": 7}, kept=False),
+        Row("end", {"primitive.sh_degree": 0}),
+    ),
+)
+
+
+@pytest.mark.parametrize(("name", "label"), ROWS)
+def test_every_row_is_a_recipe(name, label):
+    table = TABLES[name]
+    recipe = build(table)[label]
+    assert load(Recipe, json.loads(json.dumps(dump(recipe), allow_nan=False))) == recipe
+    short = with_steps(recipe, 600)
+    assert short.pretrain.steps == 600 and short.pretrain.densify.until == 300
+    assert short.pretrain.losses["normal"].start == 140
+    assert label in recipe.about and name in recipe.about
+
+
+@pytest.mark.parametrize(("name", "label"), ROWS)
+def test_every_row_changes_what_it_is_built_on(name, label):
+    table = TABLES[name]
+    row = next(row for row in table.rows if row.label == label)
+    below = built_on(table)[label]
+    before = build(table)[below] if below else table.base
+    after = build(table)[label]
+    for path, value in row.change.items():
+        before = evolve(before, path, value)
+    assert before.pretrain == after.pretrain and before.primitive == after.primitive
+    assert after.pretrain.policies, "all these tables are about how points multiply"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_row_has_its_published_figures(name):
+    for row in TABLES[name].rows:
+        assert row.paper.keys() == {"psnr", "ssim", "f1", "points"}
+        assert row.paper["psnr"] > 20 > row.paper["ssim"] and row.paper["points"] > 9e6
+    assert TABLES[name].name == name
+
+
+def test_rows_build_on_the_last_kept_one():
+    recipes = build(LADDER)
+    assert list(recipes) == ["start", "given up", "end"]
+    assert [recipe.seed for recipe in recipes.values()] == [1, 2, 1]
+    assert [recipe.pretrain.sh_every for recipe in recipes.values()] == [1_000, 7, 1_000]
+    assert [recipe.primitive.sh_degree for recipe in recipes.values()] == [3, 3, 0]
+    assert built_on(LADDER) == {"start": None, "given up": "start", "end": "start"}
+
+
+def test_the_model_table_adds_up():
+    recipes = list(build(MODEL).values())
+    assert [bool(recipe.pretrain.densify.filters) for recipe in recipes[:3]] == [False, True, True]
+    assert [recipe.pretrain.signal for recipe in recipes[:3]] == [
+        LossGradient(),
+        LossGradient(),
+        LossGradient(terms=("ssim",), boost=0.9),
+    ]
+
+
+def test_the_gradient_table_changes_nothing_but_the_signal():
+    recipes = list(build(GRADIENT).values())[:4]
+    assert [recipe.pretrain.signal.terms for recipe in recipes] == [
+        None,
+        ("ssim", "l1"),
+        ("ssim", "normal"),
+        ("ssim",),
+    ]
+    assert len({json.dumps(dump(evolve(r, "pretrain.signal", LossGradient()).pretrain)) for r in recipes}) == 1
+
+
+def test_the_baseline_is_the_published_one():
+    stage = COARSE_BASELINE.pretrain
+    normal = stage.losses["normal"]
+    assert COARSE_BASELINE.primitive.sh_degree == 3 and stage.steps == 30_000
+    assert (normal.weight, normal.start, normal.depth) == (0.0125, 7_000, "median")
+    assert (stage.densify.cull_opacity, stage.densify.filters, stage.signal.terms) == (0.005, (), None)
+    assert "distortion" not in stage.losses
+
+
+def test_a_row_that_cannot_be_built_says_which():
+    table = Table("bad", "", COARSE_BASELINE, (Row("base"), Row("worse", {"pretrain.densfy": None})))
+    with pytest.raises(BadInput, match="table:bad, row 'worse': pretrain has no 'densfy'"):
+        build(table)
+    with pytest.raises(BadInput, match="two rows 'a'"):
+        Table("bad", "", COARSE_BASELINE, (Row("a"), Row("b"), Row("a")))
+
+
+def test_a_row_with_a_shorter_run_stays_shorter():
+    table = Table("short", "", COARSE_BASELINE, (Row("long"), Row("short", {"pretrain.steps": 7_500})))
+    steps = [scaled(recipe, table, 1_000).pretrain.steps for recipe in build(table).values()]
+    assert steps == [1_000, 250]
+    assert scaled(table.base, table, None) is table.base
+    with pytest.raises(BadInput, match="--steps 0"):
+        scaled(table.base, table, 0)
+
+
+def test_rows_are_picked_by_number_or_label():
+    assert pick(LADDER, []) == ["start", "given up", "end"]
+    assert pick(LADDER, ["3", "start"]) == ["start", "end"]
+    for wrong in ("0", "4", "strt"):
+        with pytest.raises(BadInput, match=f"no row named '{wrong}'.*known: start, given up, end; .* 1 to 3"):
+            pick(LADDER, [wrong])

@@ -1,0 +1,59 @@
+import pytest
+
+from surfkit.recipes.ablations import COARSE_BASELINE
+from surfkit.report.ablation import Row, Table
+from surfkit.report.compare import compare, deviation, difference, figures
+
+TABLE = Table(
+    "small",
+    "",
+    COARSE_BASELINE,
+    (
+        Row("base", paper={"psnr": 21.12, "points": 9.54e6}),
+        Row("more", {"seed": 5}, kept=False, paper={"psnr": 22.24, "f1": 0.4}),
+        Row("most"),
+    ),
+)
+
+
+def run(psnr: float, points: int = 100) -> dict[str, float]:
+    return {"psnr": psnr, "ssim": 0.5, "points": points, "seconds": 60.0, "cpu_seconds": 90.0}
+
+
+def test_a_paired_difference_by_hand():
+    here = {0: run(22.0, 110), 1: run(23.0, 130), 2: run(21.0, 120), 7: run(99.0, 1)}
+    there = {0: run(21.0, 100), 1: run(21.0, 100), 2: run(21.0, 130), 8: run(0.0, 1)}
+    found = difference(here, there)
+    # PSNR: +1, +2, 0: mean 1, standard deviation 1; points: +10, +30, -10: mean 10, standard deviation 20
+    assert found["psnr"] == pytest.approx({"mean": 1.0, "standard_error": 3**-0.5, "seeds": 3, "base": 21.0})
+    assert found["points"] == pytest.approx({"mean": 10.0, "standard_error": 20 * 3**-0.5, "seeds": 3, "base": 110.0})
+    assert found["ssim"]["mean"] == found["ssim"]["standard_error"] == 0
+
+
+def test_one_seed_has_no_error_and_none_no_difference():
+    assert difference({0: run(22.0)}, {0: run(21.0)})["psnr"] == {
+        "mean": 1.0, "standard_error": None, "seeds": 1, "base": 21.0
+    }  # fmt: skip
+    assert difference({0: run(22.0)}, {1: run(21.0)}) == {}
+    assert deviation([4.0]) is None and deviation([1.0, 3.0]) == pytest.approx(2**0.5)
+
+
+def test_rows_are_compared_with_the_kept_one():
+    base, more, most = compare(TABLE, {"base": {0: run(20.0), 1: run(22.0)}, "most": {0: run(23.0)}})
+    assert base["mean"]["psnr"] == 21 and base["sd"]["psnr"] == pytest.approx(2**0.5) and base["difference"] == {}
+    assert more["mean"] == {} and more["difference"] == {} and more["change"] == {"seed": 5}
+    assert (base["built_on"], more["built_on"], most["built_on"]) == (None, "base", "base")
+    assert most["difference"]["psnr"]["mean"] == 3 and most["difference"]["psnr"]["seeds"] == 1
+    assert more["paper_difference"] == {"psnr": 1.12} and most["paper_difference"] == {}
+    assert [row["number"] for row in (base, more, most)] == [1, 2, 3]
+
+
+def test_figures_are_found_in_the_metrics():
+    metrics = {"images": {"psnr": 1.0, "ssim": 0.2, "per_image": {}}, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0}
+    assert figures(metrics | {"fps": 6.0}) == {
+        "psnr": 1.0,
+        "ssim": 0.2,
+        "points": 3,
+        "seconds": 4.0,
+        "cpu_seconds": 5.0,
+    }

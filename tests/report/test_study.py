@@ -1,0 +1,225 @@
+"""Running tables, with runs that only pretend to train."""
+
+import io
+import json
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.recipes.ablations import COARSE_BASELINE
+from surfkit.report import study
+from surfkit.report.ablation import Row, Table
+from surfkit.report.screen import Screen
+from surfkit.report.study import Plan, ablate, fingerprint
+from surfkit.report.table import lines
+from surfkit.scene.data import Data
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train.progress import Display
+
+TABLE = Table(
+    "twins",
+    "Two rows with one recipe, and a third",
+    COARSE_BASELINE,
+    (
+        Row("base", paper={"psnr": 21.12, "ssim": 0.637, "f1": 0.41, "points": 9_540_000}),
+        Row("same", {"pretrain.sh_every": 1_000}, kept=False),
+        Row("less | more", {"primitive.sh_degree": 1}, paper={"psnr": 22.24, "points": 9_510_000}),
+    ),
+)
+
+
+class Silent:
+    """Watches, and remembers."""
+
+    def __init__(self):
+        self.begun = []
+
+    def begin(self, trial, at, count, report):
+        self.begun.append((trial.label, trial.seed, at, count))
+
+    def end(self, trial, outcome, report):
+        pass
+
+
+class Runs:
+    """Stands in for training: PSNR is 20 + seed, and 3 more with degree 1; a run may fail or be interrupted."""
+
+    def __init__(self):
+        self.calls = []
+        self.raises = {}
+
+    def __call__(self, recipe, data, out, device):
+        key = (recipe.primitive.sh_degree, recipe.seed)
+        self.calls.append(key)
+        if key in self.raises:
+            raise self.raises[key]
+        images = {"psnr": 20.0 + recipe.seed + 3 * (recipe.primitive.sh_degree == 1), "ssim": 0.5, "per_image": {}}
+        metrics = {"images": images, "points": 100 * key[0], "seconds": 90.0, "cpu_seconds": 100.0}
+        write_json(out / "metrics.json", metrics)
+        return metrics
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Data:
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(views=9, width=24, height=18, points=40)))
+    return Data(folder)
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    stand_in = Runs()
+    monkeypatch.setattr(study.pipeline, "run", stand_in)
+    return stand_in
+
+
+def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
+    watch = Silent()
+    report = ablate(Plan(TABLE, data, tmp_path, steps=300, seeds=2), watch)
+    assert runs.calls == [(3, 0), (1, 0), (3, 1), (1, 1)]
+    assert watch.begun == [("base", 0, 1, 4), ("less | more", 0, 2, 4), ("base", 1, 3, 4), ("less | more", 1, 4, 4)]
+    base, same, less = report["rows"]
+    assert base["runs"] == same["runs"] and base["runs"] != less["runs"]
+    assert same["difference"]["psnr"]["mean"] == 0
+    assert less["difference"]["psnr"] == {"mean": 3.0, "standard_error": 0.0, "seeds": 2, "base": 20.5}
+    assert base["mean"]["psnr"] == 20.5 and base["sd"]["psnr"] == pytest.approx(0.5**0.5)
+    for run in base["runs"] + less["runs"]:
+        assert (tmp_path / run["folder"] / "metrics.json").exists()
+    assert len(list((tmp_path / "runs").iterdir())) == 4
+
+
+def test_what_is_saved(data, runs, tmp_path):
+    report = ablate(Plan(TABLE, data, tmp_path, steps=300, seeds=2), Silent())
+    assert json.loads((tmp_path / "ablation.json").read_text()) == report
+    assert (report["table"], report["steps"], report["seeds"]) == ("twins", 300, 2)
+    assert report["data"]["path"] == str(data.path) and report["versions"].keys() >= {"surfkit", "torch", "python"}
+    assert report["rows"][2]["change"] == {"primitive.sh_degree": 1} and report["rows"][1]["kept"] is False
+    page = (tmp_path / "ablation.md").read_text()
+    own = "| 3 | less \\| more | 2/2 | 23.50 ± 0.71 | +3.00 ± 0.00 | 0.500 ± 0.000 | +0.000 ± 0.000 | 100 ± 0 | "
+    assert own + "-66.7 ± 0.0 % | 1.5 | 22.24 | +1.12 |  |  | 9.51 M | -0.3 % |  |  |" in page
+    assert "| 2 | (same) |" in page and page.startswith("# table:twins\n")
+    widths = {line.replace("\\|", "").count("|") for line in page.splitlines() if line.startswith("|")}
+    assert widths == {19}
+
+
+def test_an_interrupted_table_goes_on(data, runs, tmp_path):
+    whole = ablate(Plan(TABLE, data, tmp_path / "whole", seeds=2), Silent())
+    runs.raises = {(3, 1): KeyboardInterrupt()}
+    plan = Plan(TABLE, data, tmp_path / "broken", seeds=2)
+    with pytest.raises(KeyboardInterrupt):
+        ablate(plan, Silent())
+    half = json.loads((plan.out / "ablation.json").read_text())
+    assert [len(row["runs"]) for row in half["rows"]] == [1, 1, 1] and not any(row["failed"] for row in half["rows"])
+    runs.raises, runs.calls = {}, []
+    assert ablate(plan, Silent()) == whole
+    assert runs.calls == [(3, 1), (1, 1)]
+
+
+def test_a_finished_table_needs_nothing(data, runs, tmp_path):
+    plan = Plan(TABLE, data, tmp_path)
+    first = ablate(plan, Silent())
+    runs.calls = []
+    assert ablate(plan, Silent()) == first and runs.calls == []
+    more = ablate(replace(plan, seeds=2), Silent())
+    assert runs.calls == [(3, 1), (1, 1)] and more["rows"][0]["runs"][0] == first["rows"][0]["runs"][0]
+    runs.calls = []
+    ablate(replace(plan, steps=20), Silent())
+    assert len(runs.calls) == 2, "other steps are other runs"
+
+
+def test_some_rows_now_and_the_others_later(data, runs, tmp_path):
+    report = ablate(Plan(TABLE, data, tmp_path, rows=("3",)), Silent())
+    assert runs.calls == [(1, 0)] and report["rows"][0]["runs"] == [] and report["rows"][2]["difference"] == {}
+    report = ablate(Plan(TABLE, data, tmp_path, rows=("same",)), Silent())
+    assert runs.calls == [(1, 0), (3, 0)] and report["rows"][2]["difference"]["psnr"]["mean"] == 3
+
+
+def test_a_row_that_fails_does_not_stop_the_others(data, runs, tmp_path):
+    runs.raises = {(3, 0): RuntimeError("step 7:\n  the losses are nan")}
+    plan = Plan(TABLE, data, tmp_path, seeds=2)
+    report = ablate(plan, Silent())
+    assert runs.calls == [(3, 0), (1, 0), (1, 1)], "a failed row is not tried with other seeds"
+    base, same, less = report["rows"]
+    assert base["failed"].startswith("seed 0: RuntimeError: step 7: the losses are nan; see ")
+    assert base["failed"] == same["failed"] and base["runs"] == [] and base["mean"] == {}
+    assert less["failed"] is None and less["mean"]["psnr"] == 23.5 and less["difference"] == {}
+    (trace,) = tmp_path.rglob("failed.txt")
+    assert "in __call__" in trace.read_text()
+    assert "- base: failed: seed 0: RuntimeError" in (tmp_path / "ablation.md").read_text()
+    assert [row[2] for row in lines(report)[1]] == ["failed", "failed", "2/2"]
+    runs.raises = {}
+    again = ablate(plan, Silent())
+    assert not any(row["failed"] for row in again["rows"]) and not list(tmp_path.rglob("failed.txt"))
+
+
+def test_input_that_a_single_run_refuses_fails_its_row(data, runs, tmp_path):
+    runs.raises = {(1, 0): BadInput("no depth\nprior")}
+    report = ablate(Plan(TABLE, data, tmp_path), Silent())
+    assert report["rows"][2]["failed"] == "seed 0: no depth prior" and not list(tmp_path.rglob("failed.txt"))
+
+
+def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs, tmp_path):
+    plan = Plan(TABLE, data, tmp_path / "out")
+    for wrong, message in (
+        (replace(plan, data=Data(tmp_path / "nowhere")), "no such folder"),
+        (replace(plan, data=replace(data, test_every=0)), "no photograph is kept from training"),
+        (replace(plan, steps=0), "--steps 0"),
+        (replace(plan, rows=("4",)), "no row named '4'"),
+        (replace(plan, device="cuda"), "--device cuda"),
+    ):
+        with pytest.raises(BadInput, match=message):
+            ablate(wrong, Silent())
+    with pytest.raises(BadInput, match="--seeds 0"):
+        replace(plan, seeds=0)
+    assert runs.calls == [] and not plan.out.exists()
+    plan.out.write_text("")
+    with pytest.raises(BadInput, match="a file, not a folder"):
+        ablate(plan, Silent())
+
+
+def test_a_fingerprint_tells_what_a_run_is_made_from(data, monkeypatch):
+    recipe = COARSE_BASELINE
+    first = fingerprint(recipe, data)
+    assert first == fingerprint(replace(recipe, about="in other words"), data) and len(first) == 12
+    others = [
+        fingerprint(replace(recipe, seed=1), data),
+        fingerprint(recipe, replace(data, scale=2.0)),
+        fingerprint(recipe, Data(data.path.parent)),
+    ]
+    newer = [replace(plugin, version="99") for plugin in study.records()]
+    monkeypatch.setattr(study, "records", lambda: newer)
+    others.append(fingerprint(recipe, data))
+    assert len({first, *others}) == 5
+
+
+def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
+    out = io.StringIO()
+    console = Console(file=out, width=120, force_terminal=True)
+
+    class Training(Runs):
+        def __call__(self, recipe, data, out, device):
+            with Display("pretrain", 1, console) as display:
+                assert display.bar is None, "no second live display"
+                display.outer("pretrain", 1, 1, "step 1/1")
+            return super().__call__(recipe, data, out, device)
+
+    training = Training()
+    training.raises = {(1, 0): RuntimeError("too bad")}
+    monkeypatch.setattr(study.pipeline, "run", training)
+    with Screen(console) as screen:
+        ablate(Plan(TABLE, data, tmp_path), screen)
+    text = out.getvalue()
+    assert "run 1 of 2: base, seed 0" in text and "step 1/1" in text and "━" in text
+    assert "21.12" in text and "run 2 of 2: less | more, seed 0: failed: RuntimeError: too bad" in text
+    assert Display("pretrain", 1).outer is None
+
+
+def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
+    with Screen(Console(file=io.StringIO())) as screen:
+        ablate(Plan(TABLE, data, tmp_path), screen)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 4 and said[0].startswith("run 1 of 2: base, seed 0, in ")
+    assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"
