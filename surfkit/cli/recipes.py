@@ -18,6 +18,7 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from surfkit.cli.parts import with_parts
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -28,7 +29,10 @@ ARGV: ContextVar[tuple[str, ...]] = ContextVar("argv", default=())
 
 
 def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
-    """Offered recipes by name, and every FILE.json that `argv` names as recipe:FILE.json."""
+    """Offered recipes by name, and every FILE.json that `argv` names as recipe:FILE.json.
+
+    The one that `argv` chooses has the parts that `argv` adds, and not those that it removes.
+    """
     found: dict[str, tuple[str, Any]] = {}
     for owner, name, recipe in offered("surfkit_recipes"):
         if name in found:
@@ -38,7 +42,15 @@ def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
             )
         found[name] = (owner, recipe)
     named = {name: recipe for name, (_, recipe) in found.items()}
-    return named | {file: _read(file) for file in _files(argv)}
+    named |= {file: _read(file) for file in _files(argv)}
+    if (name := chosen_name(argv)) in named:
+        named[name], _ = with_parts(named[name], argv)
+    return named
+
+
+def chosen_name(argv: Sequence[str]) -> str | None:
+    """The first recipe that the words choose."""
+    return next((word.removeprefix("recipe:") for word in argv if word.startswith("recipe:")), None)
 
 
 def recipe_choice(argv: Sequence[str] = ()) -> Any:

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from surfkit.cli.recipes import chosen_recipe, recipes
+from surfkit.cli.parts import open_places, with_parts
+from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
 from surfkit.core.registry import Component, components, kebab, unknown
 
@@ -24,9 +25,8 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
         if get_origin(hint) is Annotated and chosen_recipe in get_args(hint):
             known = recipes(argv)
             found["recipe"] = tuple(known)
-            chosen = next((known[word[7:]] for word in argv if word.startswith("recipe:") and word[7:] in known), None)
-            if chosen is not None:
-                found |= _below(type(chosen), chosen, "")
+            if (chosen := known.get(chosen_name(argv))) is not None:
+                found |= open_places(chosen, argv) | _below(type(chosen), chosen, "")
         elif get_origin(hint) is Annotated and chosen_table in get_args(hint):
             found["table"] = tuple(tables())
         else:
@@ -40,12 +40,22 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
     A setting before the choice it belongs to would choose the default part. A choice without alternatives is left out:
     tyro sees no choice there.
     """
-    known = slots(command, argv)
+    known, done = slots(command, argv), handled(argv)
+    argv = [word for word in argv if word not in done]
     names = {word: known.get(word.partition(":")[0], ()) for word in argv}
     choices = [word for word in argv if word.partition(":")[2] in names[word]]
     others = [word for word in argv if word.partition(":")[2] not in names[word]]
     choices.sort(key=lambda word: (not word.startswith(WHOLE), word.partition(":")[0].count(".")))
-    return [word for word in choices if len(names[word]) > 1] + others
+    done = handled(argv)
+    return [word for word in choices if len(names[word]) > 1 and word not in done] + [
+        w for w in others if w not in done
+    ]
+
+
+def handled(argv: Sequence[str]) -> set[str]:
+    """The words that have changed the chosen recipe already."""
+    recipe = recipes([word for word in argv if word.startswith("recipe:")]).get(chosen_name(argv))
+    return set() if recipe is None else with_parts(recipe, argv)[1]
 
 
 def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
@@ -82,6 +92,8 @@ def _below(hint: Any, value: Any, path: str) -> Slots:
     elif isinstance(value, tuple) and (inner := [get_args(m)[0] for m in members if get_origin(m) is tuple]):
         for at, item in enumerate(value):
             found |= _below(inner[0], item, _join(path, str(at)))
+        if bases := [m for m in _members(inner[0]) if isinstance(m, type) and issubclass(m, Component)]:
+            found[_join(path, str(len(value)))] = tuple(components(bases[0]))  # one more
     elif isinstance(value, dict):  # an entry keeps its class, but there may be slots inside
         for key, item in value.items():
             found |= _below(Any, item, _join(path, _flag(key)))

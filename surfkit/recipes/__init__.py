@@ -4,8 +4,12 @@ from collections.abc import Mapping
 
 from surfkit.core.registry import hookimpl
 from surfkit.densify.adc import ADC
+from surfkit.densify.prune import Importance
+from surfkit.densify.signal import AbsGradient
+from surfkit.densify.trim import Trim
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
@@ -31,7 +35,49 @@ SURFELS = Recipe(
 )
 
 
+FLAT = Recipe(
+    about="3D Gaussians with one axis pinned to almost nothing: between 3dgs and 2dgs",
+    primitive=Flat3D(),
+    pretrain=Stage(losses={"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency()}),
+)
+
+ABSOLUTE = Recipe(
+    about="3DGS that splits by the sizes of the pixels' gradients, which signs do not cancel (AbsGS, Ye et al. 2024)",
+    primitive=Gaussian3D(),
+    pretrain=Stage(signal=AbsGradient(), densify=ADC(threshold=4e-4, small=0.001)),
+)
+
+TRIMMED = Recipe(
+    about="2DGS, then 7,000 steps that trim a tenth of the points every 500 (Trim2DGS, Fan et al. 2024)",
+    primitive=Surfel2D(),
+    pretrain=Stage(
+        steps=37_000,
+        losses={
+            "l1": L1(),
+            "ssim": SSIM(),
+            "normal": NormalConsistency(weight=0.05, start=7_000, depth="expected"),
+            "distortion": Distortion(weight=100.0, start=30_000),
+        },
+        densify=ADC(cull_opacity=0.05),
+        prune=(Trim(ratio=0.1, start=31_000, until=37_000),),
+    ),
+)
+
+LIGHT = Recipe(
+    about="3DGS, then two thirds of the points dropped by importance and 5,000 steps to recover (LightGaussian, 2023)",
+    primitive=Gaussian3D(),
+    pretrain=Stage(steps=35_000, prune=(Importance(at=(30_000,), ratio=0.66),)),
+)
+
+
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
     """The recipes of surfkit."""
-    return {"2dgs": SURFELS, "3dgs": GAUSSIANS}
+    return {
+        "2dgs": SURFELS,
+        "3dgs": GAUSSIANS,
+        "flat3dgs": FLAT,
+        "absgs": ABSOLUTE,
+        "trim2dgs": TRIMMED,
+        "lightgaussian": LIGHT,
+    }

@@ -49,10 +49,10 @@ class Stage:
     """Photographs shown, one a step."""
 
     losses: dict[str, Annotated[Loss, choice(Loss)]] = field(default_factory=lambda: {"l1": L1(), "ssim": SSIM()})
-    """What is minimised: the weighted sum of these."""
+    """What is minimised: the weighted sum of these. losses.KEY:NAME adds or changes one, losses.KEY:none drops it."""
 
     regularizers: dict[str, Annotated[Regularizer, choice(Regularizer)]] = field(default_factory=dict)
-    """Terms on the points themselves, added to the losses."""
+    """Terms on the points themselves, added to the losses; regularizers.KEY:NAME adds one."""
 
     appearance: Annotated[Appearance | None, choice(Appearance, optional=True)] = None
     """What may differ from photograph to photograph; none takes all colours as they are."""
@@ -64,7 +64,7 @@ class Stage:
     """How points multiply; none keeps their number."""
 
     prune: tuple[Annotated[Prune, choice(Prune)], ...] = ()
-    """Further ways to remove points."""
+    """Further ways to remove points; prune.0:NAME adds the first, prune.1:NAME the next, prune.0:none drops one."""
 
     rates: dict[str, Rate] = field(default_factory=lambda: dict(RATES))
     """Learning rates of the parameters; of positions as a share of the scene extent."""

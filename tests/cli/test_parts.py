@@ -1,0 +1,69 @@
+"""Parts that come, change or go by a word, on the real recipes."""
+
+import pytest
+
+from surfkit.cli.parse import parse
+from surfkit.cli.train import Train
+from surfkit.core.check import BadInput
+from surfkit.densify import CountCap, Elongation, Faint, Trim
+from surfkit.losses.photometric import L1
+from surfkit.losses.regularizers import MeanOpacity
+from surfkit.losses.surface import Distortion
+
+
+def stage(*words: str):
+    return parse(Train, ["recipe:2dgs", *words], "surfkit train").recipe.pretrain
+
+
+def test_parts_are_added_to_a_tuple_one_after_the_other():
+    made = stage("pretrain.prune.0:trim", "pretrain.prune.1:opacity", "--pretrain.prune.0.ratio", "0.1")
+    assert made.prune == (Trim(ratio=0.1), Faint())
+    filters = ("pretrain.densify.filters.0:elongation", "pretrain.densify.filters.1:count-cap")
+    made = stage("--pretrain.densify.filters.1.points", "5000", *filters)
+    assert made.densify.filters == (Elongation(), CountCap(5000))
+
+
+def test_a_part_of_the_recipe_is_swapped_or_taken_away(tmp_path):
+    from surfkit.core.codec import write_json
+    from surfkit.core.tree import evolve
+    from surfkit.recipes import SURFELS
+
+    file = tmp_path / "r.json"
+    write_json(file, evolve(SURFELS, "pretrain.prune", (Trim(), Faint())))
+    for words, left in {
+        ("pretrain.prune.0:none",): (Faint(),),
+        ("pretrain.prune.0:opacity",): (Faint(), Faint()),
+        ("pretrain.prune.2:trim", "--pretrain.prune.2.gamma", "1"): (Trim(), Faint(), Trim(gamma=1.0)),
+        ("pretrain.prune.1:none", "pretrain.prune.0:none"): (),
+    }.items():
+        assert parse(Train, [f"recipe:{file}", *words], "surfkit train").recipe.pretrain.prune == left
+
+
+def test_entries_of_a_dict_come_change_and_go():
+    made = stage("pretrain.losses.normal:none", "pretrain.losses.more:l1", "--pretrain.losses.more.weight", "0.3")
+    assert list(made.losses) == ["l1", "ssim", "distortion", "more"] and made.losses["more"] == L1(0.3)
+    assert stage("pretrain.losses.normal:distortion").losses["normal"] == Distortion()
+    assert stage("pretrain.regularizers.o:mean-opacity").regularizers == {"o": MeanOpacity()}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["pretrain.prune.0:trimm"], "no pretrain.prune.0 named 'trimm'; did you mean 'trim'"),
+        (["pretrain.prune.1:trim"], "nothing to choose at 'pretrain.prune.1'; did you mean 'pretrain.prune.0'"),
+        (["pretrain.prune.0:none"], "no pretrain.prune.0 named 'none'"),
+        (["pretrain.losses.normal:nrmal"], "no pretrain.losses.normal named 'nrmal'; did you mean 'normal'"),
+        (["pretrain.losses.foo:none"], "no pretrain.losses.foo named 'none'"),
+        (["pretrain.prune.0:trim", "pretrain.prune.0:opacity"], "pretrain.prune.0 is chosen twice"),
+        (["pretrain.prune.0:trim", "--pretrain.prune.0.rat", "1"], "--pretrain.prune.0.ratio"),
+    ],
+)
+def test_words_that_do_not_fit_are_explained_in_a_line(words, said):
+    with pytest.raises(BadInput) as caught:
+        stage(*words)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_taking_away_a_loss_that_drives_densification_is_refused(tmp_path):
+    with pytest.raises(BadInput, match="signal.terms names ssim"):
+        stage("--pretrain.signal.terms", "ssim", "pretrain.losses.ssim:none")
