@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import cache
 from types import ModuleType
 
@@ -46,7 +47,8 @@ class NativeRasterizer(Rasterizer):
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
-        drawn = _Pass(splats, camera, near)
+        grey = replace(splats, sh=torch.zeros(len(splats), 1, 3))  # colours cost a third of the projection
+        drawn = _Pass(grey, camera, near)
         total = torch.zeros(len(splats), dtype=torch.float32)
         count = torch.zeros(len(splats), dtype=torch.int64)
         drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())

@@ -20,6 +20,7 @@ class Tiny:
     photos: list[torch.Tensor]
     cloud: Cloud
     rasterizer: Rasterizer
+    truth: Splats
 
 
 def looking_down(x: float, y: float) -> Camera:
@@ -51,7 +52,7 @@ def tiny() -> Tiny:
     images = [rasterizer.render(truth, camera, 0.005, geometry=False).maps.color for camera in cameras]
     photos = [(image.clamp(0, 1) * 255).round().to(torch.uint8) for image in images]
     cloud = Cloud(means + 0.01 * torch.randn(count, 3, generator=draw), (colors * 255).to(torch.uint8))
-    return Tiny(views, photos, cloud, rasterizer)
+    return Tiny(views, photos, cloud, rasterizer, truth)
 
 
 @pytest.fixture

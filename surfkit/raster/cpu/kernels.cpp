@@ -585,7 +585,8 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
         const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
-        Floats sum[4] = {Floats{}, Floats{}, Floats{}, Floats{}};
+        Floats sum{};
+        int count = 0;
         for (uint64_t todo = touched_blocks(s, sx, sy) & rays; todo; todo &= todo - 1) {
             const int bit = __builtin_ctzll(todo), b = block_at(bit);
             typename K::Pixel at;
@@ -601,16 +602,16 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
             const Floats term =
                 root_mean ? root(alpha * before)
                           : exp_negative(madd(log_positive(alpha), alpha_power, log_positive(before) * open_power));
-            sum[0] += keep(m, term);
-            sum[1] += keep(m, broadcast(1.0f));
+            sum += keep(m, term);
+            count += __builtin_popcount(bits(m));
             open[b] = select(m, after, before);
         }
-        float total[4];
-        sum_lanes(sum, 4, total);
-        if (total[1] > 0) {
+        if (count) {
             const uint32_t slot = tile.job.entries[k].slot;
-            sums[2 * (size_t)slot] = total[0];
-            sums[2 * (size_t)slot + 1] = total[1];
+            float total = 0;
+            for (int l = 0; l < kLanes; l++) total += sum[l];
+            sums[2 * (size_t)slot] = total;
+            sums[2 * (size_t)slot + 1] = (float)count;
             touched_slots[slot] = 1;
         }
         if (!rays) break;

@@ -1,0 +1,38 @@
+"""A half-trained scene to measure on: the bundled example at half size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from surfkit.pipeline import with_steps
+from surfkit.primitives.points import Points
+from surfkit.raster.select import select
+from surfkit.recipe import Recipe
+from surfkit.scene import colmap
+from surfkit.scene.data import Data
+from surfkit.scene.photos import Photos
+from surfkit.train.stage import StageState, Trainer
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"
+
+
+def halfway(recipe: Recipe, steps: int, scale: float = 2.0) -> tuple[Trainer, StageState]:
+    """A trainer of `recipe` in a run of `steps` steps, and its state after half of them."""
+    scene = colmap.read(Data(EXAMPLE, scale=scale))
+    recipe = with_steps(recipe, steps)
+    rasterizer, _ = select("cpu")
+    trainer = Trainer(recipe.pretrain, recipe.primitive, scene.train, Photos(scene.train), rasterizer)
+    generator = torch.Generator().manual_seed(0)
+    state = trainer.begin(Points.fresh(recipe.primitive.init(scene.cloud, generator)), generator)
+    for done in trainer.run(state):
+        if done.index == steps // 2:
+            return trainer, state
+    raise AssertionError("a run has a middle")
+
+
+def copied(state: StageState) -> StageState:
+    """The state with points of its own."""
+    return replace(state, points=state.points.take(torch.arange(len(state.points))))
