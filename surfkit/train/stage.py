@@ -25,7 +25,8 @@ from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.scene.scene import View
-from surfkit.train.adam import Rate, adam_step, update
+from surfkit.train.adam import Rate, adam_step
+from surfkit.train.look import Look, fresh_looks
 from surfkit.train.views import Order, Survey
 
 RATES = {
@@ -111,7 +112,7 @@ class StageState:
     peak_memory_bytes: int = 0
     """Most memory held so far; 0 where the system does not tell."""
     looks: Columns = field(default_factory=dict)
-    """Numbers of the appearance model, a row per view: "value", Adam's "first" and "second", "shown" so often."""
+    """What is known of the look of each photograph (`train.look`)."""
     reset_at: int = 0
     """Step that last lowered the opacities; 0 if none has."""
 
@@ -159,9 +160,7 @@ class Trainer:
             raise BadInput(f"rates has {', '.join(self.stage.rates)}; the points have {', '.join(points.params)}")
         state = StageState(points, Order(len(self.views)), generator)
         if self.stage.appearance is not None:
-            value = self.stage.appearance.begin(len(self.views))
-            state.looks = {"value": value, "first": torch.zeros_like(value), "second": torch.zeros_like(value)}
-            state.looks["shown"] = torch.zeros(len(self.views), dtype=torch.int64)
+            state.looks = fresh_looks(self.stage.appearance, len(self.views))
         return state
 
     def run(self, state: StageState) -> Iterator[Done]:
@@ -217,7 +216,7 @@ class Trainer:
         if terms is None:
             total = gradient(list(values.values()), leaves)
             return numbers, total, total if self.stage.signal.absolute else None
-        chosen = gradient([value for name, value in values.items() if name in terms], leaves)
+        chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared=look is not None)
         others = gradient([value for name, value in values.items() if name not in terms], leaves)
         return numbers, added(chosen, others), chosen
 
@@ -265,11 +264,14 @@ class Trainer:
         return points
 
 
-def gradient(losses: list[Tensor], leaves: Columns) -> Maps:
-    """d(sum of losses)/d(maps); None for a map without influence, but colour is always there."""
+def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
+    """d(sum of losses)/d(maps); None for a map without influence, but colour is always there.
+
+    `shared`: other losses have part of their graph in common with these, and come later.
+    """
     grads = [None] * len(leaves)
     if losses:
-        grads = torch.autograd.grad(sum(losses), list(leaves.values()), allow_unused=True)
+        grads = torch.autograd.grad(sum(losses), list(leaves.values()), allow_unused=True, retain_graph=shared)
     found = Maps(**dict(zip(leaves, grads, strict=True)))
     return found if found.color is not None else replace(found, color=torch.zeros_like(leaves["color"]))
 
@@ -280,30 +282,6 @@ def added(a: Maps, b: Maps) -> Maps:
     for name, value in b.present().items():
         sums[name] = sums[name] + value if name in sums else value
     return Maps(**sums)
-
-
-@dataclass
-class Look:
-    """One photograph's own numbers in one step."""
-
-    model: Appearance
-    looks: Columns
-    row: int
-    rate: float
-
-    def __post_init__(self) -> None:
-        self.numbers = self.looks["value"][self.row].clone().requires_grad_()
-
-    def shown(self, color: Tensor) -> Tensor:
-        """(3, H, W) the render as the photograph would show it."""
-        return self.model(self.numbers.to(color), color)
-
-    def learn(self, losses: list[Tensor]) -> None:
-        """Take a step of Adam, as many as the photograph was shown."""
-        (grad,) = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True)
-        self.looks["shown"][self.row] += 1
-        value, first, second = (self.looks[name][self.row] for name in ("value", "first", "second"))
-        update(value, grad, first, second, self.rate, int(self.looks["shown"][self.row]))
 
 
 def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:

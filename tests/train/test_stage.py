@@ -3,8 +3,9 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
+from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
-from surfkit.densify import ADC, AbsGradient, LossGradient
+from surfkit.densify import ADC, AbsGradient, LossGradient, Trim
 from surfkit.densify.base import Prune
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
@@ -207,3 +208,18 @@ def test_stages_that_make_no_sense_are_refused(begin):
         Stage(sh_every=0)
     with pytest.raises(BadInput, match="the points have means"):
         begin(Stage(rates={"means": Rate(1.0)}))
+
+
+def test_a_view_that_sees_nothing_changes_no_colour_and_gives_no_signal(begin):
+    away = torch.eye(4, dtype=torch.float64)
+    away[2, 3] = -50.0  # everything lies behind
+    stage = replace(QUIET, steps=4, signal=LossGradient(terms=("ssim",), boost=0.9), densify=ADC(start=0, every=2))
+    trainer, state = begin(replace(stage, appearance=Exposure()))
+    views = tuple(replace(view, camera=replace(view.camera, world_to_camera=away)) for view in trainer.views)
+    trainer, before = replace(trainer, views=views), state.points.params["sh0"].clone()
+    done = trainer.step(state)
+    assert not state.points.stat("adc/seen").any() and not done.maps.alpha.any()
+    assert len(state.points) == 40 and torch.equal(state.points.params["sh0"], before)
+    trimmed = replace(trainer, stage=replace(stage, prune=(Trim(),)))
+    with pytest.raises(BadInput, match="step 1 would drop every point"):  # unseen by all views, all of them
+        trimmed.step(trimmed.begin(state.points, torch.Generator()))

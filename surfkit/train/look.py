@@ -1,0 +1,56 @@
+"""What a stage learns of the look of each photograph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from surfkit.appearance.base import Appearance
+from surfkit.primitives.points import Columns
+from surfkit.train.adam import update
+
+
+def fresh_looks(model: Appearance, count: int) -> Columns:
+    """The numbers of `count` photographs, a row each: "value", Adam's "first" and "second", "shown" so often."""
+    value = model.begin(count)
+    moments = {name: torch.zeros_like(value) for name in ("first", "second")}
+    return {"value": value, **moments, "shown": torch.zeros(count, dtype=torch.int64)}
+
+
+@dataclass
+class Look:
+    """One photograph's own numbers in one step.
+
+    Attributes:
+        model: What they mean.
+        looks: Of all photographs.
+        row: The photograph's.
+        rate: The learning rate now.
+        numbers: The photograph's, with which gradients can be taken.
+    """
+
+    model: Appearance
+    looks: Columns
+    row: int
+    rate: float
+    numbers: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.numbers = self.looks["value"][self.row].clone().requires_grad_()
+
+    def shown(self, color: Tensor) -> Tensor:
+        """(3, H, W) the render as the photograph would show it."""
+        return self.model(self.numbers.to(color), color)
+
+    def learn(self, losses: list[Tensor]) -> None:
+        """Take this photograph's next step of Adam, if any loss looks at colours."""
+        grad = None
+        if losses:
+            (grad,) = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)
+        if grad is None:
+            return
+        self.looks["shown"][self.row] += 1
+        value, first, second = (self.looks[name][self.row] for name in ("value", "first", "second"))
+        update(value, grad, first, second, self.rate, int(self.looks["shown"][self.row]))
