@@ -24,7 +24,7 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
-BUILTIN = ("surfkit.primitives", "surfkit.losses", "surfkit.densify", "surfkit.recipes")
+BUILTIN = ("surfkit.primitives", "surfkit.losses", "surfkit.depth", "surfkit.densify", "surfkit.recipes")
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
 
 

@@ -1,0 +1,97 @@
+"""How well photographs agree on each of many depths: the cost volume of a plane sweep (Collins 1996)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from surfkit.scene.camera import Camera
+
+NOISE = 0.006
+"""Standard deviation of luminance, of 1, below which a window shows nothing to compare."""
+PIECE = 1 << 20
+"""Pixels, over all planes, that are compared at a time."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A camera and the luminance that it saw.
+
+    Attributes:
+        camera: At the size of the picture.
+        light: (H, W) float32 in [0, 1].
+    """
+
+    camera: Camera
+    light: Tensor
+
+
+def cost_volume(here: Picture, others: Sequence[Picture], planes: Tensor, window: int, visible: float) -> Tensor:
+    """1 - correlation of windows between a picture and others warped into it through planes of one depth each.
+
+    Windows are compared by zero-mean normalised cross-correlation, so exposure does not matter; of the others, only the
+    part that agrees best counts, so the rest may be occluded.
+
+    Args:
+        here: The picture whose depth is sought.
+        others: To compare it with.
+        planes: (D,) inverse depths.
+        window: Pixels on a side, odd.
+        visible: Share of the others that counts.
+
+    Returns:
+        (D, H, W) in [0, 1].
+    """
+    mean = _box(here.light[None], window)[0]
+    contrast = (_box(here.light[None] ** 2, window)[0] - mean**2).clamp_min(0) + NOISE**2
+    best = max(1, round(visible * len(others)))
+    volume = torch.empty(len(planes), *here.light.shape, device=planes.device)
+    for part in torch.arange(len(planes), device=planes.device).split(max(1, PIECE // here.light.numel())):
+        least = [torch.ones(len(part), *here.light.shape, device=planes.device) for _ in range(best)]
+        for other in others:
+            warped, inside = _warp(here.camera, other, planes[part])
+            moved = _box(warped, window)
+            variance = (_box(warped**2, window) - moved**2).clamp_min_(0).add_(NOISE**2)
+            together = _box(warped * here.light, window) - moved * mean
+            cost = 1 - together.mul_((variance.mul_(contrast)).rsqrt_())
+            cost = torch.where(inside, cost.clamp_(0, 1), 1)
+            for i in range(best):  # insert into the sorted least costs
+                least[i], cost = torch.minimum(least[i], cost), torch.maximum(least[i], cost)
+        volume[part] = sum(least) / best
+    return volume
+
+
+def ray_map(here: Camera, there: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(3, H, W) a and (3,) b, so that a + c b is where a pixel of `here` at inverse depth c lies in `there`.
+
+    The first two components over the third are pixels there, and the third over c is the depth there.
+    """
+    turn = there.world_to_camera @ torch.linalg.inv(here.world_to_camera)
+    lens = torch.tensor([[there.fx, 0, there.cx], [0, there.fy, there.cy], [0, 0, 1]], dtype=torch.float64)
+    rays = here.rays(torch.float64)
+    a = torch.einsum("ij,jhw->ihw", lens @ turn[:3, :3], rays)
+    return a.to(device, torch.float32), (lens @ turn[:3, 3]).to(device, torch.float32)
+
+
+def _warp(here: Camera, other: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:
+    """(D, H, W) of `other` as seen from here if everything had one inverse depth, and where that is inside of it."""
+    a, b = ray_map(here, other.camera, planes.device)
+    c = planes[:, None, None]
+    depth = a[2] + c * b[2]
+    x = (a[0] + c * b[0]) / depth * (2 / other.camera.width) - 1
+    y = (a[1] + c * b[1]) / depth * (2 / other.camera.height) - 1
+    inside = (x.abs() < 1) & (y.abs() < 1) & (depth > 0)
+    grid = torch.stack([x, y], -1).view(1, -1, here.width, 2)
+    warped = grid_sample(other.light[None, None], grid, padding_mode="border", align_corners=False)
+    return warped.view(len(planes), here.height, here.width), inside
+
+
+def _box(maps: Tensor, size: int) -> Tensor:
+    """Means over square windows of maps (D, H, W)."""
+    half = size // 2
+    rows = avg_pool2d(maps[:, None], (1, size), 1, (0, half), count_include_pad=False)
+    return avg_pool2d(rows, (size, 1), 1, (half, 0), count_include_pad=False)[:, 0]
