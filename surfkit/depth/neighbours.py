@@ -13,6 +13,10 @@ from surfkit.scene.scene import View
 
 NARROW, WIDE = 1 / 3, 1.5
 """How fast a pair loses worth below and above the best angle, as shares of it."""
+SAME_SIDE = 0.8
+"""Share of its worth that a view loses when another stands in the same direction: both see the same occlusions."""
+LEAST = 0.1
+"""A pair that is worth less than this many well placed points cannot be compared."""
 CANDIDATES = 40
 """Of how many views with most shared points the angles are looked at."""
 OUTLIERS = 0.01
@@ -48,8 +52,7 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
             other: _worth(observations.xyz[np.intersect1d(own, sees[other].indices)], centres[[at, other]], angle)
             for other in candidates
         }
-        best = sorted((other for other in worth if worth[other] > 0.1), key=lambda other: (-worth[other], other))
-        chosen.append(best[:count])
+        chosen.append(_spread(worth, {other: centres[other] - centres[at] for other in worth}, count))
     return chosen
 
 
@@ -67,6 +70,21 @@ def depth_range(view: View, observations: Observations, margin: float) -> tuple[
     low, high = np.quantile(inverse, [OUTLIERS, 1 - OUTLIERS])
     more = margin * max(high - low, 0.1 * high)
     return float(max(low - more, low / 3)), float(high + more)
+
+
+def _spread(worth: dict[int, float], baselines: dict[int, np.ndarray], count: int) -> list[int]:
+    """Up to `count` of the views, the best first, where one that stands in the direction of another is worth less."""
+    left = {other: value for other, value in worth.items() if value > LEAST}
+    chosen: list[int] = []
+    while left and len(chosen) < count:
+        best = max(left, key=lambda other: (left[other], -other))
+        chosen.append(best)
+        del left[best]
+        for other in left:
+            a, b = baselines[best], baselines[other]
+            cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
+            left[other] *= 1 - SAME_SIDE * max(cosine, 0)
+    return chosen
 
 
 def _worth(xyz: np.ndarray, centres: np.ndarray, angle: float) -> float:
