@@ -6,10 +6,19 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, max_pool2d
 
 from surfkit.depth.matching import ray_map
 from surfkit.scene.camera import Camera
+
+
+def at_edge(inverse: Tensor, radius: int, share: float) -> Tensor:
+    """(H, W) whether something further away, by `share` of the depth, lies within `radius` pixels.
+
+    There, windows that are compared also show what is behind, and the nearer surface comes out too large.
+    """
+    least = -max_pool2d(-inverse[None], 2 * radius + 1, 1, radius)[0]
+    return least < inverse * (1 - share)
 
 
 def agreement(

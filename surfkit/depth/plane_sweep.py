@@ -7,16 +7,17 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthEstimator, Estimate, Material
-from surfkit.depth.consistency import agreement
+from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.scanlines import best_planes, smoothed
-from surfkit.scene.camera import Camera
+from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
 
 LUMINANCE = (0.299, 0.587, 0.114)
@@ -55,14 +56,17 @@ class PlaneSweep(DepthEstimator):
     window: int = 5
     """Side of the windows compared, pixels; odd."""
 
-    step_cost: float = 0.05
+    step_cost: float = 0.1
     """Cost of a change of depth by one plane from a pixel to the next; 1 is that of a wrong match."""
 
-    jump_cost: float = 0.5
+    jump_cost: float = 1.0
     """Cost of a jump in depth from a pixel to the next."""
 
     tolerance: float = 0.01
     """Share by which depths may differ for the maps of two photographs to agree."""
+
+    edge: float = 0.03
+    """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
 
     agree: int = 2
     """Neighbours whose maps must agree with a depth to trust it fully."""
@@ -74,6 +78,8 @@ class PlaneSweep(DepthEstimator):
             raise BadInput("longest, neighbours and agree must be 1 or more, and max_planes 3 or more")
         if not (min(self.angle, self.step_px, self.tolerance) > 0 and 0 < self.visible <= 1 and self.margin >= 0):
             raise BadInput("angle, step_px and tolerance must be above 0, visible in (0, 1] and margin 0 or more")
+        if not (0 < self.edge < 1 and 0 < self.step_cost <= self.jump_cost):
+            raise BadInput("edge must be in (0, 1), and step_cost above 0 and no more than jump_cost")
 
     def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
@@ -84,11 +90,12 @@ class PlaneSweep(DepthEstimator):
 
         @lru_cache(KEPT)
         def sweep(at: int) -> tuple[Tensor, Tensor] | None:
-            path = given.work / f"{at:06d}.pt"
+            path = given.work / f"{at:06d}.npy"
             if not path.exists():
                 found = self.sweep(given, at, picture(at), [picture(other) for other in pairs[at]])
-                torch.save(found, path)
-            return torch.load(path, map_location=given.device)
+                save_array(path, np.zeros(0) if found is None else torch.stack(found).cpu().numpy())
+            both = torch.from_numpy(np.load(path)).to(given.device)
+            return (both[0], both[1]) if len(both) else None
 
         for at in wanted:
             maps = {near: found for near in [at, *pairs[at]] if (found := sweep(near)) is not None}
@@ -99,12 +106,13 @@ class PlaneSweep(DepthEstimator):
             others = [(picture(near).camera, found) for near, (found, _) in maps.items()]
             count, fused = agreement(picture(at).camera, inverse, others, self.tolerance)
             trusted = (count / min(self.agree, max(1, len(others)))).clamp_max(1)
+            trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
             yield Estimate(at, fused.cpu(), (trusted * matched).cpu())
 
     def picture(self, given: Material, at: int) -> Picture:
         """A photograph at the working size."""
         view = given.views[at]
-        camera = fitted(view.camera, self.longest)
+        camera = view.camera.fitted(self.longest)
         rgb = read_photo(view.path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
         return Picture(camera, torch.einsum("chw,c->hw", rgb, rgb.new_tensor(LUMINANCE)))
 
@@ -131,9 +139,3 @@ class PlaneSweep(DepthEstimator):
             x, y = (ends[1][i] / ends[1][2] - ends[0][i] / ends[0][2] for i in range(2))
             moves.append(float(torch.hypot(x, y).median()))
         return min(max(3, round(max(moves) / self.step_px) + 1), self.max_planes)
-
-
-def fitted(camera: Camera, longest: int) -> Camera:
-    """The camera at a size with a longest side of at most `longest` pixels."""
-    by = max(1.0, max(camera.width, camera.height) / longest)
-    return camera.resized(max(1, round(camera.width / by)), max(1, round(camera.height / by)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -12,6 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
+from surfkit.scene.ply import replacing
 
 FOLDER = "estimated_depths"
 RECORD = "depth.json"
@@ -107,8 +107,8 @@ def write_map(root: Path, name: str, inverse: np.ndarray, confidence: np.ndarray
         confidence: (h, w) in [0, 1].
     """
     path = map_path(root, name)
-    _save(confidence_path(path), (confidence.clip(0, 1) * 255).round().astype(np.uint8))
-    _save(path, inverse.astype(np.float32))
+    save_array(confidence_path(path), (confidence.clip(0, 1) * 255).round().astype(np.uint8))
+    save_array(path, inverse.astype(np.float32))
 
 
 def read_record(root: Path) -> Mapping[str, Any]:
@@ -127,15 +127,10 @@ def write_record(root: Path, record: Mapping[str, Any]) -> None:
     write_json(root / FOLDER / RECORD, record)
 
 
-def _save(path: Path, values: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with unfinished.open("wb") as file:
-            np.save(file, values)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+def save_array(path: Path, values: np.ndarray) -> None:
+    """Save numbers as .npy; the file is whole or not there."""
+    with replacing(path) as file:
+        np.save(file, values)
 
 
 def _stored(path: Path) -> np.ndarray:
