@@ -18,10 +18,10 @@ from collections.abc import Sequence
 from surfkit.core.check import BadInput
 
 COMMANDS = {
-    "prepare": "Make what a data set may need before training: `prepare depth`.",
     "train": "Reconstruct a surface from photographs with known cameras.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
     "export": "Write the result of a run for other programs.",
+    "prepare": "Make what a data set may need before training: `prepare depth`.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
     "components": "List the parts that recipes are made of, by kind.",
     "plugins": "List the plugins: where each comes from, what it offers, why it failed.",

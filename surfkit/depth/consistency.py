@@ -6,19 +6,27 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d
+from torch.nn.functional import grid_sample, pad
 
 from surfkit.depth.matching import ray_map
 from surfkit.scene.camera import Camera
 
 
 def at_edge(inverse: Tensor, radius: int, share: float) -> Tensor:
-    """(H, W) whether something further away, by `share` of the depth, lies within `radius` pixels.
+    """(H, W) whether the surface ends within `radius` pixels, and what is behind lies further by `share` of the depth.
 
-    There, windows that are compared also show what is behind, and the nearer surface comes out too large.
+    There, windows that are compared also show what is behind, and the nearer surface comes out too large. Inverse depth
+    is linear in the image on a plane, however steep, so the mean of two opposite neighbours tells slopes from edges.
     """
-    least = -max_pool2d(-inverse[None], 2 * radius + 1, 1, radius)[0]
-    return least < inverse * (1 - share)
+    height, width = inverse.shape
+    around = pad(inverse[None], (radius, radius, radius, radius), mode="replicate")[0]
+
+    def moved(y: int, x: int) -> Tensor:
+        return around[radius + y : radius + y + height, radius + x : radius + x + width]
+
+    steps = [(k * y, k * x) for y, x in ((0, 1), (1, 0), (1, 1), (1, -1)) for k in range(1, radius + 1)]
+    bend = torch.stack([inverse - (moved(y, x) + moved(-y, -x)) / 2 for y, x in steps]).amax(0)
+    return bend > inverse * share / 2
 
 
 def agreement(

@@ -35,7 +35,7 @@ class PlaneSweep(DepthEstimator):
     longest: int = 480
     """Longest side of a depth map in pixels; the time grows with its third power."""
 
-    neighbours: int = 4
+    neighbours: int = 5
     """Photographs that each one is compared with."""
 
     angle: float = 8.0
@@ -44,7 +44,7 @@ class PlaneSweep(DepthEstimator):
     visible: float = 0.5
     """Share of the neighbours that must see a point: the others may be occluded."""
 
-    step_px: float = 0.75
+    step_px: float = 1.0
     """How far a picture moves from one depth to the next, pixels."""
 
     max_planes: int = 192
@@ -62,7 +62,7 @@ class PlaneSweep(DepthEstimator):
     jump_cost: float = 1.0
     """Cost of a jump in depth from a pixel to the next."""
 
-    tolerance: float = 0.01
+    tolerance: float = 0.015
     """Share by which depths may differ for the maps of two photographs to agree."""
 
     edge: float = 0.03
