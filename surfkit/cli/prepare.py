@@ -73,11 +73,11 @@ class Depth:
         scene = colmap.read(data)
         if notice := self.estimator.notice():
             print(f"note: {notice}", file=sys.stderr)
-        wanted = preparation.begin(scene, self.again)
-        views = preparation.views(scene)
+        given = preparation.material(scene)
+        wanted, views = preparation.begin(scene, self.again), given.views
         if there := len(views) - len(wanted):
             print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
-        done = watched(preparation.run(scene, wanted), len(wanted))
+        done = watched(preparation.run(scene, given, wanted), len(wanted))
         path = self.data / FOLDER / "overview.png"
         write_overview(path, self.data, views)
         show(done)

@@ -11,30 +11,36 @@ from torch.nn.functional import grid_sample, pad
 
 from surfkit.scene.camera import Camera
 
-NOISE = 0.006
-"""Standard deviation of luminance, of 1, below which a window shows nothing to compare."""
+NOISE = 0.004
+"""Standard deviation of a colour, of 1, below which a window shows nothing to compare."""
 PIECE = 1 << 19
 """Pixels, over all planes, that are compared at a time."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A camera and the luminance that it saw.
+    """A camera and what it saw.
 
     Attributes:
         camera: At the size of the picture.
-        light: (H, W) float32 in [0, 1].
+        color: (C, H, W) float32 in [0, 1].
     """
 
     camera: Camera
-    light: Tensor
+    color: Tensor
+
+    @property
+    def light(self) -> Tensor:
+        """(H, W) mean of the colours."""
+        return self.color.mean(0)
 
 
 def cost_volume(here: Picture, others: Sequence[Picture], planes: Tensor, window: int, visible: float) -> Tensor:
     """1 - correlation of windows between a picture and others warped into it through planes of one depth each.
 
-    Windows are compared by zero-mean normalised cross-correlation, so exposure does not matter; of the others, only the
-    part that agrees best counts, so the rest may be occluded.
+    Windows are compared by zero-mean normalised cross-correlation of all colours together, so exposure does not matter,
+    and a pattern that runs along the parallax in one colour may be told by another. Of the others, only the part that
+    agrees best counts, so the rest may be occluded.
 
     Args:
         here: The picture whose depth is sought.
@@ -46,18 +52,18 @@ def cost_volume(here: Picture, others: Sequence[Picture], planes: Tensor, window
     Returns:
         (D, H, W) in [0, 1].
     """
-    mean = _box(here.light[None], window)[0]
-    contrast = (_box(here.light[None] ** 2, window)[0] - mean**2).clamp_min(0) + NOISE**2
+    mean, floor = _box(here.color, window), len(here.color) * NOISE**2
+    contrast = _variance(here.color[None], mean[None], window) + floor
     best = max(1, round(visible * len(others)))
-    volume = torch.empty(len(planes), *here.light.shape, device=planes.device)
-    for part in torch.arange(len(planes), device=planes.device).split(max(1, PIECE // here.light.numel())):
-        least = [torch.ones(len(part), *here.light.shape, device=planes.device) for _ in range(best)]
+    volume = torch.empty(len(planes), *here.color.shape[1:], device=planes.device)
+    for part in torch.arange(len(planes), device=planes.device).split(max(1, PIECE // here.color.numel())):
+        least = [torch.ones(len(part), *here.color.shape[1:], device=planes.device) for _ in range(best)]
         for other in others:
             warped, inside = _warp(here.camera, other, planes[part])
-            moved = _box(warped, window)
-            variance = (_box(warped**2, window) - moved**2).clamp_min_(0).add_(NOISE**2)
-            together = _box(warped * here.light, window) - moved * mean
-            cost = 1 - together.mul_((variance.mul_(contrast)).rsqrt_())
+            moved = _box(warped.flatten(0, 1), window).view_as(warped)
+            variance = _variance(warped, moved, window).add_(floor)
+            together = _box((warped * here.color).sum(1), window) - (moved * mean).sum(1)
+            cost = 1 - together.mul_(variance.mul_(contrast).rsqrt_())
             cost = torch.where(inside, cost.clamp_(0, 1), 1)
             for i in range(best):  # insert into the sorted least costs
                 least[i], cost = torch.minimum(least[i], cost), torch.maximum(least[i], cost)
@@ -78,16 +84,21 @@ def ray_map(here: Camera, there: Camera, device: torch.device) -> tuple[Tensor, 
 
 
 def _warp(here: Camera, other: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:
-    """(D, H, W) of `other` as seen from here if everything had one inverse depth, and where that is inside of it."""
+    """(D, C, H, W) of `other` as seen from here if all had one inverse depth; (D, H, W) where that is inside of it."""
     a, b = ray_map(here, other.camera, planes.device)
     c = planes[:, None, None]
     depth = a[2] + c * b[2]
     x = (a[0] + c * b[0]) / depth * (2 / other.camera.width) - 1
     y = (a[1] + c * b[1]) / depth * (2 / other.camera.height) - 1
     inside = (x.abs() < 1) & (y.abs() < 1) & (depth > 0)
-    grid = torch.stack([x, y], -1).view(1, -1, here.width, 2)
-    warped = grid_sample(other.light[None, None], grid, padding_mode="border", align_corners=False)
-    return warped.view(len(planes), here.height, here.width), inside
+    color = other.color.expand(len(planes), -1, -1, -1)
+    warped = grid_sample(color, torch.stack([x, y], -1), padding_mode="border", align_corners=False)
+    return warped, inside
+
+
+def _variance(maps: Tensor, mean: Tensor, window: int) -> Tensor:
+    """(D, H, W) variance within windows, summed over the colours of (D, C, H, W) maps."""
+    return (_box(maps.square().sum(1), window) - mean.square().sum(1)).clamp_min_(0)
 
 
 def _box(maps: Tensor, size: int) -> Tensor:

@@ -20,7 +20,6 @@ from surfkit.depth.scanlines import best_planes, smoothed
 from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
 
-LUMINANCE = (0.299, 0.587, 0.114)
 KEPT = 64
 """Pictures kept in memory."""
 
@@ -65,7 +64,7 @@ class PlaneSweep(DepthEstimator):
     tolerance: float = 0.015
     """Share by which depths may differ for the maps of two photographs to agree."""
 
-    edge: float = 0.03
+    edge: float = 0.02
     """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
 
     agree: int = 2
@@ -114,7 +113,7 @@ class PlaneSweep(DepthEstimator):
         view = given.views[at]
         camera = view.camera.fitted(self.longest)
         rgb = read_photo(view.path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
-        return Picture(camera, torch.einsum("chw,c->hw", rgb, rgb.new_tensor(LUMINANCE)))
+        return Picture(camera, rgb)
 
     def sweep(self, given: Material, at: int, here: Picture, others: Sequence[Picture]) -> tuple[Tensor, Tensor] | None:
         """(H, W) inverse depth and how well it matches, in [0, 1]; None without neighbours or sparse points."""

@@ -63,6 +63,20 @@ class Preparation:
         """The photographs to estimate."""
         return scene.train if self.estimator.matched else (*scene.train, *scene.held_out)
 
+    def material(self, scene: Scene) -> Material:
+        """What the estimator works from.
+
+        Raises:
+            BadInput: The sparse model does not tell which photographs to compare.
+        """
+        observations = colmap.observations(self.data, scene.frame)
+        if self.estimator.matched and not any(len(seen.points) for seen in observations.seen.values()):
+            raise BadInput(
+                f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
+                "triangulate it in COLMAP"
+            )
+        return Material(self.views(scene), observations, self.device, self.work)
+
     def begin(self, scene: Scene, again: bool) -> list[int]:
         """Positions of the views that are still to be estimated.
 
@@ -99,19 +113,13 @@ class Preparation:
             "matched": [view.name for view in views] if self.estimator.matched else None,
         }
 
-    def run(self, scene: Scene, wanted: Sequence[int]) -> Iterator[Prepared]:
+    def run(self, scene: Scene, given: Material, wanted: Sequence[int]) -> Iterator[Prepared]:
         """Estimate and save the views at the positions `wanted`, one after the other."""
-        views = self.views(scene)
-        observations = colmap.observations(self.data, scene.frame)
-        if self.estimator.matched and not any(len(seen.points) for seen in observations.seen.values()):
-            raise BadInput(
-                f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
-                "triangulate it in COLMAP"
-            )
         begun = time.perf_counter()
-        for estimate in self.estimator.estimate(Material(views, observations, self.device, self.work), wanted):
-            coverage = self.save(views[estimate.at], estimate, scene)
-            yield Prepared(views[estimate.at], coverage, time.perf_counter() - begun)
+        for estimate in self.estimator.estimate(given, wanted):
+            view = given.views[estimate.at]
+            coverage = self.save(view, estimate, scene)
+            yield Prepared(view, coverage, time.perf_counter() - begun)
             begun = time.perf_counter()
         shutil.rmtree(self.work, ignore_errors=True)
 

