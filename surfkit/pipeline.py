@@ -30,6 +30,7 @@ from surfkit.raster.select import Device, select
 from surfkit.recipe import Recipe
 from surfkit.scene import colmap
 from surfkit.scene.data import Data
+from surfkit.scene.depth_prior import Priors, read_priors
 from surfkit.scene.photos import Photos
 from surfkit.scene.ply import write_splats
 from surfkit.scene.scene import Scene, View
@@ -99,10 +100,12 @@ def run(
         rasterizer, backend = drawer(device)
         state = saved(this, scene)
         warn_of_gaps(scene, state)
+        unfinished = state is None or state.index < recipe.pretrain.steps
+        priors = depth_priors(this, scene) if unfinished else None
         claim(this, backend, notes)
-        if state is None or state.index < recipe.pretrain.steps:
+        if unfinished:
             discard(this.metrics, this.cloud)
-            state = optimise(this, scene, rasterizer, state, checkpoint_every)
+            state = optimise(this, scene, rasterizer, state, checkpoint_every, priors)
         elif this.metrics.exists() and this.cloud.exists():
             say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
             return read_json(this.metrics, Any)
@@ -175,12 +178,23 @@ def saved(this: Run, scene: Scene) -> StageState | None:
     return state
 
 
+def depth_priors(this: Run, scene: Scene) -> Priors | None:
+    """Estimated depths of the training photographs, if a loss of the recipe needs them and the data set has any."""
+    needed = any(loss.needs_prior for loss in this.recipe.pretrain.losses.values())
+    return read_priors(this.data, scene) if needed else None
+
+
 def optimise(
-    this: Run, scene: Scene, rasterizer: Rasterizer, state: StageState | None, checkpoint_every: int
+    this: Run,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    state: StageState | None,
+    checkpoint_every: int,
+    priors: Priors | None = None,
 ) -> StageState:
     """Run the stage from its last state, or from the sparse points, to its end."""
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
-    trainer = Trainer(stage, primitive, scene.train, Photos(scene.train), rasterizer)
+    trainer = Trainer(stage, primitive, scene.train, Photos(scene.train), rasterizer, priors)
     if state is None:
         generator = torch.Generator().manual_seed(this.recipe.seed)
         state = trainer.begin(Points.fresh(primitive.init(scene.cloud, generator)), generator)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,8 +75,8 @@ def check_policy(policy: Policy, points: Points, step: Step) -> None:
 
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
-    """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered; it uses
-    no map but those it says it reads, and its weight is 0 or more at any step.
+    """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered and where
+    no depth is known beforehand; it uses no map but those it says it reads, and its weight is 0 or more at any step.
 
     Args:
         loss: To check.
@@ -89,7 +90,9 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
         assert math.isfinite(weight) and weight >= 0, f"{name}: the weight at step {index} of 1000 is {weight}"
     draw = torch.Generator().manual_seed(0)
     sample = _sample(size, draw)
-    for what, alpha in (("", torch.rand(size, generator=draw)), (" of an empty render", torch.zeros(size))):
+    cases = [("", torch.rand(size, generator=draw), sample), (" of an empty render", torch.zeros(size), sample)]
+    cases.append((" without a depth prior", torch.rand(size, generator=draw), replace(sample, prior=None)))
+    for what, alpha, sample in cases:
         maps = _maps(alpha, loss.reads, draw)
         leaves = {key: value.requires_grad_() for key, value in maps.present().items()}
         value, again = loss(maps, sample), loss(maps, sample)
@@ -140,11 +143,15 @@ def _sample(size: tuple[int, int], draw: Generator) -> Sample:
 
     from surfkit.losses.base import Sample
     from surfkit.scene.camera import Camera
+    from surfkit.scene.depth_prior import DepthPrior
     from surfkit.scene.scene import View
 
     height, width = size
     camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, width / 2, height / 2, width, height)
-    return Sample(View("random.png", camera, Path("random.png")), torch.rand(3, *size, generator=draw))
+    view, photo = View("random.png", camera, Path("random.png")), torch.rand(3, *size, generator=draw)
+    there = torch.rand(size, generator=draw) > 0.2
+    inverse = torch.where(there, 0.5 + torch.rand(size, generator=draw), 0.0)
+    return Sample(view, photo, DepthPrior(inverse, torch.rand(size, generator=draw) * there, 0.8))
 
 
 def _maps(alpha: Tensor, reads: Iterable[str], draw: Generator) -> Maps:

@@ -11,7 +11,7 @@ FLOORS = (
     "core",
     "scene",
     "raster",
-    "primitives losses",
+    "primitives losses depth",
     "densify appearance",
     "train partition compress mesh evaluate",
     "recipe",

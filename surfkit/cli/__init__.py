@@ -1,7 +1,8 @@
 """The `surfkit` command: finds the subcommand, runs it, and turns what a user can put right into one line.
 
 Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
-and its `run()` does the work and returns an exit status, or None for 0. The module is imported only when its command
+and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
+word. The module is imported only when its command
 is asked for, so `surfkit --help` loads neither torch nor tyro.
 """
 
@@ -20,6 +21,7 @@ COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
     "export": "Write the result of a run for other programs.",
+    "prepare": "Make what a data set may need before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
     "components": "List the parts that recipes are made of, by kind.",
@@ -98,6 +100,14 @@ def _dispatch(words: list[str]) -> int:
     command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     from surfkit.cli.parse import parse
 
+    if isinstance(command, dict):
+        if not rest or rest[0] not in command:
+            wanted = f"surfkit {name} {'|'.join(command)} ..."
+            if rest and rest[0] not in ("-h", "--help", "help"):
+                raise BadInput(f"nothing named {rest[0]!r} to {name}; usage: {wanted}")
+            print(f"{COMMANDS[name]}\n\nusage: {wanted}\n\n`surfkit {name} {next(iter(command))} --help` tells more.")
+            return 0
+        name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
     return parse(command, rest, f"surfkit {name}").run() or 0
 
 

@@ -24,7 +24,8 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
-BUILTIN = tuple(f"surfkit.{name}" for name in ("primitives", "losses", "appearance", "densify", "recipes"))
+_PARTS = ("primitives", "losses", "depth", "appearance", "densify", "recipes")
+BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS)
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Splats
+from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 
 
@@ -20,19 +21,23 @@ class Sample:
     Attributes:
         view: The photograph's name and camera.
         photo: (3, H, W) float32 in [0, 1].
+        prior: What is known of the depth, of a photograph with a usable estimate and for losses that need one.
     """
 
     view: View
     photo: Tensor
+    prior: DepthPrior | None = None
 
 
 class Loss(Component):
     """A term of the objective.
 
-    `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them.
+    `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
+    priors are only read when a term has `needs_prior`; a photograph may still be without one.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)
+    needs_prior: ClassVar[bool] = False
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:

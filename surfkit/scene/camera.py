@@ -42,6 +42,11 @@ class Camera:
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
         )
 
+    def fitted(self, longest: int) -> Camera:
+        """The same camera with a longest side of at most `longest` pixels."""
+        by = max(1.0, max(self.width, self.height) / longest)
+        return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
+
     def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
         x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx

@@ -17,6 +17,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.data import Data, nearest
+from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import photo_size
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 
@@ -55,7 +56,7 @@ def read(data: Data) -> Scene:
     root = data.path
     if not root.is_dir():
         raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
-    folder = _model_folder(root)
+    folder = model_folder(root)
     shots, xyz, rgb = _model(folder)
     views = _photographs(root, data, shots)
     held_out = data.held_out([shot.name for shot in shots])
@@ -70,11 +71,30 @@ def read(data: Data) -> Scene:
     )
 
 
+def observations(data: Data, frame: Frame) -> Observations:
+    """Which points of the sparse model each photograph shows, in the local frame of a scene that `read` gave."""
+    folder = model_folder(data.path)
+    model = _reconstruction(folder)
+    points = sorted(model.points3D.items())
+    row = {number: at for at, (number, _) in enumerate(points)}
+    seen = {}
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        spots = [spot for spot in image.points2D if spot.point3D_id in row]
+        xy = np.array([spot.xy for spot in spots], np.float64).reshape(-1, 2)
+        rows = np.array([row[spot.point3D_id] for spot in spots], np.int64)
+        seen[image.name] = Seen(rows, xy / (camera.width, camera.height))
+    xyz = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
+    error = np.array([point.error for _, point in points], np.float64)
+    return Observations(frame.to_local(xyz), np.where(np.isfinite(xyz).all(1), error, np.inf), seen)
+
+
 def _wanted() -> str:
     return f"a data set is a folder with images/ and a COLMAP model in {', '.join(MODELS[:-1])} or {MODELS[-1]}"
 
 
-def _model_folder(root: Path) -> Path:
+def model_folder(root: Path) -> Path:
+    """Where the sparse model of a data set lies, or BadInput."""
     if not any(root.iterdir()):
         raise BadInput(f"{root}: the folder is empty; {_wanted()}")
     for place in MODELS:
@@ -93,6 +113,23 @@ def _lacking(folder: Path, end: str) -> list[str]:
 
 def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
     """Shots in name order, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
+    model = _reconstruction(folder)
+    shots = _shots(folder, model)
+    points = [point for _, point in sorted(model.points3D.items())]
+    if not points:
+        raise BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP")
+    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+    finite = np.isfinite(xyz.astype(np.float32)).all(1)
+    if not finite.any():
+        raise BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again")
+    if not finite.all():
+        emit(Warned(f"{folder}: {(~finite).sum()} of {len(xyz)} points without finite coordinates are left out"))
+    return shots, xyz[finite], rgb[finite]
+
+
+def _reconstruction(folder: Path) -> Any:
+    """pycolmap's model, or BadInput for one that is damaged."""
     binary = not _lacking(folder, ".bin")
     if binary:  # of text files, pycolmap sees by itself that they are cut off
         _refuse_cut_off(folder)
@@ -106,18 +143,7 @@ def _model(folder: Path) -> tuple[list[Shot], np.ndarray, np.ndarray]:
     cameras = sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
     if binary and (folder / "cameras.bin").stat().st_size < 8 + cameras:
         raise _cut_off(folder / "cameras.bin")
-    shots = _shots(folder, model)
-    points = [point for _, point in sorted(model.points3D.items())]
-    if not points:
-        raise BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP")
-    xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
-    rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    finite = np.isfinite(xyz.astype(np.float32)).all(1)
-    if not finite.any():
-        raise BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again")
-    if not finite.all():
-        emit(Warned(f"{folder}: {(~finite).sum()} of {len(xyz)} points without finite coordinates are left out"))
-    return shots, xyz[finite], rgb[finite]
+    return model
 
 
 def _refuse_cut_off(folder: Path) -> None:

@@ -173,8 +173,15 @@ def photograph(flight: Flight | None = None) -> Synthetic:
     return Synthetic(Scene("synthetic", train, tuple(v for v in views if v.name in held_out), cloud, frame), exact)
 
 
-def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False) -> None:
-    """Save the scene as a COLMAP folder: PNG photographs in images/, the model in sparse/0 in the input frame."""
+def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False, tracks: bool = False) -> None:
+    """Save the scene as a COLMAP folder: PNG photographs in images/, the model in sparse/0 in the input frame.
+
+    Args:
+        folder: To write into.
+        synthetic: What to write.
+        binary: Whether the model is in COLMAP's binary files, or in its text files.
+        tracks: Whether every point is tracked through all the photographs that really show it, or through none.
+    """
     from PIL import Image
     from scipy.spatial.transform import Rotation
 
@@ -183,7 +190,8 @@ def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False) -> No
     for old in model.glob("*.bin"):  # they would win over the text files
         old.unlink()
     views = sorted([*scene.train, *scene.held_out], key=lambda view: view.name)
-    shots = []
+    xyz = scene.frame.to_input(scene.cloud.xyz.numpy())
+    shots, seen_in = [], [""] * len(xyz)
     for i, view in enumerate(views, 1):
         path = folder / "images" / view.name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,18 +199,35 @@ def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False) -> No
         Image.fromarray(pixels).save(path)
         pose = scene.frame.input_pose(view.camera.world_to_camera)
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        shots.append(f"{i} {_row([w, x, y, z, *pose[:3, 3]])} 1 {view.name}\n\n")
+        spots = _observed(xyz, pose, view.camera) if tracks else []
+        for at, (point, _) in enumerate(spots):
+            seen_in[point] += f" {i} {at}"
+        line = " ".join(f"{_row(pixel)} {point + 1}" for point, pixel in spots)
+        shots.append(f"{i} {_row([w, x, y, z, *pose[:3, 3]])} 1 {view.name}\n{line}\n")
     c = views[0].camera
     lens = f"1 PINHOLE {c.width} {c.height} {_row([c.fx, c.fy, c.cx, c.cy])}\n"
-    xyz = scene.frame.to_input(scene.cloud.xyz.numpy())
-    colours = scene.cloud.rgb.tolist()
-    points = [f"{i} {_row(p)} {r} {g} {b} 0\n" for i, (p, (r, g, b)) in enumerate(zip(xyz, colours, strict=True), 1)]
+    colours = [f"{r} {g} {b}" for r, g, b in scene.cloud.rgb.tolist()]
+    rows = zip(xyz, colours, seen_in, strict=True)
+    points = [f"{i} {_row(at)} {colour} 0{track}\n" for i, (at, colour, track) in enumerate(rows, 1)]
     for part, lines in {"cameras": [lens], "images": shots, "points3D": points}.items():
         (model / f"{part}.txt").write_text("".join(lines))
     if binary:
         library().Reconstruction(str(model)).write_binary(str(model))
         for text in model.glob("*.txt"):
             text.unlink()
+
+
+def _observed(xyz: np.ndarray, pose: np.ndarray, camera: Camera) -> list[tuple[int, np.ndarray]]:
+    """Which of the (P, 3) points a camera really sees, and at which pixel."""
+    rays = xyz @ pose[:3, :3].T + pose[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = camera.fx * rays[:, 0] / rays[:, 2] + camera.cx
+        y = camera.fy * rays[:, 1] / rays[:, 2] + camera.cy
+    inside = (rays[:, 2] > 0) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
+    eye = -pose[:3, :3].T @ pose[:3, 3]
+    first = np.min([shape.hit(np.broadcast_to(eye, xyz.shape), xyz - eye)[0] for shape in SURFACES], axis=0)
+    seen = np.flatnonzero(inside & (first > 1 - 1e-4))
+    return [(int(point), np.array([x[point], y[point]])) for point in seen]
 
 
 def _row(values: Sequence[float]) -> str:

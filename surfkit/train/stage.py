@@ -24,6 +24,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.train.adam import Rate, adam_step
 from surfkit.train.look import Look, fresh_looks
@@ -145,6 +146,7 @@ class Trainer:
         views: Photographs to optimise on.
         photos: Gives their pictures by position, (3, H, W) uint8.
         rasterizer: What draws.
+        priors: Estimated depths by position, for losses that need them.
     """
 
     stage: Stage
@@ -152,6 +154,7 @@ class Trainer:
     views: Sequence[View]
     photos: Pictures
     rasterizer: Rasterizer
+    priors: Sequence[DepthPrior | None] | None = None
 
     def begin(self, points: Points, generator: torch.Generator) -> StageState:
         """The state before the first step."""
@@ -178,7 +181,8 @@ class Trainer:
         """Show one photograph, and let points and policies learn from it."""
         stage, index = self.stage, state.index + 1
         shown = state.order.next(state.generator)
-        sample = Sample(self.views[shown], self.photos[shown].to(torch.float32).div_(255))
+        prior = None if self.priors is None else self.priors[shown]
+        sample = Sample(self.views[shown], self.photos[shown].to(torch.float32).div_(255), prior)
         active = {n: w for n, loss in stage.losses.items() if (w := loss.weight_at(index, stage.steps)) > 0}
         reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}

@@ -1,0 +1,143 @@
+"""`surfkit prepare`: what a data set may need before training."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.registry import choice
+from surfkit.depth.base import DepthEstimator
+from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.depth.prepare import Preparation, Prepared
+from surfkit.evaluate.pictures import colour_depth, write_picture
+from surfkit.raster.select import Device
+from surfkit.scene import colmap
+from surfkit.scene.data import Data
+from surfkit.scene.depth_files import FOLDER, DepthFile, map_path
+from surfkit.scene.photos import read_photo
+from surfkit.scene.scene import View
+
+SHOWN = 4
+"""Views in the overview."""
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Estimate the depth of the training photographs, for the depth loss; writes DATA/estimated_depths.
+
+    An interrupted estimate goes on when the same command is given again. Choose how with `estimator:plane-sweep`
+    (several photographs, no weights) or `estimator:depth-anything-v2` (one photograph, a network).
+    """
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse."""
+
+    estimator: Annotated[DepthEstimator, choice(DepthEstimator)] = PlaneSweep()
+    """How depth is estimated."""
+
+    again: bool = False
+    """Estimate what is there already again, also with other settings."""
+
+    scale: float | None = None
+    """Divide the size of every photograph by this."""
+
+    longest: int | None = None
+    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
+
+    test_every: int = 8
+    """Keep every Nth photograph from training, as in `surfkit train`: priors must not have seen them."""
+
+    test_list: Path | None = None
+    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
+
+    images: Path | None = None
+    """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    def run(self) -> None:
+        """Estimate, and show what came out."""
+        data = Data(self.data, self.scale, self.longest, self.test_every, self.test_list, self.images)
+        preparation = Preparation(data, self.estimator, torch_device(self.device))
+        scene = colmap.read(data)
+        if notice := self.estimator.notice():
+            print(f"note: {notice}", file=sys.stderr)
+        given = preparation.material(scene)
+        wanted, views = preparation.begin(scene, self.again), given.views
+        if there := len(views) - len(wanted):
+            print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
+        done = watched(preparation.run(scene, given, wanted), len(wanted))
+        path = self.data / FOLDER / "overview.png"
+        write_overview(path, self.data, views)
+        show(done)
+        print(f"depth maps in {self.data / FOLDER}; look at {path}")
+
+
+def torch_device(device: Device) -> torch.device:
+    """Where torch computes; unlike the rasterizer, an estimator runs on any device."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BadInput("--device cuda: torch finds no CUDA device here; use --device cpu")
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def watched(steps: Iterable[Prepared], total: int) -> list[Prepared]:
+    """The results, with a bar on the terminal while they come; where there is no terminal, a line for each."""
+    console, done = Console(stderr=True), []
+    columns = (
+        TextColumn("depth"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[name]}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("depth", total=total, name="")
+        for step in steps:
+            done.append(step)
+            bar.update(task, advance=1, name=step.view.name)
+            if not console.is_terminal:
+                covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
+                line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
+                console.print(line, highlight=False, soft_wrap=True)
+    return done
+
+
+def show(done: list[Prepared]) -> None:
+    """What was estimated, as a table, and by name what was not."""
+    covered = [step.coverage for step in done if step.coverage is not None]
+    mean = f"{sum(covered) / len(covered):.0%}" if covered else "-"
+    least = f"{min(covered):.0%}" if covered else "-"
+    row = (str(len(covered)), mean, least, f"{sum(step.seconds for step in done):.1f}")
+    print_table(("photographs", "covered", "least covered", "seconds"), [row])
+    if failed := [step.view.name for step in done if step.coverage is None]:
+        print(f"too few sparse points or neighbours, no depth: {', '.join(failed)}")
+
+
+def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
+    """A picture of a few views: photograph, depth and confidence."""
+    found = [view for view in views if map_path(root, view.name).exists()]
+    rows = []
+    for view in found[:: max(1, len(found) // SHOWN)][:SHOWN]:
+        file = DepthFile(map_path(root, view.name), aligned=True)
+        inverse, confidence = torch.from_numpy(file.read()), file.read_confidence()
+        height, width = inverse.shape
+        trust = torch.zeros(height, width) if confidence is None else torch.from_numpy(confidence)
+        photo = read_photo(view.path, (width, height)).float() / 255
+        rows.append(torch.cat([photo, colour_depth(1 / inverse), trust.expand(3, -1, -1)], dim=2))
+    if rows:
+        width = max(row.shape[2] for row in rows)
+        write_picture(path, torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], dim=1))
+
+
+COMMAND = {"depth": Depth}

@@ -1,0 +1,10 @@
+"""Estimators of depth, by the name users type."""
+
+from surfkit.core.registry import hookimpl
+from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.depth.plane_sweep import PlaneSweep
+
+
+@hookimpl
+def surfkit_components():
+    return {"plane-sweep": PlaneSweep, "depth-anything-v2": DepthAnythingV2}

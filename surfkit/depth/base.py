@@ -1,0 +1,68 @@
+"""What an estimator of depth is."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from surfkit.core.registry import Component
+from surfkit.scene.observations import Observations
+from surfkit.scene.scene import View
+
+
+@dataclass(frozen=True)
+class Material:
+    """What there is to estimate depth from.
+
+    Attributes:
+        views: The photographs, with cameras in the local frame.
+        observations: Where they show sparse points.
+        device: Where to compute.
+        work: A folder for what an interrupted estimate can go on from; it is deleted when all is done.
+    """
+
+    views: Sequence[View]
+    observations: Observations
+    device: torch.device
+    work: Path
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The depth of one photograph.
+
+    Attributes:
+        at: Position of the view.
+        inverse: (h, w) float32 inverse camera z, 1/local units if the estimator is `aligned`; 0 where there is none.
+            None where the photograph gives nothing to work from.
+        confidence: (h, w) float32 in [0, 1].
+    """
+
+    at: int
+    inverse: Tensor | None
+    confidence: Tensor | None
+
+
+class DepthEstimator(Component):
+    """A way to estimate the depth of photographs with known cameras.
+
+    `aligned` estimators give inverse depth in the units of the scene, others up to scale and offset. The ones that are
+    `matched` compare photographs with one another, so they must not see those that are kept to measure with.
+    """
+
+    aligned: ClassVar[bool] = False
+    matched: ClassVar[bool] = False
+
+    @abstractmethod
+    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+        """Estimate the depth of the views at the positions `wanted`, one after the other, at any size."""
+
+    def notice(self) -> str | None:
+        """What a user should know before the results are used, such as a licence."""
+        return None

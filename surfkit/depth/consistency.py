@@ -1,0 +1,59 @@
+"""Whether the depth maps of several photographs describe one surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from surfkit.depth.matching import ray_map
+from surfkit.scene.camera import Camera
+
+
+def at_edge(inverse: Tensor, radius: int, share: float) -> Tensor:
+    """(H, W) whether the surface ends within `radius` pixels, and what is behind lies further by `share` of the depth.
+
+    There, windows that are compared also show what is behind, and the nearer surface comes out too large. Inverse depth
+    is linear in the image on a plane, however steep, so the mean of two opposite neighbours tells slopes from edges.
+    """
+    height, width = inverse.shape
+    around = pad(inverse[None], (radius, radius, radius, radius), mode="replicate")[0]
+
+    def moved(y: int, x: int) -> Tensor:
+        return around[radius + y : radius + y + height, radius + x : radius + x + width]
+
+    steps = [(k * y, k * x) for y, x in ((0, 1), (1, 0), (1, 1), (1, -1)) for k in range(1, radius + 1)]
+    bend = torch.stack([inverse - (moved(y, x) + moved(-y, -x)) / 2 for y, x in steps]).amax(0)
+    return bend > inverse * share / 2
+
+
+def agreement(
+    camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """How many other maps agree with each pixel, and the mean of what they and the map itself say.
+
+    A pixel is carried into another photograph; the maps agree where the depth there differs by a share of less than
+    `tolerance` from that in the other map.
+
+    Args:
+        camera: Of the map.
+        inverse: (H, W) inverse depth; 0 where there is none.
+        others: Cameras and maps of other photographs.
+        tolerance: Share of the depth.
+
+    Returns:
+        (H, W) number of maps that agree; (H, W) inverse depth.
+    """
+    count, ratios = torch.zeros_like(inverse), torch.ones_like(inverse)
+    for there, other in others:
+        a, b = ray_map(camera, there, inverse.device)
+        x, y, z = (a[i] + inverse * b[i] for i in range(3))
+        grid = torch.stack([x / z * (2 / there.width) - 1, y / z * (2 / there.height) - 1], -1)
+        found = grid_sample(other[None, None], grid[None], mode="nearest", align_corners=False)[0, 0]
+        ratio = found * z / inverse.clamp_min(1e-20)  # depth carried over / depth found
+        agrees = (inverse > 0) & (z > 0) & (found > 0) & ((ratio - 1).abs() < tolerance)
+        count += agrees
+        ratios += torch.where(agrees, ratio, 0)
+    return count, inverse * ratios / (count + 1)

@@ -1,0 +1,93 @@
+"""Depth from one photograph, with a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from surfkit.core.check import BadInput
+from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.scene.photos import read_photo
+
+LICENCES = {"small": "Apache-2.0", "base": "CC BY-NC 4.0", "large": "CC BY-NC 4.0"}
+"""Of the published weights."""
+MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of the colours that the network was trained on."""
+PATCH = 14
+"""Pixels on a side of the network's patches."""
+
+
+@dataclass(frozen=True)
+class DepthAnythingV2(DepthEstimator):
+    """Relative inverse depth of single photographs by Depth Anything V2 (Yang et al. 2024), aligned afterwards.
+
+    Needs `pip install surfkit[depth]`, and weights: small is under Apache-2.0, base and large are under CC BY-NC 4.0,
+    which forbids commercial use. The paper uses large.
+    """
+
+    size: Literal["small", "base", "large"] = "small"
+    """Which published weights: small (Apache-2.0), base or large (CC BY-NC 4.0, no commercial use)."""
+
+    weights: str = ""
+    """Folder of weights, or their name on the Hugging Face hub; the published ones of `size` if empty."""
+
+    shortest: int = 518
+    """Shortest side of the pictures that the network sees, pixels; rounded to patches of 14."""
+
+    def __post_init__(self) -> None:
+        if self.shortest < PATCH:
+            raise BadInput(f"shortest is {self.shortest}; it must be {PATCH} pixels or more")
+
+    @property
+    def source(self) -> str:
+        """Folder or name of the weights."""
+        return self.weights or f"depth-anything/Depth-Anything-V2-{self.size.capitalize()}-hf"
+
+    def notice(self) -> str | None:
+        """The licence."""
+        if self.weights:
+            return f"weights from {self.weights}: their licence is that of where they came from"
+        use = "" if self.size == "small" else ", which forbids commercial use"
+        return f"the weights {self.source} are under {LICENCES[self.size]}{use}"
+
+    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+        network = self.network().to(given.device).eval()
+        for at in wanted:
+            camera = given.views[at].camera
+            rgb = read_photo(given.views[at].path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
+            with torch.inference_mode():
+                inverse = self.inverse_depth(network, rgb)
+            size = camera.fitted(max(inverse.shape))  # patches bend the shape a little
+            inverse = interpolate(inverse[None, None], (size.height, size.width), mode="bilinear")[0, 0]
+            yield Estimate(at, inverse.cpu(), (inverse > 0).float().cpu())
+
+    def network(self) -> Any:
+        """The network with its weights.
+
+        Raises:
+            BadInput: transformers is missing, or the weights cannot be had.
+        """
+        try:
+            from transformers import AutoModelForDepthEstimation
+        except ImportError as error:
+            raise BadInput(f"depth-anything-v2 needs transformers ({error}): pip install 'surfkit[depth]'") from error
+        try:
+            return AutoModelForDepthEstimation.from_pretrained(self.source)
+        except (OSError, ValueError, RuntimeError) as error:
+            raise BadInput(
+                f"the weights {self.source} cannot be had: download them where there is a network, and give the folder "
+                f"with --estimator.weights ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
+            ) from error
+
+    def inverse_depth(self, network: Any, rgb: Tensor) -> Tensor:
+        """(h, w) relative inverse depth of a photograph (3, H, W) in [0, 1]; 0 for what is infinitely far."""
+        by = self.shortest / min(rgb.shape[1:])
+        size = [max(1, round(side * by / PATCH)) * PATCH for side in rgb.shape[1:]]
+        small = interpolate(rgb[None], size, mode="bicubic", antialias=True, align_corners=False)
+        mean, spread = (rgb.new_tensor(values).view(3, 1, 1) for values in (MEAN, SPREAD))
+        return network(pixel_values=(small - mean) / spread).predicted_depth[0].clamp_min(0)

@@ -1,0 +1,140 @@
+"""Depth from several photographs, without learnt weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.consistency import agreement, at_edge
+from surfkit.depth.matching import Picture, cost_volume, ray_map
+from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.scanlines import best_planes, smoothed
+from surfkit.scene.depth_files import save_array
+from surfkit.scene.photos import read_photo
+
+KEPT = 64
+"""Pictures kept in memory."""
+
+
+@dataclass(frozen=True)
+class PlaneSweep(DepthEstimator):
+    """Photographs compared with neighbours at many depths, smoothed along scanlines, checked against each other."""
+
+    aligned: ClassVar[bool] = True
+    matched: ClassVar[bool] = True
+
+    longest: int = 480
+    """Longest side of a depth map in pixels; the time grows with its third power."""
+
+    neighbours: int = 5
+    """Photographs that each one is compared with."""
+
+    angle: float = 8.0
+    """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
+
+    visible: float = 0.5
+    """Share of the neighbours that must see a point: the others may be occluded."""
+
+    step_px: float = 1.0
+    """How far a picture moves from one depth to the next, pixels."""
+
+    max_planes: int = 192
+    """Most depths tried, which bounds time and memory."""
+
+    margin: float = 0.15
+    """How far beyond the sparse points to look, as a share of their range of inverse depths."""
+
+    window: int = 5
+    """Side of the windows compared, pixels; odd."""
+
+    step_cost: float = 0.1
+    """Cost of a change of depth by one plane from a pixel to the next; 1 is that of a wrong match."""
+
+    jump_cost: float = 1.0
+    """Cost of a jump in depth from a pixel to the next."""
+
+    tolerance: float = 0.015
+    """Share by which depths may differ for the maps of two photographs to agree."""
+
+    edge: float = 0.02
+    """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
+
+    agree: int = 2
+    """Neighbours whose maps must agree with a depth to trust it fully."""
+
+    def __post_init__(self) -> None:
+        if self.window < 3 or self.window % 2 == 0:
+            raise BadInput(f"window is {self.window}; it must be an odd number of 3 or more pixels")
+        if min(self.longest, self.neighbours, self.agree) < 1 or self.max_planes < 3:
+            raise BadInput("longest, neighbours and agree must be 1 or more, and max_planes 3 or more")
+        if not (min(self.angle, self.step_px, self.tolerance) > 0 and 0 < self.visible <= 1 and self.margin >= 0):
+            raise BadInput("angle, step_px and tolerance must be above 0, visible in (0, 1] and margin 0 or more")
+        if not (0 < self.edge < 1 and 0 < self.step_cost <= self.jump_cost):
+            raise BadInput("edge must be in (0, 1), and step_cost above 0 and no more than jump_cost")
+
+    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+        pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
+
+        @lru_cache(KEPT)
+        def picture(at: int) -> Picture:
+            return self.picture(given, at)
+
+        @lru_cache(KEPT)
+        def sweep(at: int) -> tuple[Tensor, Tensor] | None:
+            path = given.work / f"{at:06d}.npy"
+            if not path.exists():
+                found = self.sweep(given, at, picture(at), [picture(other) for other in pairs[at]])
+                save_array(path, np.zeros(0) if found is None else torch.stack(found).cpu().numpy())
+            both = torch.from_numpy(np.load(path)).to(given.device)
+            return (both[0], both[1]) if len(both) else None
+
+        for at in wanted:
+            maps = {near: found for near in [at, *pairs[at]] if (found := sweep(near)) is not None}
+            if at not in maps:
+                yield Estimate(at, None, None)
+                continue
+            inverse, matched = maps.pop(at)
+            others = [(picture(near).camera, found) for near, (found, _) in maps.items()]
+            count, fused = agreement(picture(at).camera, inverse, others, self.tolerance)
+            trusted = (count / min(self.agree, max(1, len(others)))).clamp_max(1)
+            trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
+            yield Estimate(at, fused.cpu(), (trusted * matched).cpu())
+
+    def picture(self, given: Material, at: int) -> Picture:
+        """A photograph at the working size."""
+        view = given.views[at]
+        camera = view.camera.fitted(self.longest)
+        rgb = read_photo(view.path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
+        return Picture(camera, rgb)
+
+    def sweep(self, given: Material, at: int, here: Picture, others: Sequence[Picture]) -> tuple[Tensor, Tensor] | None:
+        """(H, W) inverse depth and how well it matches, in [0, 1]; None without neighbours or sparse points."""
+        span = depth_range(given.views[at], given.observations, self.margin)
+        if span is None or not others:
+            return None
+        count = self.planes(here, others, span)
+        planes = torch.linspace(*span, count, device=given.device)
+        volume = cost_volume(here, others, planes, self.window, self.visible)
+        plane, position = best_planes(smoothed(volume, here.light, self.step_cost, self.jump_cost))
+        inverse = span[0] + position * ((span[1] - span[0]) / (count - 1))
+        matched = 1 - volume.gather(0, plane[None])[0]
+        inner = (plane > 0) & (plane < count - 1)
+        return inverse, torch.where(inner, matched, 0)
+
+    def planes(self, here: Picture, others: Sequence[Picture], span: tuple[float, float]) -> int:
+        """How many depths to try, so that no picture moves by more than a step from one to the next."""
+        moves = []
+        for other in others:
+            a, b = ray_map(here.camera, other.camera, torch.device("cpu"))
+            ends = [a[:, ::16, ::16] + c * b[:, None, None] for c in span]
+            x, y = (ends[1][i] / ends[1][2] - ends[0][i] / ends[0][2] for i in range(2))
+            moves.append(float(torch.hypot(x, y).median()))
+        return min(max(3, round(max(moves) / self.step_px) + 1), self.max_planes)

@@ -1,0 +1,132 @@
+"""Depth priors for a whole data set: what is there already is kept, and an interrupted estimate goes on."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump
+from surfkit.core.version import own_version
+from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.scene import colmap
+from surfkit.scene.data import Data
+from surfkit.scene.depth_files import FOLDER, confidence_path, map_path, read_record, write_map, write_record
+from surfkit.scene.scene import Scene, View
+
+TRUSTED = 0.5
+"""Pixels of a higher confidence count as covered."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A photograph whose depth was estimated.
+
+    Attributes:
+        view: The photograph.
+        coverage: Share of its pixels with a confidence above one half; None where nothing could be estimated.
+        seconds: It took.
+    """
+
+    view: View
+    coverage: float | None
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """A data set and the estimator of its depth.
+
+    Attributes:
+        data: The data set; photographs that it keeps from training are not used by estimators that compare.
+        estimator: How.
+        device: Where to compute.
+    """
+
+    data: Data
+    estimator: DepthEstimator
+    device: torch.device
+
+    @property
+    def work(self) -> Path:
+        """What an interrupted estimate goes on from."""
+        return self.data.path / FOLDER / ".work"
+
+    def views(self, scene: Scene) -> tuple[View, ...]:
+        """The photographs to estimate."""
+        return scene.train if self.estimator.matched else (*scene.train, *scene.held_out)
+
+    def material(self, scene: Scene) -> Material:
+        """What the estimator works from.
+
+        Raises:
+            BadInput: The sparse model does not tell which photographs to compare.
+        """
+        observations = colmap.observations(self.data, scene.frame)
+        if self.estimator.matched and not any(len(seen.points) for seen in observations.seen.values()):
+            raise BadInput(
+                f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
+                "triangulate it in COLMAP"
+            )
+        return Material(self.views(scene), observations, self.device, self.work)
+
+    def begin(self, scene: Scene, again: bool) -> list[int]:
+        """Positions of the views that are still to be estimated.
+
+        Args:
+            scene: Of the data set.
+            again: Whether to delete the maps that are there.
+
+        Raises:
+            BadInput: There are maps that something else made, or other settings.
+        """
+        root, views = self.data.path, self.views(scene)
+        record, before = self.record(views), read_record(root)
+        paths = [map_path(root, view.name) for view in views]
+        if again:
+            for path in paths:
+                path.unlink(missing_ok=True)
+                confidence_path(path).unlink(missing_ok=True)
+        elif before != record and (before or any(path.exists() for path in paths)):
+            made = "with other settings" if before else "by another program"
+            raise BadInput(f"{root / FOLDER} holds depth maps made {made}; --again replaces them")
+        if before != record or again:
+            shutil.rmtree(self.work, ignore_errors=True)
+            write_record(root, record)
+        self.work.mkdir(parents=True, exist_ok=True)
+        return [at for at, path in enumerate(paths) if not path.exists()]
+
+    def record(self, views: Sequence[View]) -> dict[str, Any]:
+        """What depth.json says of the maps."""
+        return {
+            "estimator": dump(self.estimator),
+            "surfkit": own_version(),
+            "aligned": self.estimator.aligned,
+            "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
+            "matched": [view.name for view in views] if self.estimator.matched else None,
+        }
+
+    def run(self, scene: Scene, given: Material, wanted: Sequence[int]) -> Iterator[Prepared]:
+        """Estimate and save the views at the positions `wanted`, one after the other."""
+        begun = time.perf_counter()
+        for estimate in self.estimator.estimate(given, wanted):
+            view = given.views[estimate.at]
+            coverage = self.save(view, estimate, scene)
+            yield Prepared(view, coverage, time.perf_counter() - begun)
+            begun = time.perf_counter()
+        shutil.rmtree(self.work, ignore_errors=True)
+
+    def save(self, view: View, estimate: Estimate, scene: Scene) -> float | None:
+        """Write a map, in the units of the input if it has any, and return its coverage."""
+        if estimate.inverse is None or estimate.confidence is None:
+            return None
+        inverse: Tensor = estimate.inverse * (scene.frame.scale if self.estimator.aligned else 1.0)
+        write_map(self.data.path, view.name, inverse.numpy(), estimate.confidence.numpy())
+        return float((estimate.confidence > TRUSTED).float().mean())

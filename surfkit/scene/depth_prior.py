@@ -1,0 +1,220 @@
+"""Estimated depth of the training photographs, in the units of the scene, for the depth loss."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.scene import colmap
+from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
+from surfkit.scene.data import Data
+from surfkit.scene.depth_files import DepthFile, find_maps, read_record
+from surfkit.scene.observations import Observations
+from surfkit.scene.scene import Scene, View
+
+BUDGET_BYTES = 2**30
+"""Of maps kept in memory."""
+UNITS = 1.25
+"""A map in input units that is off by a larger factor from the sparse points is in other units."""
+EDGE = 0.05
+"""Neighbours whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What is known beforehand of the depth of a photograph.
+
+    Attributes:
+        inverse: (H, W) float32 inverse camera z, 1/local units; 0 where there is none.
+        confidence: (H, W) float32 in [0, 1]; 0 where there is none.
+        typical: Inverse depth that is typical of the data set, 1/local units.
+    """
+
+    inverse: Tensor
+    confidence: Tensor
+    typical: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units."""
+
+    file: DepthFile
+    scale: float
+    offset: float
+
+
+class Priors(Sequence["DepthPrior | None"]):
+    """The priors of training views by position; read when asked for, and kept while they fit into memory."""
+
+    def __init__(
+        self, views: Sequence[View], fits: Sequence[Fit | None], typical: float, budget_bytes: int = BUDGET_BYTES
+    ) -> None:
+        self.views, self.fits, self.typical, self.budget_bytes = views, fits, typical, budget_bytes
+        self._kept: OrderedDict[int, DepthPrior] = OrderedDict()
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, at: int) -> DepthPrior | None:  # type: ignore[override] (no slices)
+        fit = self.fits[at]
+        if fit is None:
+            return None
+        if at not in self._kept:
+            self._keep(at, self._read(self.views[at], fit))
+        self._kept.move_to_end(at)
+        return self._kept[at]
+
+    def _read(self, view: View, fit: Fit) -> DepthPrior:
+        size = (view.camera.height, view.camera.width)
+        try:
+            inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
+            confidence = fit.file.read_confidence()
+        except BadInput as error:
+            raise BadInput(f"{fit.file.path}: {error}") from error
+        inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
+        there = (inverse > 0).to(torch.float32)
+        if confidence is None:
+            return DepthPrior(inverse, there, self.typical)
+        grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
+        return DepthPrior(inverse, grown * there, self.typical)
+
+    def _keep(self, at: int, prior: DepthPrior) -> None:
+        self._kept[at] = prior
+        self._bytes += size_of(prior)
+        while self._bytes > self.budget_bytes and len(self._kept) > 1:
+            self._bytes -= size_of(self._kept.popitem(last=False)[1])
+
+
+def read_priors(data: Data, scene: Scene) -> Priors | None:
+    """The depth priors of a data set, aligned to its sparse points; None, and a warning, where there are none.
+
+    Photographs without a map, or with one that cannot be used, are listed in one warning.
+    """
+    maps = find_maps(data.path, colmap.model_folder(data.path), [view.name for view in scene.train])
+    if not maps:
+        emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
+        return None
+    observations = colmap.observations(data, scene.frame)
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), observations, scene), scene.train))
+    fits = [answer if isinstance(answer, Fit) else None for answer in answers]
+    reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
+    for at in _outliers(fits):
+        reasons[scene.train[at].name] = "its scale is far from that of the other images"
+        fits[at] = None
+    if not any(fits):
+        emit(Warned(f"no depth prior of {data.path} can be used, so the depth loss is off: {listed(reasons)}"))
+        return None
+    if reasons:
+        emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
+    _warn_of_leaks(data, scene)
+    return Priors(scene.train, fits, typical_inverse_depth(scene.train, observations, scene))
+
+
+def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:
+    """A map (h, w) at another size (H, W), smooth on surfaces and sharp between them; 0 stays 0."""
+    if inverse.shape == size:
+        return inverse
+    smaller = size[0] < inverse.shape[0]
+    near = interpolate(inverse[None, None], size, mode="nearest-exact")[0, 0]
+    there = (inverse > 0).to(inverse.dtype)
+    both = torch.stack([inverse, there])[None]
+    smooth, full = interpolate(both, size, mode="area" if smaller else "bilinear")[0]
+    one_surface = (full == 1) & ((smooth - near).abs() < EDGE * near)
+    return torch.where(one_surface, smooth, near)
+
+
+def typical_inverse_depth(views: Sequence[View], observations: Observations, scene: Scene) -> float:
+    """The median over views of the median inverse depth of their sparse points, 1/local units."""
+    medians = [np.median(c) for view in views for c in [observations.of(view, MAX_ERROR_PX)[1]] if len(c)]
+    if medians:
+        return float(np.median(medians))
+    xyz = scene.cloud.xyz.to(torch.float64)  # a model without tracks: every point that is before a camera
+    depths = torch.cat([xyz @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3] for view in views])
+    return float((1 / depths[depths > 0]).median())
+
+
+def size_of(prior: DepthPrior) -> int:
+    """Bytes of its maps."""
+    return sum(t.numel() * t.element_size() for t in (prior.inverse, prior.confidence))
+
+
+def listed(reasons: Mapping[str, str]) -> str:
+    """Names by reason, in one line."""
+    groups: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        groups.setdefault(reason, []).append(name)
+    return "; ".join(f"{reason}: {', '.join(names)}" for reason, names in groups.items())
+
+
+def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene) -> Fit | str:
+    """How the map of a view becomes inverse depth, or why it cannot."""
+    if file is None:
+        return "no map"
+    try:
+        values = file.read()
+        file.read_confidence()
+        _check_map(values, view)
+        at, inverse = observations.of(view, MAX_ERROR_PX)
+        values = sample(values, at)
+        if not file.aligned:
+            return Fit(file, *align(values, inverse))
+        _check_units(values / scene.frame.scale, inverse)
+        return Fit(file, 1 / scene.frame.scale, 0.0)
+    except BadInput as error:
+        return str(error).removeprefix(f"{file.path}: ")
+
+
+def _check_map(values: np.ndarray, view: View) -> None:
+    height, width = values.shape
+    wanted = width * view.camera.height / view.camera.width
+    if abs(height - wanted) > 1 + 0.01 * wanted:
+        raise BadInput(f"{width} x {height} px is not the shape of its photograph")
+    known = values[np.isfinite(values)]
+    if not len(known):
+        raise BadInput("no value in it")
+    if np.ptp(known) <= 1e-6 * np.abs(known).max():
+        raise BadInput("constant")
+
+
+def _check_units(values: np.ndarray, inverse: np.ndarray) -> None:
+    known = np.isfinite(values) & (values > 0)
+    ratio = float(np.median(values[known] / inverse[known])) if known.sum() > MIN_POINTS else 1.0
+    if not 1 / UNITS < ratio < UNITS:
+        raise BadInput("its depths are not those of the sparse points")
+
+
+def _outliers(fits: Sequence[Fit | None]) -> list[int]:
+    """Positions of the images whose alignment failed; maps that came in input units share one scale."""
+    scales = {at: fit.scale for at, fit in enumerate(fits) if fit is not None and not fit.file.aligned}
+    if not scales:
+        return []
+    usual = float(np.median(list(scales.values())))
+    return [at for at, scale in scales.items() if not usual / SCALE_BAND <= scale <= usual * SCALE_BAND]
+
+
+def _warn_of_leaks(data: Data, scene: Scene) -> None:
+    """Maps made from several photographs must not have seen those that are kept to measure with."""
+    used = read_record(data.path).get("matched")
+    seen = [view.name for view in scene.held_out if isinstance(used, list) and view.name in used]
+    if seen:
+        text = (
+            f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs kept from training, "
+            f"{seen[0]} for one, so the quality will look better than it is; {_make(data)} --again, with the same split"
+        )
+        emit(Warned(text))
+
+
+def _make(data: Data) -> str:
+    return f"make them with `surfkit prepare depth {data.path}`"

@@ -1,0 +1,126 @@
+"""`surfkit prepare depth`, from photographs to a run that uses what it made."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from surfkit import pipeline
+from surfkit.cli import main
+from surfkit.cli.recipes import recipes
+from surfkit.core.tree import evolve
+from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.losses import DepthRegression
+from surfkit.pipeline import run, with_steps
+from surfkit.scene.data import Data
+from surfkit.scene.depth_files import map_path
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+SMALL = ("--test-every", "4", "--estimator.longest", "48")
+
+
+@pytest.fixture
+def farm(tmp_path):
+    """A data set with tracks, of eight photographs; two are held out."""
+    torch.set_num_threads(2)
+    folder = tmp_path / "farm"
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=64, height=48, points=300)), tracks=True)
+    return folder
+
+
+def maps(folder):
+    return {path.name: path.read_bytes() for path in sorted((folder / "estimated_depths").glob("*.npy"))}
+
+
+def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    out = capsys.readouterr().out
+    assert out.split("\n")[1].split()[0] == "6" and "overview.png" in out
+    made = maps(farm)
+    assert len(made) == 12 and "view_000.png.npy" not in made  # held out
+    record = json.loads((farm / "estimated_depths/depth.json").read_text())
+    assert record["aligned"] is True and record["estimator"]["use"] == "plane-sweep" and len(record["matched"]) == 6
+    assert not (farm / "estimated_depths/.work").exists()
+    with Image.open(farm / "estimated_depths/overview.png") as picture:
+        assert picture.size == (3 * 48, 4 * 36) and np.asarray(picture).std() > 20
+
+    recipe = with_steps(evolve(recipes()["2dgs"], "primitive.sh_degree", 0), 60)
+    losses = recipe.pretrain.losses | {"depth": DepthRegression()}
+    seen = []
+    step = pipeline.Trainer.step
+
+    def watched(self, state):
+        done = step(self, state)
+        seen.append(done.losses["depth"])
+        return done
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline.Trainer, "step", watched)
+        run(evolve(recipe, "pretrain.losses", losses), Data(farm, test_every=4), tmp_path / "run")
+    assert len(seen) == 60 and max(seen) > 0  # as soon as rays get opaque
+    assert json.loads((tmp_path / "run/run.json").read_text())["notes"] == []
+
+
+def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, monkeypatch, capsys):
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    whole = maps(farm)
+    estimate = PlaneSweep.estimate
+
+    def interrupted(self, given, wanted):
+        for count, found in enumerate(estimate(self, given, wanted)):
+            if count == 2:
+                raise KeyboardInterrupt
+            yield found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PlaneSweep, "estimate", interrupted)
+        assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 130
+    assert len(maps(farm)) == 4 and all(".png." in name for name in maps(farm))
+    capsys.readouterr()
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    assert "2 of 6 photographs have their depth already" in capsys.readouterr().err
+    assert maps(farm) == whole
+
+
+def test_maps_of_others_are_not_overwritten(farm, capsys):
+    path = map_path(farm, "view_001.png")
+    path.parent.mkdir()
+    np.save(path, np.ones((3, 4)))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 2
+    assert "made by another program; --again replaces them" in capsys.readouterr().err
+    assert np.load(path).shape == (3, 4)
+    assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 0
+    assert np.load(path).shape == (36, 48)
+    assert main(["prepare", "depth", str(farm), *SMALL, "--estimator.window", "7"]) == 2
+    assert "made with other settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["prepare", "deph"], "nothing named 'deph' to prepare"),
+        (["prepare", "depth", "nowhere"], "nowhere: no such folder"),
+        (["prepare", "depth", "d", "estimator:plan-sweep"], "did you mean 'plane-sweep'?"),
+        (["prepare", "depth", "d", "--estimator.window", "4"], "window is 4; it must be an odd number"),
+    ],
+)
+def test_mistakes_are_one_line(words, message, capsys):
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert message in err and err.count("\n") == 1
+
+
+def test_a_model_without_tracks_is_one_line(tmp_path, capsys):
+    write_colmap(tmp_path, photograph(Flight(views=4, width=24, height=18, points=40)))
+    assert main(["prepare", "depth", str(tmp_path)]) == 2
+    assert "observes any point" in capsys.readouterr().err
+    assert not (tmp_path / "estimated_depths").exists()
+
+
+def test_help_names_what_can_be_prepared(capsys):
+    assert main(["prepare"]) == main(["prepare", "--help"]) == 0
+    assert "surfkit prepare depth" in capsys.readouterr().out
+    assert main(["prepare", "depth", "estimator:depth-anything-v2", "--help"]) == 0
+    assert "CC BY-NC 4.0" in capsys.readouterr().out

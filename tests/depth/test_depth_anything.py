@@ -1,0 +1,74 @@
+"""The way weights of Depth Anything V2 are found and used, with a tiny network of the same classes."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from surfkit.core.check import BadInput
+from surfkit.depth.base import Material
+from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.scene.camera import Camera
+from surfkit.scene.observations import Observations
+from surfkit.scene.scene import View
+
+NOTHING = Observations(np.zeros((0, 3)), np.zeros(0), {})
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A folder with random weights of a network a thousand times smaller than the published ones."""
+    transformers = pytest.importorskip(
+        "transformers", reason="transformers is not installed: pip install surfkit[depth]"
+    )
+    stages = {"out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False}
+    backbone = transformers.Dinov2Config(
+        hidden_size=8, num_hidden_layers=4, num_attention_heads=2, image_size=28, patch_size=14, **stages
+    )
+    config = transformers.DepthAnythingConfig(
+        backbone_config=backbone, reassemble_hidden_size=8, neck_hidden_sizes=[4] * 4, fusion_hidden_size=4,
+        head_hidden_size=4, patch_size=14,
+    )  # fmt: skip
+    torch.manual_seed(1)
+    folder = tmp_path_factory.mktemp("weights")
+    network = transformers.DepthAnythingForDepthEstimation(config)
+    network.head.conv3.bias.data.fill_(0.5)  # so that not everything is infinitely far
+    network.save_pretrained(folder)
+    return folder
+
+
+def material(folder) -> Material:
+    """One photograph of 60 x 40 pixels."""
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    Image.fromarray(pixels).save(folder / "a.png")
+    camera = Camera(torch.eye(4, dtype=torch.float64), 50.0, 50.0, 30.0, 20.0, 60, 40)
+    return Material([View("a.png", camera, folder / "a.png")], NOTHING, torch.device("cpu"), folder)
+
+
+def test_maps_have_the_shape_of_the_photograph_and_weights_come_from_the_folder(weights, tmp_path):
+    given, estimator = material(tmp_path), DepthAnythingV2(weights=str(weights), shortest=56)
+    (first,), (again,) = (list(estimator.estimate(given, [0])) for _ in range(2))
+    assert first.inverse.shape == first.confidence.shape == (56, 84) and torch.equal(first.inverse, again.inverse)
+    assert torch.isfinite(first.inverse).all() and (first.inverse >= 0).all() and first.inverse.std() > 0
+    assert torch.equal(first.confidence, (first.inverse > 0).float())
+    assert not DepthAnythingV2.aligned and not DepthAnythingV2.matched
+
+
+def test_weights_that_cannot_be_had_are_one_line(tmp_path):
+    pytest.importorskip("transformers", reason="transformers is not installed: pip install surfkit[depth]")
+    with pytest.raises(BadInput, match="cannot be had: download them .* --estimator.weights"):
+        DepthAnythingV2(weights=str(tmp_path)).network()
+
+
+def test_without_transformers_the_message_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(BadInput, match=r"pip install 'surfkit\[depth\]'"):
+        DepthAnythingV2().network()
+
+
+def test_the_licence_is_shown():
+    assert "Apache-2.0" in DepthAnythingV2().notice()
+    assert "CC BY-NC 4.0, which forbids commercial use" in DepthAnythingV2(size="large").notice()
+    assert DepthAnythingV2(size="large").source == "depth-anything/Depth-Anything-V2-Large-hf"
