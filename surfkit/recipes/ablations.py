@@ -8,6 +8,7 @@ from __future__ import annotations
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
 from surfkit.densify.signal import LossGradient
+from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import NormalConsistency
 from surfkit.primitives.surfel2d import Surfel2D
@@ -35,6 +36,7 @@ def published(psnr: float, ssim: float, f1: float, millions: float) -> dict[str,
 
 
 FILTER = {"pretrain.densify.filters": (Elongation(),)}
+DEPTH = {"pretrain.losses.depth": DepthRegression(start=0.5, end=0.0025)}
 
 MODEL = Table(
     "model",
@@ -48,6 +50,7 @@ MODEL = Table(
             {"pretrain.signal": LossGradient(terms=("ssim",), boost=0.9)},
             paper=published(22.24, 0.674, 0.429, 9.51),
         ),
+        Row("+ depth regression", DEPTH, paper=published(22.22, 0.674, 0.438, 9.67)),
     ),
 )
 
@@ -79,6 +82,13 @@ GRADIENT = Table(
             "SSIM",
             {"pretrain.signal": LossGradient(terms=("ssim",))},
             paper=published(22.24, 0.674, 0.419, 9.51),
+        ),
+        Row("SSIM, depth as a loss", DEPTH, paper=published(22.22, 0.674, 0.429, 9.67)),
+        Row(
+            "SSIM + depth",
+            {"pretrain.signal": LossGradient(terms=("ssim", "depth"))},
+            kept=False,
+            paper=published(22.21, 0.674, 0.428, 9.43),
         ),
     ),
 )

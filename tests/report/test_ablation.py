@@ -7,7 +7,9 @@ import pytest
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.tree import evolve
+from surfkit.densify.filters import Elongation
 from surfkit.densify.signal import LossGradient
+from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe
 from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, TABLES
@@ -68,24 +70,21 @@ def test_rows_build_on_the_last_kept_one():
 
 
 def test_the_model_table_adds_up():
-    recipes = list(build(MODEL).values())
-    assert [bool(recipe.pretrain.densify.filters) for recipe in recipes[:3]] == [False, True, True]
-    assert [recipe.pretrain.signal for recipe in recipes[:3]] == [
-        LossGradient(),
-        LossGradient(),
-        LossGradient(terms=("ssim",), boost=0.9),
-    ]
+    stages = [recipe.pretrain for recipe in build(MODEL).values()]
+    assert [bool(stage.densify.filters) for stage in stages] == [False, True, True, True]
+    dgd = LossGradient(terms=("ssim",), boost=0.9)
+    assert [stage.signal for stage in stages] == [LossGradient(), LossGradient(), dgd, dgd]
+    assert [stage.losses.get("depth") for stage in stages] == [None] * 3 + [DepthRegression(start=0.5, end=0.0025)]
 
 
-def test_the_gradient_table_changes_nothing_but_the_signal():
-    recipes = list(build(GRADIENT).values())[:4]
-    assert [recipe.pretrain.signal.terms for recipe in recipes] == [
-        None,
-        ("ssim", "l1"),
-        ("ssim", "normal"),
-        ("ssim",),
-    ]
-    assert len({json.dumps(dump(evolve(r, "pretrain.signal", LossGradient()).pretrain)) for r in recipes}) == 1
+def test_the_gradient_table_changes_the_signal_and_then_the_loss():
+    stages = [recipe.pretrain for recipe in build(GRADIENT).values()]
+    terms = [None, ("ssim", "l1"), ("ssim", "normal"), ("ssim",), ("ssim",), ("ssim", "depth")]
+    assert [stage.signal for stage in stages] == [LossGradient(terms=names) for names in terms]
+    assert ["depth" in stage.losses for stage in stages] == [False] * 4 + [True] * 2
+    same = [evolve(evolve(stage, "signal", LossGradient()), "losses", {}) for stage in stages]
+    assert all(stage == same[0] for stage in same) and same[0].densify.filters == (Elongation(),)
+    assert list(built_on(GRADIENT).values()) == [None, *["SSIM + RGB + normal"] * 3, "SSIM", "SSIM, depth as a loss"]
 
 
 def test_the_baseline_is_the_published_one():
