@@ -49,3 +49,29 @@ def test_any_number_of_steps_is_the_whole_schedule(name, steps):
 def test_no_steps_are_refused():
     with pytest.raises(BadInput, match="--steps 0"):
         with_steps(recipes()["3dgs"], 0)
+
+
+def test_citygs2_coarse_is_the_last_row_of_the_upper_half_of_the_ablation_table():
+    from dataclasses import replace
+
+    from surfkit.recipes.ablations import MODEL
+    from surfkit.report.ablation import build
+
+    *_, last = build(MODEL).values()
+    assert replace(recipes()["citygs2-coarse"], about=last.about) == last
+    assert last.pretrain.signal.boost == 0.9 and last.pretrain.signal.terms == ("ssim",)
+
+
+def test_published_settings_of_the_other_recipes():
+    known = recipes()
+    flat, absolute, trimmed, light = (known[n].pretrain for n in ("flat3dgs", "absgs", "trim2dgs", "lightgaussian"))
+    assert flat.losses["normal"].weight == 0.0125
+    assert absolute.signal.absolute and (absolute.densify.threshold, absolute.densify.small) == (4e-4, 0.001)
+    trim = trimmed.prune[0]
+    assert (trim.ratio, trim.start, trim.until, trim.every, trimmed.steps) == (0.1, 31_000, 37_000, 500, 37_000)
+    assert (light.prune[0].at, light.prune[0].ratio, light.prune[0].power, light.steps) == (
+        (30_000,),
+        0.66,
+        0.1,
+        35_000,
+    )

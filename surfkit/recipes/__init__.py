@@ -4,9 +4,11 @@ from collections.abc import Mapping
 
 from surfkit.core.registry import hookimpl
 from surfkit.densify.adc import ADC
+from surfkit.densify.filters import Elongation
 from surfkit.densify.prune import Importance
-from surfkit.densify.signal import AbsGradient
+from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.densify.trim import Trim
+from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.primitives.flat3d import Flat3D
@@ -70,6 +72,23 @@ LIGHT = Recipe(
 )
 
 
+# CityGaussianV2: the upper half of its ablation table, from `recipes.ablations.COARSE_BASELINE` to here.
+COARSE = Recipe(
+    about="Pretraining of CityGaussianV2 (Liu et al. 2024): densified by the gradient of SSIM, depth from priors",
+    primitive=Surfel2D(),
+    pretrain=Stage(
+        losses={
+            "l1": L1(),
+            "ssim": SSIM(),
+            "normal": NormalConsistency(weight=0.0125, start=7_000, depth="median"),
+            "depth": DepthRegression(start=0.5, end=0.0025),
+        },
+        signal=LossGradient(terms=("ssim",), boost=0.9),
+        densify=ADC(cull_opacity=0.005, filters=(Elongation(min_ratio=0.01),)),
+    ),
+)
+
+
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
     """The recipes of surfkit."""
@@ -80,4 +99,5 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "absgs": ABSOLUTE,
         "trim2dgs": TRIMMED,
         "lightgaussian": LIGHT,
+        "citygs2-coarse": COARSE,
     }
