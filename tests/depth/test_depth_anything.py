@@ -40,10 +40,10 @@ def weights(tmp_path_factory):
 
 
 def material(folder) -> Material:
-    """One photograph of 60 x 40 pixels."""
-    pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    """One photograph of 120 x 80 pixels."""
+    pixels = np.random.default_rng(0).integers(0, 255, (80, 120, 3), np.uint8)
     Image.fromarray(pixels).save(folder / "a.png")
-    camera = Camera(torch.eye(4, dtype=torch.float64), 50.0, 50.0, 30.0, 20.0, 60, 40)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 60.0, 40.0, 120, 80)
     return Material([View("a.png", camera, folder / "a.png")], NOTHING, torch.device("cpu"), folder)
 
 
