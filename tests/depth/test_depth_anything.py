@@ -34,7 +34,9 @@ def weights(tmp_path_factory):
     torch.manual_seed(1)
     folder = tmp_path_factory.mktemp("weights")
     network = transformers.DepthAnythingForDepthEstimation(config)
-    network.head.conv3.bias.data.fill_(0.5)  # so that not everything is infinitely far
+    for parameter in network.parameters():
+        parameter.data.normal_(0, 0.3)
+    network.head.conv3.bias.data.fill_(5)  # so that not everything is infinitely far
     network.save_pretrained(folder)
     return folder
 
