@@ -34,16 +34,18 @@ def weights(tmp_path_factory):
     torch.manual_seed(1)
     folder = tmp_path_factory.mktemp("weights")
     network = transformers.DepthAnythingForDepthEstimation(config)
-    network.head.conv3.bias.data.fill_(0.5)  # so that not everything is infinitely far
+    for parameter in network.parameters():
+        parameter.data.normal_(0, 0.3)
+    network.head.conv3.bias.data.fill_(5)  # so that not everything is infinitely far
     network.save_pretrained(folder)
     return folder
 
 
 def material(folder) -> Material:
-    """One photograph of 60 x 40 pixels."""
-    pixels = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
+    """One photograph of 120 x 80 pixels."""
+    pixels = np.random.default_rng(0).integers(0, 255, (80, 120, 3), np.uint8)
     Image.fromarray(pixels).save(folder / "a.png")
-    camera = Camera(torch.eye(4, dtype=torch.float64), 50.0, 50.0, 30.0, 20.0, 60, 40)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 60.0, 40.0, 120, 80)
     return Material([View("a.png", camera, folder / "a.png")], NOTHING, torch.device("cpu"), folder)
 
 
