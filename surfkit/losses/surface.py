@@ -7,7 +7,8 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from surfkit.core.schedule import Steps
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import Steps, log_linear
 from surfkit.losses.base import Loss, Sample
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
@@ -20,16 +21,29 @@ class NormalConsistency(Loss):
     reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median", "normal")
 
     weight: float = 0.0125
-    """Share in the objective."""
+    """Share in the objective, from `start` on."""
+
+    end: float | None = None
+    """Share at the last step, reached along a straight line in the logarithm; constant if unset."""
 
     start: Steps = 7_000
-    """First step that counts: a surface must have formed."""
+    """Steps without this term, as a surface must form first; 0 has it from the first step."""
 
     depth: Literal["median", "expected"] = "median"
     """Which rendered depth is the surface."""
 
+    def __post_init__(self) -> None:
+        if self.weight < 0 or (self.end is not None and not (self.weight > 0 and self.end > 0)):
+            raise BadInput(
+                f"the normal loss goes from {self.weight} to {self.end}; weights must be above 0 (or a constant 0)"
+            )
+
     def weight_at(self, index: int, steps: int) -> float:
-        return self.weight if index > self.start else 0.0
+        if index <= self.start:
+            return 0.0
+        if self.end is None:
+            return self.weight
+        return log_linear(self.weight, self.end, (index - self.start) / max(1, steps - self.start))
 
     def __call__(self, maps: Maps, sample: Sample) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()

@@ -2,13 +2,19 @@
 
 import pytest
 
+from surfkit.appearance.base import Appearance
 from surfkit.cli.parse import parse
+from surfkit.cli.recipes import recipes
 from surfkit.cli.train import Train
 from surfkit.core.check import BadInput
+from surfkit.core.registry import components
 from surfkit.densify import CountCap, Elongation, Faint, Trim
+from surfkit.densify.base import Densify, Filter, Prune, Signal
+from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1
 from surfkit.losses.regularizers import MeanOpacity
 from surfkit.losses.surface import Distortion
+from surfkit.primitives.base import Primitive
 
 
 def stage(*words: str):
@@ -67,3 +73,34 @@ def test_words_that_do_not_fit_are_explained_in_a_line(words, said):
 def test_taking_away_a_loss_that_drives_densification_is_refused(tmp_path):
     with pytest.raises(BadInput, match="signal.terms names ssim"):
         stage("--pretrain.signal.terms", "ssim", "pretrain.losses.ssim:none")
+
+
+SLOTS = {
+    Primitive: "primitive",
+    Loss: "pretrain.losses.extra",
+    Regularizer: "pretrain.regularizers.extra",
+    Appearance: "pretrain.appearance",
+    Signal: "pretrain.signal",
+    Densify: "pretrain.densify",
+    Filter: "pretrain.densify.filters.{}",
+    Prune: "pretrain.prune.{}",
+}
+
+
+@pytest.mark.parametrize("recipe", ["3dgs", "citygs2-coarse"])
+def test_every_component_can_be_put_into_a_recipe_by_a_word(recipe):
+    for base, slot in SLOTS.items():
+        assert components(base)
+        for name, cls in components(base).items():
+            at = len(recipes()[recipe].pretrain.densify.filters) if base is Filter else 0
+            word = f"{slot.format(at)}:{name}"
+            made = parse(Train, [f"recipe:{recipe}", word], "surfkit train").recipe
+            for step in slot.format(at).split("."):
+                made = (
+                    made[int(step)]
+                    if step.isdecimal()
+                    else made[step]
+                    if isinstance(made, dict)
+                    else getattr(made, step)
+                )
+            assert isinstance(made, cls), word

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.losses.base import Sample
 from surfkit.raster import native
@@ -134,3 +135,12 @@ def test_weights_begin_after_their_start():
     loss = NormalConsistency(weight=0.05, start=70)
     assert [loss.weight_at(index, 300) for index in (1, 70, 71, 300)] == [0, 0, 0.05, 0.05]
     assert L1().weight_at(1, 300) == 0.8 and math.isclose(SSIM().weight_at(300, 300), 0.2)
+
+
+def test_the_weight_of_normals_starts_late_and_may_fall():
+    constant, falling = NormalConsistency(weight=0.05, start=100), NormalConsistency(weight=0.05, end=0.005, start=100)
+    assert [constant.weight_at(i, 300) for i in (1, 100, 101, 300)] == [0, 0, 0.05, 0.05]
+    assert falling.weight_at(100, 300) == 0 and falling.weight_at(200, 300) == pytest.approx(0.05 * 0.1**0.5)
+    assert falling.weight_at(300, 300) == pytest.approx(0.005)
+    with pytest.raises(BadInput, match="normal loss goes from 0.0 to 0.1"):
+        NormalConsistency(weight=0.0, end=0.1)
