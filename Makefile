@@ -24,7 +24,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard sur
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
 	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev]"
-	$(PY) -m pip install --quiet --no-deps -e plugins/surfkit-ceiling
+	$(PY) -m pip install --quiet --no-deps -e plugins/surfkit-ceiling -e plugins/surfkit-mcmc
 	touch $@
 
 clean:
