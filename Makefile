@@ -17,7 +17,9 @@ lint: $(VENV)/.installed
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
 
 bench: $(VENV)/.installed
-	$(PY) bench/raster.py
+	OMP_WAIT_POLICY=PASSIVE $(PY) bench/raster.py
+	OMP_WAIT_POLICY=PASSIVE $(PY) bench/dgd.py
+	OMP_WAIT_POLICY=PASSIVE $(PY) bench/survey.py
 
 # Reinstalled when what is compiled or declared changes; the Python files are used in place.
 $(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/raster/*.h surfkit/raster/cpu/*.h surfkit/raster/cpu/*.cpp)
