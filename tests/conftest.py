@@ -157,7 +157,7 @@ class Crowded:
         from surfkit.densify.base import Tally
 
         seen = (self.contribution > 0).long()
-        return Tally(self.contribution**alpha_power, 50 * seen, 10 * seen)
+        return Tally(self.contribution**alpha_power, self.contribution**alpha_power, 50 * seen, 10 * seen)
 
     def each(self, alpha_power, transmittance_power):
         for at in range(20):

@@ -21,11 +21,13 @@ class Tally:
     Attributes:
         mean: (N,) mean over the views of the point's mean alpha^a T^b over the pixels it is blended into; a view that
             does not see the point counts as 0 (CityGaussianV2, eq. 4).
+        peak: (N,) the same of the view where it is largest.
         hits: (N,) int64, pixels of all views that the point is blended into.
         views: (N,) int64, views with such a pixel.
     """
 
     mean: Tensor
+    peak: Tensor
     hits: Tensor
     views: Tensor
 

@@ -23,12 +23,13 @@ class Trim(Prune):
     ratio: float = 0.025
     """Share of the points that each trim drops."""
 
-    score: Literal["mean", "released"] = "mean"
-    """Contribution: the mean over pixels and views of alpha^gamma T^(1 - gamma), or the mean of the last records of
-    alpha T over the views in their order, as the released code has it."""
+    score: Literal["mean", "peak", "released"] = "mean"
+    """Contribution: the mean over pixels and views of alpha^gamma T^(1 - gamma), as in the paper; that of the view where
+    it is largest, which spares what few views see, as at the rim of a survey; or the mean of the last records of alpha T
+    over the views in their order, as in the released code."""
 
     gamma: float = 0.5
-    """Power of alpha in the contribution, the rest being that of the transmittance; of the mean alone."""
+    """Power of alpha in the contribution, the rest being that of the transmittance; not of the released one."""
 
     start: Steps = 1_000
     """First step that may trim; before it, only points that no view sees are dropped, at the first step."""
@@ -63,7 +64,8 @@ class Trim(Prune):
     def _scores(self, views: Views) -> Tensor:
         if self.score == "released":
             return released_score(views)
-        return views.survey(self.gamma, 1 - self.gamma).mean
+        tally = views.survey(self.gamma, 1 - self.gamma)
+        return tally.peak if self.score == "peak" else tally.mean
 
 
 def lowest(scores: Tensor, ratio: float) -> Tensor:

@@ -57,11 +57,13 @@ class Survey:
         """See `Views.survey`."""
         powers = (alpha_power, transmittance_power)
         if powers not in self.tallies:
-            mean = torch.zeros_like(self.shape.opacities)
+            mean, peak = torch.zeros_like(self.shape.opacities), torch.zeros_like(self.shape.opacities)
             hits, views = (torch.zeros_like(mean, dtype=torch.int64) for _ in range(2))
             for amount, count in self.each(*powers):
-                mean += amount / count.clamp_min(1)
+                here = amount / count.clamp_min(1)
+                mean += here
+                torch.maximum(peak, here, out=peak)
                 hits += count
                 views += count > 0
-            self.tallies[powers] = Tally(mean / len(self.views), hits, views)
+            self.tallies[powers] = Tally(mean / len(self.views), peak, hits, views)
         return self.tallies[powers]

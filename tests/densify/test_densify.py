@@ -20,7 +20,7 @@ class Everything:
         return 10
 
     def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
-        return Tally(torch.arange(N) / N, torch.full((N,), 100), torch.ones(N, dtype=torch.int64))
+        return Tally(torch.arange(N) / N, torch.arange(N) / N, torch.full((N,), 100), torch.ones(N, dtype=torch.int64))
 
 
 N = 60

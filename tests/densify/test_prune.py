@@ -29,8 +29,8 @@ class Seven:
         yield from zip(AMOUNT * (COUNT > 0), COUNT, strict=True)
 
     def survey(self, alpha_power=0.5, transmittance_power=0.5):
-        mean = (AMOUNT / COUNT.clamp_min(1) * (COUNT > 0)).mean(0)
-        return Tally(mean, COUNT.sum(0), (COUNT > 0).sum(0))
+        each = AMOUNT / COUNT.clamp_min(1) * (COUNT > 0)
+        return Tally(each.mean(0), each.amax(0), COUNT.sum(0), (COUNT > 0).sum(0))
 
 
 def at(crowd, index, since_reset=1_000):
@@ -57,6 +57,12 @@ def test_trim_drops_the_unseen_at_the_first_step_and_then_the_lowest_means(crowd
         np.mean([AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)]) for n in range(200)
     ]  # fmt: skip
     assert set(found.nonzero().flatten().tolist()) == set(np.argsort(mean, kind="stable")[:20].tolist())
+
+
+def test_trim_by_the_view_that_shows_a_point_best(crowd):
+    found = dropped(Trim(ratio=0.1, every=500, score="peak"), crowd, 504 * 2)
+    peak = [max(AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)) for n in range(200)]
+    assert set(found.nonzero().flatten().tolist()) == set(np.argsort(peak, kind="stable")[:20].tolist())
 
 
 def test_trims_end_epochs_and_leave_reset_points_alone(crowd):
