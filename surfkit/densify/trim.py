@@ -24,9 +24,9 @@ class Trim(Prune):
     """Share of the points that each trim drops."""
 
     score: Literal["mean", "peak", "released"] = "mean"
-    """Contribution: the mean over pixels and views of alpha^gamma T^(1 - gamma), as in the paper; that of the view where
-    it is largest, which spares what few views see, as at the rim of a survey; or the mean of the last records of alpha T
-    over the views in their order, as in the released code."""
+    """Contribution: the mean over pixels and views of alpha^gamma T^(1 - gamma), as in the paper; that of the view
+    where it is largest, which spares what few views see, as at the rim of a survey; or the mean of the last records of
+    alpha T over the views in their order, as in the released code."""
 
     gamma: float = 0.5
     """Power of alpha in the contribution, the rest being that of the transmittance; not of the released one."""

@@ -11,6 +11,7 @@ from surfkit.densify import ADC, CountCap, Elongation, LossGradient
 from surfkit.densify.base import Densify, Filter, Policy, Signal, Step, Tally
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
+from surfkit.testing import check_policy
 
 
 class Everything:
@@ -36,7 +37,7 @@ def step(index: int, **other) -> Step:
     splats = Splats("surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, None)
     facts = dict(
         index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), shape=splats, grad=torch.full((N,), 1e-3),
-        radii=torch.ones(N), image_px=100, views=Everything(),
+        radii=torch.ones(N), image_px=100, views=Everything(), since_reset=1_000, rates={"means": 1e-4}, seed=index,
     )  # fmt: skip
     return Step(**(facts | other))
 
@@ -53,17 +54,7 @@ def watched(policy: ADC, points: Points, steps, **other):
 def test_contract_of_every_policy(name):
     policy, points = components(Policy)[name](), scene()
     for index in (1, 599, 600, 3000, 3100, 29_999):
-        now = step(index)
-        policy.watch(points, now)
-        before = {k: v.clone() for group in vars(points).values() for k, v in group.items()}
-        first, second = policy.edit(points, now), policy.edit(points, now)
-        assert {k for group in vars(points).values() for k in group} == before.keys()
-        assert all(torch.equal(v, before[k]) for g in (points.params, points.stats) for k, v in g.items())
-        assert (first is None) == (second is None)
-        for mask in ("drop", "clone", "split"):
-            a, b = (getattr(edit, mask, None) for edit in (first, second))
-            if a is not None:
-                assert a.dtype == torch.bool and a.shape == (N,) and torch.equal(a, b)
+        check_policy(policy, points, step(index))
 
 
 @pytest.mark.parametrize("base", [Densify, Signal])
