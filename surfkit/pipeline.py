@@ -28,11 +28,11 @@ from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.recipe import Recipe
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import Priors, read_priors
 from surfkit.scene.photos import Photos
 from surfkit.scene.ply import write_splats
+from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
 from surfkit.train.interrupt import graceful
@@ -96,7 +96,7 @@ def run(
     this = Run(out, recipe, replace(data, path=data.path.resolve()))
     refuse_other(this)
     with noted() as notes:
-        scene = colmap.read(this.data)
+        scene = read(this.data)
         rasterizer, backend = drawer(device)
         state = saved(this, scene)
         warn_of_gaps(scene, state)
@@ -266,7 +266,7 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
     record = read_json(out / "run.json", Any)
     this = Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
-    scene = colmap.read(this.data)
+    scene = read(this.data)
     state = saved(this, scene)
     steps = this.recipe.pretrain.steps
     if state is None or state.index < steps:

@@ -14,11 +14,11 @@ from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.scene import colmap
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import DepthFile, find_maps, read_record
 from surfkit.scene.observations import Observations
+from surfkit.scene.read import model_folder, observations
 from surfkit.scene.scene import Scene, View
 
 BUDGET_BYTES = 2**30
@@ -101,13 +101,13 @@ def read_priors(data: Data, scene: Scene) -> Priors | None:
 
     Photographs without a map, or with one that cannot be used, are listed in one warning.
     """
-    maps = find_maps(data.path, colmap.model_folder(data.path), [view.name for view in scene.train])
+    maps = find_maps(data.path, model_folder(data), [view.name for view in scene.train])
     if not maps:
         emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
         return None
-    observations = colmap.observations(data, scene.frame)
+    tracks = observations(data, scene)
     with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), observations, scene), scene.train))
+        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
     for at in _outliers(fits):
@@ -119,7 +119,7 @@ def read_priors(data: Data, scene: Scene) -> Priors | None:
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
     _warn_of_leaks(data, scene)
-    return Priors(scene.train, fits, typical_inverse_depth(scene.train, observations, scene))
+    return Priors(scene.train, fits, typical_inverse_depth(scene.train, tracks, scene))
 
 
 def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:

@@ -31,7 +31,7 @@ class Photos:
             threads: Decoders; as many as there are cores, 4 at most, by default.
         """
         pool = ThreadPoolExecutor(threads or min(4, os.cpu_count() or 1), thread_name_prefix="photo")
-        self._decoded = [pool.submit(read_photo, view.path, (view.camera.width, view.camera.height)) for view in views]
+        self._decoded = [pool.submit(view_photo, view) for view in views]
         pool.shutdown(wait=False)
         self._stop = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
 
@@ -51,36 +51,42 @@ class Photos:
         self._stop()
 
 
+def view_photo(view: View) -> Tensor:
+    """(3, H, W) uint8 of the photograph of a view, at the size of its camera."""
+    return read_photo(view.path, (view.camera.width, view.camera.height), view.white)
+
+
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, as stored: the rotation in EXIF is not applied, as COLMAP does not apply it.
 
     Raises:
         BadInput: The file is no picture that Pillow reads.
     """
-    return _opened(path, lambda image: image.size)
+    return opened(path, lambda image: image.size)
 
 
-def read_photo(path: Path, size: tuple[int, int]) -> Tensor:
-    """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter. Alpha lies over black.
+def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
+    """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter.
 
     Args:
-        path: Any 8-bit picture that Pillow reads, or a 16-bit grey one.
+        path: Any picture of 8 or 16 bits that Pillow reads.
         size: Width and height wanted.
+        white: Whether transparent pixels lie over white, or over black.
 
     Raises:
         BadInput: The file is damaged or holds another kind of pixel.
     """
 
     def decode(image: Image.Image) -> np.ndarray:
-        plain = _rgb(image, path)
+        plain = _rgb(image, path, 255 if white else 0)
         if plain.size != size:
             plain = plain.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
         return np.array(plain)
 
-    return torch.from_numpy(_opened(path, decode)).permute(2, 0, 1).contiguous()
+    return torch.from_numpy(opened(path, decode)).permute(2, 0, 1).contiguous()
 
 
-def _rgb(image: Image.Image, path: Path) -> Image.Image:
+def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
         grey = np.asarray(image).astype(np.int64).clip(0, 65535)
         return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
@@ -88,11 +94,11 @@ def _rgb(image: Image.Image, path: Path) -> Image.Image:
         raise BadInput(f"{path}: pixels are floating point; convert it to 8 bits, for example to PNG")
     if "A" in image.getbands() or "a" in image.getbands() or "transparency" in image.info:
         image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image).convert("RGB")
+        return Image.alpha_composite(Image.new("RGBA", image.size, (under, under, under, 255)), image).convert("RGB")
     return image.convert("RGB")
 
 
-def _opened(path: Path, use: Callable[[Image.Image], T]) -> T:
+def opened(path: Path, use: Callable[[Image.Image], T]) -> T:
     """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput."""
     try:
         with Image.open(path) as image:

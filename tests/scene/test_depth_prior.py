@@ -12,11 +12,12 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.pipeline import noted
-from surfkit.scene import colmap
+from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import confidence_path, find_maps, map_path, write_map, write_record
 from surfkit.scene.depth_prior import Priors, read_priors, resized
+from surfkit.scene.read import observations
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 
@@ -34,7 +35,7 @@ def farm(made, tmp_path):
     """A copy to write maps into: its data, scene, and exact inverse depth by name, 1/input units."""
     folder, truth = made
     data = Data(Path(shutil.copytree(folder, tmp_path / "farm")))
-    scene = colmap.read(data)
+    scene = scenes.read(data)
     exact = {name: (truth.scene.frame.scale / e.depth.clamp_min(1e-9)).numpy() for name, e in truth.exact.items()}
     return data, scene, {name: np.where(truth.exact[name].depth > 0, inv, 0) for name, inv in exact.items()}
 
@@ -65,15 +66,15 @@ def check_exact(priors, scene, exact, share=2e-3):
 
 def test_tracks_project_to_where_they_are_observed(farm):
     data, scene, exact = farm
-    observations = colmap.observations(data, scene.frame)
+    tracks = observations(data, scene)
     for view in scene.train:
-        seen, camera = observations.seen[view.name], view.camera
+        seen, camera = tracks.seen[view.name], view.camera
         pose = camera.world_to_camera.numpy()
-        local = observations.xyz[seen.points] @ pose[:3, :3].T + pose[:3, 3]
+        local = tracks.xyz[seen.points] @ pose[:3, :3].T + pose[:3, 3]
         x = (camera.fx * local[:, 0] / local[:, 2] + camera.cx) / camera.width
         y = (camera.fy * local[:, 1] / local[:, 2] + camera.cy) / camera.height
         assert len(x) > 20 and np.abs(np.stack([x, y], 1) - seen.at).max() < 1e-4
-        at, inverse = observations.of(view)
+        at, inverse = tracks.of(view)
         error = np.abs(sample(exact[view.name], at) / scene.frame.scale / inverse - 1)
         assert np.median(error) < 0.01  # the map is sampled at pixels; points are anywhere
 
@@ -117,7 +118,7 @@ def test_relative_maps_are_aligned(farm):
     priors, notes = read(data, scene)
     assert notes == []
     check_exact(priors, scene, exact, share=0.03)  # sparse points are not at the centres of pixels
-    depths = [colmap.observations(data, scene.frame).of(view)[1] for view in scene.train]
+    depths = [observations(data, scene).of(view)[1] for view in scene.train]
     assert priors[0].typical == pytest.approx(float(np.median([np.median(c) for c in depths])))
 
 
