@@ -197,3 +197,30 @@ def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
     assert this.recipe == recipe and this.data == data and state.index == STEPS and len(scene.train) == 10
     with pytest.raises(BadInput, match="no run folder"):
         load_run(tmp_path)
+
+
+def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path):
+    metrics = run(recipe, data, tmp_path, cache="20KB")  # two photographs of 64 x 48
+    assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
+    assert metrics["images"] == finished[1]["images"]
+    with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
+        run(recipe, data, tmp_path, cache="lots")
+
+
+def test_masks_train_end_to_end(data, recipe, tmp_path):
+    """What is under the masks makes no difference, in training or in the metrics."""
+    clouds, metrics = [], []
+    for value in (0, 255):
+        folder = tmp_path / str(value)
+        shutil.copytree(data.path, folder)
+        for path in (folder / "images").iterdir():
+            pixels = np.array(Image.open(path))
+            pixels[10:30, 20:40] = value
+            Image.fromarray(pixels).save(path)
+            mask = np.full((48, 64), 255, np.uint8)
+            mask[10:30, 20:40] = 0
+            (folder / "masks").mkdir(exist_ok=True)
+            Image.fromarray(mask).save(folder / "masks" / path.name)
+        metrics.append(run(with_steps(recipe, 20), Data(folder), tmp_path / f"run-{value}")["images"])
+        clouds.append((tmp_path / f"run-{value}" / "point_cloud.ply").read_bytes())
+    assert clouds[0] == clouds[1] and metrics[0] == metrics[1]

@@ -78,6 +78,10 @@ class Train:
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints."""
 
+    cache: str = "auto"
+    """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
+    does not depend on it."""
+
     folder: tyro.conf.Suppress[str] = ""
 
     def __post_init__(self) -> None:
@@ -92,7 +96,7 @@ class Train:
         data = Data(self._data(), self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
-        metrics = run(recipe, data, out, self.device, self.checkpoint_every)
+        metrics = run(recipe, data, out, self.device, self.checkpoint_every, self.cache)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -12,8 +12,10 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.scene.cache import Cache
 from surfkit.scene.capture import Shot
 from surfkit.scene.photos import opened, photo_size
+from surfkit.scene.scene import View
 
 FOLDER = "masks"
 MARKS = (".mask", "_mask")
@@ -71,6 +73,23 @@ def read_mask(path: Path, size: tuple[int, int]) -> Tensor:
     most = int(values.max(initial=0))
     half = 0 if most <= 1 else 127 if most <= 255 else 32767
     return torch.from_numpy(values > half)
+
+
+def mask_cache(views: Sequence[View], budget_bytes: int | None = None) -> Cache[Tensor | None] | None:
+    """The masks of views by position, (H, W) bool or None; None if no view has one."""
+    if not any(view.mask for view in views):
+        return None
+    return Cache(lambda at: view_mask(views[at]), mask_sizes(views), budget_bytes)
+
+
+def mask_sizes(views: Sequence[View]) -> list[int]:
+    """Bytes of the mask of each view."""
+    return [view.camera.width * view.camera.height if view.mask else 0 for view in views]
+
+
+def view_mask(view: View) -> Tensor | None:
+    """(H, W) bool of the mask of a view, if it has one, at the size of its camera."""
+    return None if view.mask is None else read_mask(view.mask, (view.camera.width, view.camera.height))
 
 
 def check_mask(path: Path, size: tuple[int, int]) -> None:

@@ -1,11 +1,8 @@
-"""Photographs as tensors, reduced to the size of their cameras and kept in memory."""
+"""Photographs as tensors, reduced to the size of their cameras."""
 
 from __future__ import annotations
 
-import os
-import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,40 +12,16 @@ from PIL import Image
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
 
 
-class Photos:
-    """The photographs of `views` by position, decoded ahead by a few threads and kept as uint8."""
-
-    def __init__(self, views: Sequence[View], threads: int | None = None) -> None:
-        """Start decoding, in the order of `views`.
-
-        Args:
-            views: What will be asked for.
-            threads: Decoders; as many as there are cores, 4 at most, by default.
-        """
-        pool = ThreadPoolExecutor(threads or min(4, os.cpu_count() or 1), thread_name_prefix="photo")
-        self._decoded = [pool.submit(view_photo, view) for view in views]
-        pool.shutdown(wait=False)
-        self._stop = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
-
-    def __len__(self) -> int:
-        return len(self._decoded)
-
-    def __getitem__(self, at: int, /) -> Tensor:
-        """(3, H, W) uint8; waits until it is decoded.
-
-        Raises:
-            BadInput: The photograph is damaged.
-        """
-        return self._decoded[at].result()
-
-    def close(self) -> None:
-        """Decode no further photographs."""
-        self._stop()
+def photo_cache(views: Sequence[View], budget_bytes: int | None = None, threads: int | None = None) -> Cache[Tensor]:
+    """The photographs of views by position, (3, H, W) uint8."""
+    sizes = [3 * view.camera.width * view.camera.height for view in views]
+    return Cache(lambda at: view_photo(views[at]), sizes, budget_bytes, threads)
 
 
 def view_photo(view: View) -> Tensor:

@@ -16,7 +16,7 @@ from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import confidence_path, find_maps, map_path, write_map, write_record
-from surfkit.scene.depth_prior import Priors, read_priors, resized
+from surfkit.scene.depth_prior import read_priors, resized
 from surfkit.scene.read import observations
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
@@ -265,17 +265,15 @@ def test_resizing_is_smooth_on_surfaces_and_sharp_between_them():
     assert resized(inverse, (8, 12)) is inverse
 
 
-def test_memory_is_bounded_and_priors_are_read_when_asked_for(farm):
+def test_memory_is_bounded_and_priors_are_read_ahead(farm):
     data, scene, exact = farm
     relative(data, exact)
-    priors, _ = read(data, scene)
-    one = 2 * 4 * 64 * 48
-    small = Priors(priors.views, priors.fits, priors.typical, budget_bytes=2 * one)
-    first = small[0]
-    assert small[0] is first
+    budget = 2 * 2 * 4 * 64 * 48
+    everything, small = (read_priors(data, scene, most) for most in (None, budget))
     for at in range(len(small)):
-        assert small[at] is not None and len(small._kept) <= 2
-    assert small[0] is not first and torch.equal(small[0].inverse, first.inverse)
-    camera = replace(scene.train[0].camera.resized(32, 24))
-    half = Priors([replace(scene.train[0], camera=camera)], priors.fits[:1], priors.typical)[0]
-    assert half.inverse.shape == half.confidence.shape == (24, 32)
+        assert torch.equal(small[at].inverse, everything[at].inverse)
+        assert torch.equal(small[at].confidence, everything[at].confidence)
+        assert small.bytes <= budget
+    half = replace(scene.train[0], camera=scene.train[0].camera.resized(32, 24))
+    smaller = read_priors(data, replace(scene, train=(half, *scene.train[1:])))[0]
+    assert smaller.inverse.shape == smaller.confidence.shape == (24, 32)

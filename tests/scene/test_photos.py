@@ -9,7 +9,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.scene.photos import Photos, photo_size, read_photo
+from surfkit.scene.photos import photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 
 
@@ -80,7 +80,7 @@ def test_the_rotation_in_exif_is_not_applied(tmp_path):
 
 def test_by_position_in_the_size_of_the_camera(tmp_path):
     paths = [save(tmp_path / f"{i}.png", np.full((6, 8, 3), i * 10, np.uint8)) for i in range(5)]
-    photos = Photos([view(path, 4, 3) for path in paths], threads=2)
+    photos = photo_cache([view(path, 4, 3) for path in paths], threads=2)
     assert len(photos) == 5
     for i in (3, 0, 4, 3, -1):
         assert photos[i].shape == (3, 3, 4) and (photos[i] == i % 5 * 10).all()
@@ -91,7 +91,7 @@ def test_a_damaged_photograph_is_named(tmp_path):
     whole = save(tmp_path / "whole.jpg", stripes(64, 48))
     cut = tmp_path / "cut.jpg"
     cut.write_bytes(whole.read_bytes()[:700])
-    photos = Photos([view(whole, 64, 48), view(cut, 64, 48)])
+    photos = photo_cache([view(whole, 64, 48), view(cut, 64, 48)])
     assert photos[0].shape == (3, 48, 64)
     with pytest.raises(BadInput, match="cut.jpg: not a whole picture: .*truncated") as error:
         photos[1]
