@@ -6,5 +6,7 @@ from surfkit.core.registry import hookimpl
 @hookimpl
 def surfkit_components():
     from surfkit.scene.colmap import COLMAP
+    from surfkit.scene.opensfm import ODM
+    from surfkit.scene.transforms import Blender, MatrixCity, Nerfstudio
 
-    return {"colmap": COLMAP}
+    return {"blender": Blender, "colmap": COLMAP, "matrixcity": MatrixCity, "nerfstudio": Nerfstudio, "odm": ODM}

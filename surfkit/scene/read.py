@@ -32,7 +32,11 @@ def read(data: Data) -> Scene:
     Raises:
         BadInput: Something is missing, damaged, or of a kind that is not supported; one line says what to do.
     """
-    capture = reader_of(data).read(data)
+    reader = reader_of(data)
+    if data.layout is None and len(fitting := _fitting(data.path)) > 1:
+        others = ", ".join(name for name, other in fitting.items() if other != reader)
+        emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+    capture = reader.read(data)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
@@ -56,14 +60,17 @@ def reader_of(data: Data) -> Reader:
         raise BadInput(f"{root}: the folder is empty; {_wanted()}")
     if data.layout is not None:
         return find(Reader, data.layout)()
-    fitting = {name: cls() for name, cls in components(Reader).items() if cls().recognises(root)}
-    if "colmap" in fitting and len(fitting) > 1:  # it has the points and their observations
-        others = ", ".join(name for name in fitting if name != "colmap")
-        emit(Warned(f"{root}: read as COLMAP; it could also be read with --layout {others}"))
+    fitting = _fitting(root)
+    if "colmap" in fitting:  # it has the points and their observations
         return fitting["colmap"]
     if len(fitting) > 1:
         raise BadInput(f"{root}: could be of layout {' or '.join(fitting)}; choose one with --layout")
     return next(iter(fitting.values()), COLMAP())
+
+
+def _fitting(root: Path) -> dict[str, Reader]:
+    """The readers that recognise a folder, by name."""
+    return {name: cls() for name, cls in components(Reader).items() if cls().recognises(root)}
 
 
 def observations(data: Data, scene: Scene) -> Observations:
