@@ -133,7 +133,8 @@ def refuse_other(this: Run) -> None:
         if not path.exists():
             continue
         there = read_json(path, Any)
-        found = difference(there if key is None else there.get(key), dump(value), key or "")
+        before = there if key is None else dump(load(Data, there.get(key), key))  # with the defaults of newer settings
+        found = difference(before, dump(value), key or "")
         if found is not None:
             at, old, new = found
             raise BadInput(

@@ -68,7 +68,7 @@ def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
     if "A" in image.getbands() or "a" in image.getbands() or "transparency" in image.info:
         image = image.convert("RGBA")
         return Image.alpha_composite(Image.new("RGBA", image.size, (under, under, under, 255)), image).convert("RGB")
-    return image.convert("RGB")
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
 def opened(path: Path, use: Callable[[Image.Image], T]) -> T:
