@@ -11,9 +11,9 @@ from surfkit.pipeline import with_steps
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.recipe import Recipe
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
-from surfkit.scene.photos import Photos
+from surfkit.scene.photos import photo_cache
+from surfkit.scene.read import read
 from surfkit.train.stage import StageState, Trainer
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"
@@ -21,10 +21,10 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"
 
 def halfway(recipe: Recipe, steps: int, scale: float = 2.0) -> tuple[Trainer, StageState]:
     """A trainer of `recipe` in a run of `steps` steps, and its state after half of them."""
-    scene = colmap.read(Data(EXAMPLE, scale=scale))
+    scene = read(Data(EXAMPLE, scale=scale))
     recipe = with_steps(recipe, steps)
     rasterizer, _ = select("cpu")
-    trainer = Trainer(recipe.pretrain, recipe.primitive, scene.train, Photos(scene.train), rasterizer)
+    trainer = Trainer(recipe.pretrain, recipe.primitive, scene.train, photo_cache(scene.train), rasterizer)
     generator = torch.Generator().manual_seed(0)
     state = trainer.begin(Points.fresh(recipe.primitive.init(scene.cloud, generator)), generator)
     for done in trainer.run(state):

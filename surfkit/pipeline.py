@@ -6,7 +6,7 @@ import json
 import platform
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,11 +28,14 @@ from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.recipe import Recipe
-from surfkit.scene import colmap
+from surfkit.scene.cache import Cache, share
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import Priors, read_priors
-from surfkit.scene.photos import Photos
+from surfkit.scene.masks import mask_cache, mask_sizes
+from surfkit.scene.memory import cache_bytes
+from surfkit.scene.photos import photo_cache
 from surfkit.scene.ply import write_splats
+from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
 from surfkit.train.interrupt import graceful
@@ -85,9 +88,16 @@ def with_steps(recipe: Recipe, steps: int) -> Recipe:
 
 
 def run(
-    recipe: Recipe, data: Data, out: Path, device: Device = "auto", checkpoint_every: int = CHECKPOINT_EVERY
+    recipe: Recipe,
+    data: Data,
+    out: Path,
+    device: Device = "auto",
+    checkpoint_every: int = CHECKPOINT_EVERY,
+    cache: str = "auto",
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
+
+    `cache` is the memory for photographs, masks and depth priors, such as "4GB"; the result does not depend on it.
 
     Raises:
         BadInput: `out` holds a run of another recipe or of other data, or the data cannot be used.
@@ -95,23 +105,23 @@ def run(
     """
     this = Run(out, recipe, replace(data, path=data.path.resolve()))
     refuse_other(this)
+    budget = cache_bytes(cache)
     with noted() as notes:
-        scene = colmap.read(this.data)
+        scene = read(this.data)
         rasterizer, backend = drawer(device)
         state = saved(this, scene)
         warn_of_gaps(scene, state)
         unfinished = state is None or state.index < recipe.pretrain.steps
-        priors = depth_priors(this, scene) if unfinished else None
         claim(this, backend, notes)
         if unfinished:
             discard(this.metrics, this.cloud)
-            state = optimise(this, scene, rasterizer, state, checkpoint_every, priors)
+            state = optimise(this, scene, rasterizer, state, checkpoint_every, read_ahead(this, scene, budget))
         elif this.metrics.exists() and this.cloud.exists():
             say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
             return read_json(this.metrics, Any)
         if not this.cloud.exists():
             export(this, state, scene)
-        return evaluate(this, state, scene, rasterizer)
+        return evaluate(this, state, scene, rasterizer, budget)
 
 
 def refuse_other(this: Run) -> None:
@@ -123,7 +133,8 @@ def refuse_other(this: Run) -> None:
         if not path.exists():
             continue
         there = read_json(path, Any)
-        found = difference(there if key is None else there.get(key), dump(value), key or "")
+        before = there if key is None else dump(load(Data, there.get(key), key))  # with the defaults of newer settings
+        found = difference(before, dump(value), key or "")
         if found is not None:
             at, old, new = found
             raise BadInput(
@@ -178,10 +189,34 @@ def saved(this: Run, scene: Scene) -> StageState | None:
     return state
 
 
-def depth_priors(this: Run, scene: Scene) -> Priors | None:
-    """Estimated depths of the training photographs, if a loss of the recipe needs them and the data set has any."""
+@dataclass(frozen=True)
+class Material:
+    """What training looks at, by position of the view.
+
+    Attributes:
+        photos: (3, H, W) uint8.
+        masks: (H, W) bool or None.
+        priors: Estimated depths, if a loss of the recipe needs them and the data set has any.
+    """
+
+    photos: Cache[Tensor]
+    masks: Cache[Tensor | None] | None = None
+    priors: Priors | None = None
+
+    def expect(self, coming: Sequence[int]) -> None:
+        """Read in this order from now on."""
+        for cache in filter(None, (self.photos, self.masks, self.priors)):
+            cache.expect(coming)
+
+
+def read_ahead(this: Run, scene: Scene, budget_bytes: int) -> Material:
+    """The photographs, masks and depth priors of the training views, within a number of bytes."""
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     needed = any(loss.needs_prior for loss in this.recipe.pretrain.losses.values())
-    return read_priors(this.data, scene) if needed else None
+    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
+    for_photos, for_masks, for_priors = share(budget_bytes, wanted)
+    priors = read_priors(this.data, scene, for_priors) if needed else None
+    return Material(photo_cache(scene.train, for_photos), mask_cache(scene.train, for_masks), priors)
 
 
 def optimise(
@@ -190,11 +225,12 @@ def optimise(
     rasterizer: Rasterizer,
     state: StageState | None,
     checkpoint_every: int,
-    priors: Priors | None = None,
+    given: Material,
 ) -> StageState:
     """Run the stage from its last state, or from the sparse points, to its end."""
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
-    trainer = Trainer(stage, primitive, scene.train, Photos(scene.train), rasterizer, priors)
+    sources = (given.photos, rasterizer, given.priors, given.masks, given.expect)
+    trainer = Trainer(stage, primitive, scene.train, *sources)
     if state is None:
         generator = torch.Generator().manual_seed(this.recipe.seed)
         state = trainer.begin(Points.fresh(primitive.init(scene.cloud, generator)), generator)
@@ -225,7 +261,9 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     emit(FileWritten(this.cloud, "points"))
 
 
-def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer) -> dict[str, Any]:
+def evaluate(
+    this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int | None = None
+) -> dict[str, Any]:
     """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
     degree = min(primitive.sh_degree, state.index // stage.sh_every)
@@ -240,8 +278,15 @@ def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer)
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
 
-    photos, changing = Photos(scene.held_out), stage.appearance is not None
-    measured = evaluate_views(scene.held_out, photos, draw, timed=colors, show=show, correct_color=changing)
+    measured = evaluate_views(
+        scene.held_out,
+        photo_cache(scene.held_out, budget_bytes),
+        draw,
+        timed=colors,
+        show=show,
+        correct_color=stage.appearance is not None,
+        masks=mask_cache(scene.held_out, budget_bytes),
+    )
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
@@ -266,7 +311,7 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
     record = read_json(out / "run.json", Any)
     this = Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
-    scene = colmap.read(this.data)
+    scene = read(this.data)
     state = saved(this, scene)
     steps = this.recipe.pretrain.steps
     if state is None or state.index < steps:

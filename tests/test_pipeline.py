@@ -15,9 +15,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
 from surfkit.pipeline import load_run, run, with_steps
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
+from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 STEPS = 60
@@ -61,7 +61,7 @@ def test_a_run_leaves_everything_behind(finished, data, recipe):
 
 def test_points_are_in_the_frame_of_the_input(finished, data):
     out, metrics = finished
-    table, scene = read_splats(out / "point_cloud.ply"), colmap.read(data)
+    table, scene = read_splats(out / "point_cloud.ply"), read(data)
     assert table.kind == "surfel" and len(table) == metrics["points"] > 300
     truth = scene.frame.to_input(scene.cloud.xyz.numpy())
     for share in (10, 50, 90):
@@ -166,13 +166,13 @@ def test_without_held_out_photographs_the_metrics_say_so(data, recipe, tmp_path,
 
 
 def test_warnings_of_a_run_become_notes_once(data, recipe, tmp_path, monkeypatch):
-    read = colmap.read
+    original = pipeline.read
 
     def warning(given):
         emit(Warned("the scene is odd"))
-        return read(given)
+        return original(given)
 
-    monkeypatch.setattr(colmap, "read", warning)
+    monkeypatch.setattr(pipeline, "read", warning)
     for _ in range(2):
         run(with_steps(recipe, 1), data, tmp_path)
         assert json.loads((tmp_path / "run.json").read_text())["notes"] == ["the scene is odd"]
@@ -180,8 +180,8 @@ def test_warnings_of_a_run_become_notes_once(data, recipe, tmp_path, monkeypatch
 
 def test_photographs_that_are_no_longer_there_are_noticed(data, recipe, tmp_path, monkeypatch):
     run(with_steps(recipe, 2), data, tmp_path)
-    scene = colmap.read(data)
-    monkeypatch.setattr(colmap, "read", lambda given: replace(scene, train=scene.train[1:]))
+    scene = read(data)
+    monkeypatch.setattr(pipeline, "read", lambda given: replace(scene, train=scene.train[1:]))
     with pytest.raises(BadInput, match="trained on 10 photographs and .* now gives 9"):
         run(with_steps(recipe, 2), data, tmp_path)
 
@@ -197,3 +197,30 @@ def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
     assert this.recipe == recipe and this.data == data and state.index == STEPS and len(scene.train) == 10
     with pytest.raises(BadInput, match="no run folder"):
         load_run(tmp_path)
+
+
+def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path):
+    metrics = run(recipe, data, tmp_path, cache="20KB")  # two photographs of 64 x 48
+    assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
+    assert metrics["images"] == finished[1]["images"]
+    with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
+        run(recipe, data, tmp_path, cache="lots")
+
+
+def test_masks_train_end_to_end(data, recipe, tmp_path):
+    """What is under the masks makes no difference, in training or in the metrics."""
+    clouds, metrics = [], []
+    for value in (0, 255):
+        folder = tmp_path / str(value)
+        shutil.copytree(data.path, folder)
+        for path in (folder / "images").iterdir():
+            pixels = np.array(Image.open(path))
+            pixels[10:30, 20:40] = value
+            Image.fromarray(pixels).save(path)
+            mask = np.full((48, 64), 255, np.uint8)
+            mask[10:30, 20:40] = 0
+            (folder / "masks").mkdir(exist_ok=True)
+            Image.fromarray(mask).save(folder / "masks" / path.name)
+        metrics.append(run(with_steps(recipe, 20), Data(folder), tmp_path / f"run-{value}")["images"])
+        clouds.append((tmp_path / f"run-{value}" / "point_cloud.ply").read_bytes())
+    assert clouds[0] == clouds[1] and metrics[0] == metrics[1]

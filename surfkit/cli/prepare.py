@@ -21,10 +21,10 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.prepare import Preparation, Prepared
 from surfkit.evaluate.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import FOLDER, DepthFile, map_path
 from surfkit.scene.photos import read_photo
+from surfkit.scene.read import read
 from surfkit.scene.scene import View
 
 SHOWN = 4
@@ -40,7 +40,7 @@ class Depth:
     """
 
     data: Annotated[Path, tyro.conf.Positional]
-    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse."""
+    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
     estimator: Annotated[DepthEstimator, choice(DepthEstimator)] = PlaneSweep()
     """How depth is estimated."""
@@ -63,14 +63,24 @@ class Depth:
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
+    masks: Path | None = None
+    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
+
+    layout: str | None = None
+    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
+
+    white: bool = False
+    """Lay transparent pixels of photographs over white instead of black."""
+
     device: Device = "auto"
     """Where to compute."""
 
     def run(self) -> None:
         """Estimate, and show what came out."""
-        data = Data(self.data, self.scale, self.longest, self.test_every, self.test_list, self.images)
+        split = (self.test_every, self.test_list)
+        data = Data(self.data, self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
-        scene = colmap.read(data)
+        scene = read(data)
         if notice := self.estimator.notice():
             print(f"note: {notice}", file=sys.stderr)
         given = preparation.material(scene)

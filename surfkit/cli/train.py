@@ -39,8 +39,8 @@ class Train:
     """What to do."""
 
     data: Path | None = None
-    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse. By default the
-    bundled example, a farm photographed from a kite."""
+    """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another
+    layout. By default the bundled example, a farm photographed from a kite."""
 
     out: Path | None = None
     """Run folder; runs/DATA-RECIPE by default."""
@@ -63,11 +63,24 @@ class Train:
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
+    masks: Path | None = None
+    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
+
+    layout: str | None = None
+    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
+
+    white: bool = False
+    """Lay transparent pixels of photographs over white instead of black."""
+
     device: Device = "auto"
     """Where to compute."""
 
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints."""
+
+    cache: str = "auto"
+    """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
+    does not depend on it."""
 
     folder: tyro.conf.Suppress[str] = ""
 
@@ -79,10 +92,11 @@ class Train:
 
     def run(self) -> None:
         """Train, and show what came out."""
-        data = Data(self._data(), self.scale, self.longest, self.test_every, self.test_list, self.images)
+        split = (self.test_every, self.test_list)
+        data = Data(self._data(), self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
-        metrics = run(recipe, data, out, self.device, self.checkpoint_every)
+        metrics = run(recipe, data, out, self.device, self.checkpoint_every, self.cache)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -16,9 +16,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, Estimate, Material
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import FOLDER, confidence_path, map_path, read_record, write_map, write_record
+from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene, View
 
 TRUSTED = 0.5
@@ -69,13 +69,13 @@ class Preparation:
         Raises:
             BadInput: The sparse model does not tell which photographs to compare.
         """
-        observations = colmap.observations(self.data, scene.frame)
-        if self.estimator.matched and not any(len(seen.points) for seen in observations.seen.values()):
+        tracks = observations(self.data, scene)
+        if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(
                 f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
                 "triangulate it in COLMAP"
             )
-        return Material(self.views(scene), observations, self.device, self.work)
+        return Material(self.views(scene), tracks, self.device, self.work)
 
     def begin(self, scene: Scene, again: bool) -> list[int]:
         """Positions of the views that are still to be estimated.

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.raster.api import Maps
-from surfkit.raster.ssim import ssim
+from surfkit.raster.ssim import ssim, ssim_map
 from surfkit.scene.scene import View
 
 Draw = Callable[[View], Maps]
@@ -31,26 +31,40 @@ class Pictures(Protocol):
         """(3, H, W) uint8."""
 
 
-def psnr(render: Tensor, photo: Tensor) -> float:
+def psnr(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
     """Peak signal-to-noise ratio in dB for a peak of 1, at most 100.
 
     Args:
         render: (3, H, W), clamped to [0, 1] first, as a screen shows it.
         photo: (3, H, W) in [0, 1].
+        mask: (H, W) bool, False where pixels do not count.
     """
-    error = (render.clamp(0, 1).double() - photo.double()).square().mean()
+    errors = (render.clamp(0, 1).double() - photo.double()).square()
+    error = errors.mean() if mask is None else errors[:, mask].mean()
     return float(-10 * error.clamp_min(SMALLEST).log10())
 
 
-def color_corrected(render: Tensor, photo: Tensor) -> Tensor:
+def similarity(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
+    """Mean structural similarity of (3, H, W) images in [0, 1].
+
+    With a mask (H, W), the mean over the windows around pixels that count, in which the others are alike.
+    """
+    if mask is None:
+        return float(ssim(render, photo))
+    return float(ssim_map(render, torch.where(mask, photo, render))[:, mask].mean())
+
+
+def color_corrected(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
     """The render after the affine change of colour that brings it closest to the photograph, both (3, H, W).
 
-    For photographs of changing exposure: what a held-out one's own exposure was is not known from training.
+    For photographs of changing exposure: what a held-out one's own exposure was is not known from training. With a
+    mask (H, W) bool, only pixels where it is True decide.
     """
     colors, wanted = render.flatten(1).double().T, photo.flatten(1).double().T
     inputs = torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
-    damped = inputs.T @ inputs + 1e-9 * torch.eye(4).to(inputs)  # a render of one colour has no unique answer
-    change = torch.linalg.solve(damped, inputs.T @ wanted)
+    known = slice(None) if mask is None else mask.flatten()
+    damped = inputs[known].T @ inputs[known] + 1e-9 * torch.eye(4).to(inputs)  # one colour has no unique answer
+    change = torch.linalg.solve(damped, inputs[known].T @ wanted[known])
     return (inputs @ change).T.reshape(render.shape).to(render)
 
 
@@ -62,6 +76,7 @@ def evaluate_views(
     timed: Draw | None = None,
     show: Show | None = None,
     correct_color: bool = False,
+    masks: Sequence[Tensor | None] | None = None,
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
@@ -72,19 +87,28 @@ def evaluate_views(
         timed: Makes the renders whose speed counts, where it is not `draw`: colours only, for one.
         show: Called once a view, to write pictures.
         correct_color: Also measure "psnr_corrected", of `color_corrected` renders.
+        masks: Which pixels count, by position in `views`; a view without any is shown but not measured.
     """
     per_image = {}
     for at, view in enumerate(views):
         photo, maps = photos[at], draw(view)
-        render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
-        per_image[view.name] = {"psnr": psnr(render, target), "ssim": float(ssim(render, target))}
-        if correct_color:
-            per_image[view.name]["psnr_corrected"] = psnr(color_corrected(render, target), target)
+        mask = None if masks is None else masks[at]
+        if mask is None or mask.any():
+            render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
+            per_image[view.name] = _measured(render, target, mask, correct_color)
         if show is not None:
             show(view, photo, maps)
     names = ("psnr", "ssim", *["psnr_corrected"] * correct_color)
     means = {name: _mean([values[name] for values in per_image.values()]) for name in names}
     return {"images": {**means, "per_image": per_image}, "fps": frames_per_second(views, timed or draw)}
+
+
+def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color: bool) -> dict[str, float]:
+    mask = None if mask is None else mask.to(render.device)
+    found = {"psnr": psnr(render, photo, mask), "ssim": similarity(render, photo, mask)}
+    if correct_color:
+        found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)
+    return found
 
 
 def frames_per_second(views: Sequence[View], draw: Draw, warmup: int = 2, most: int = 20) -> float | None:

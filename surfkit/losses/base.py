@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
@@ -22,11 +23,31 @@ class Sample:
         view: The photograph's name and camera.
         photo: (3, H, W) float32 in [0, 1].
         prior: What is known of the depth, of a photograph with a usable estimate and for losses that need one.
+        mask: (H, W) bool, False where the photograph is to be ignored; None where all of it counts. The trainer sees
+            to it (`ignoring`) that no loss learns from such pixels.
     """
 
     view: View
     photo: Tensor
     prior: DepthPrior | None = None
+    mask: Tensor | None = None
+
+
+def ignoring(maps: Maps, sample: Sample) -> tuple[Maps, Sample]:
+    """Maps and sample that teach nothing where the mask is False.
+
+    There the photograph is what was rendered, no depth is known, and the maps are constants, so that no gradient
+    reaches them through the windows of their neighbours either.
+    """
+    keep = sample.mask
+    if keep is None:
+        return maps, sample
+    held = Maps(**{name: torch.where(keep, value, value.detach()) for name, value in maps.present().items()})
+    prior = sample.prior
+    if prior is not None:
+        known = {name: torch.where(keep, getattr(prior, name), 0) for name in ("inverse", "confidence")}
+        prior = replace(prior, **known)
+    return held, replace(sample, photo=torch.where(keep, sample.photo, held.color.detach()), prior=prior)
 
 
 class Loss(Component):

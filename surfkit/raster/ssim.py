@@ -26,6 +26,16 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
 
 def ssim_reference(x: Tensor, y: Tensor) -> Tensor:
     """The same in plain torch, in any precision."""
+    return ssim_map(x, y).mean()
+
+
+def ssim_map(x: Tensor, y: Tensor) -> Tensor:
+    """(C, H, W) structural similarity of the windows around each pixel of two images, in plain torch.
+
+    Args:
+        x: (C, H, W) in [0, 1].
+        y: (C, H, W) in [0, 1].
+    """
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=x.dtype, device=x.device)
     window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     window = window / window.sum()
@@ -38,7 +48,7 @@ def ssim_reference(x: Tensor, y: Tensor) -> Tensor:
     squares = mean_x**2 + mean_y**2
     spread = blur(x * x + y * y) - squares
     together = blur(x * y) - mean_x * mean_y
-    return ((2 * mean_x * mean_y + C1) * (2 * together + C2) / ((squares + C1) * (spread + C2))).mean()
+    return (2 * mean_x * mean_y + C1) * (2 * together + C2) / ((squares + C1) * (spread + C2))
 
 
 class _Fused(torch.autograd.Function):

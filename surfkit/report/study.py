@@ -22,8 +22,8 @@ from surfkit.recipe import Recipe
 from surfkit.report.ablation import Table, build, pick, scaled
 from surfkit.report.compare import compare, figures
 from surfkit.report.table import markdown
-from surfkit.scene import colmap
 from surfkit.scene.data import Data
+from surfkit.scene.read import read
 
 TRACE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""
@@ -154,7 +154,7 @@ def refuse_unusable(plan: Plan) -> None:
     if plan.out.exists() and not plan.out.is_dir():
         raise BadInput(f"--out {plan.out}: a file, not a folder; name another one")
     pipeline.drawer(plan.device)
-    if not colmap.read(plan.data).held_out:
+    if not read(plan.data).held_out:
         raise BadInput("no photograph is kept from training, so rows cannot be compared; see --test-every")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +21,8 @@ class Data:
     """A data set and how to use it."""
 
     path: Annotated[Path, tyro.conf.arg(name="data")]
-    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse."""
+    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
+    another layout that `surfkit components reader` lists."""
 
     scale: float | None = None
     """Divide the size of every photograph by this."""
@@ -30,13 +31,23 @@ class Data:
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
 
     test_every: int = 8
-    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none."""
+    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none. A data
+    set with test photographs of its own keeps those."""
 
     test_list: Path | None = None
     """Keep the photographs named in this file from training instead: one name a line, as below images/."""
 
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    masks: Path | None = None
+    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
+
+    layout: str | None = None
+    """How the data set is laid out; recognised by its files if left out."""
+
+    white: bool = False
+    """Lay transparent pixels of photographs over white instead of black."""
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 1 <= self.scale < float("inf"):
@@ -52,13 +63,21 @@ class Data:
         by = max(self.scale or 1.0, max(width, height) / longest)
         return max(1, round(width / by)), max(1, round(height / by))
 
-    def held_out(self, names: Sequence[str]) -> set[str]:
-        """Which of the sorted `names` are kept from training."""
+    def held_out(self, names: Sequence[str], own: Collection[str] | None = None) -> set[str]:
+        """Which photographs are kept from training.
+
+        Args:
+            names: Of all photographs, sorted.
+            own: Those that the data set itself keeps; None if it keeps none.
+        """
         chosen = set(names[:: self.test_every]) if self.test_every else set()
+        if own is not None:
+            chosen = set(own)
         if self.test_list is not None:
             chosen = _listed(self.test_list, names)
         if len(chosen) == len(names):
-            what = f"--test-list {self.test_list}" if self.test_list else f"--test-every {self.test_every}"
+            what = f"--test-every {self.test_every}" if own is None else "the data set's own split"
+            what = f"--test-list {self.test_list}" if self.test_list else what
             raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
         return chosen
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,15 +13,14 @@ from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.scene import colmap
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
+from surfkit.scene.cache import Cache
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import DepthFile, find_maps, read_record
 from surfkit.scene.observations import Observations
+from surfkit.scene.read import model_folder, observations
 from surfkit.scene.scene import Scene, View
 
-BUDGET_BYTES = 2**30
-"""Of maps kept in memory."""
 UNITS = 1.25
 """A map in input units that is off by a larger factor from the sparse points is in other units."""
 EDGE = 0.05
@@ -44,6 +42,9 @@ class DepthPrior:
     typical: float
 
 
+Priors = Cache["DepthPrior | None"]
+
+
 @dataclass(frozen=True)
 class Fit:
     """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units."""
@@ -53,61 +54,46 @@ class Fit:
     offset: float
 
 
-class Priors(Sequence["DepthPrior | None"]):
-    """The priors of training views by position; read when asked for, and kept while they fit into memory."""
+def prior_cache(
+    views: Sequence[View], fits: Sequence[Fit | None], typical: float, budget_bytes: int | None = None
+) -> Priors:
+    """The priors of training views by position, as `fits` says how to read them."""
 
-    def __init__(
-        self, views: Sequence[View], fits: Sequence[Fit | None], typical: float, budget_bytes: int = BUDGET_BYTES
-    ) -> None:
-        self.views, self.fits, self.typical, self.budget_bytes = views, fits, typical, budget_bytes
-        self._kept: OrderedDict[int, DepthPrior] = OrderedDict()
-        self._bytes = 0
+    def read(at: int) -> DepthPrior | None:
+        fit = fits[at]
+        return None if fit is None else _read(views[at], fit, typical)
 
-    def __len__(self) -> int:
-        return len(self.views)
-
-    def __getitem__(self, at: int) -> DepthPrior | None:  # type: ignore[override] (no slices)
-        fit = self.fits[at]
-        if fit is None:
-            return None
-        if at not in self._kept:
-            self._keep(at, self._read(self.views[at], fit))
-        self._kept.move_to_end(at)
-        return self._kept[at]
-
-    def _read(self, view: View, fit: Fit) -> DepthPrior:
-        size = (view.camera.height, view.camera.width)
-        try:
-            inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
-            confidence = fit.file.read_confidence()
-        except BadInput as error:
-            raise BadInput(f"{fit.file.path}: {error}") from error
-        inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
-        there = (inverse > 0).to(torch.float32)
-        if confidence is None:
-            return DepthPrior(inverse, there, self.typical)
-        grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
-        return DepthPrior(inverse, grown * there, self.typical)
-
-    def _keep(self, at: int, prior: DepthPrior) -> None:
-        self._kept[at] = prior
-        self._bytes += size_of(prior)
-        while self._bytes > self.budget_bytes and len(self._kept) > 1:
-            self._bytes -= size_of(self._kept.popitem(last=False)[1])
+    sizes = [8 * v.camera.width * v.camera.height if f else 0 for v, f in zip(views, fits, strict=True)]
+    return Cache(read, sizes, budget_bytes)
 
 
-def read_priors(data: Data, scene: Scene) -> Priors | None:
+def _read(view: View, fit: Fit, typical: float) -> DepthPrior:
+    size = (view.camera.height, view.camera.width)
+    try:
+        inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
+        confidence = fit.file.read_confidence()
+    except BadInput as error:
+        raise BadInput(f"{fit.file.path}: {error}") from error
+    inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
+    there = (inverse > 0).to(torch.float32)
+    if confidence is None:
+        return DepthPrior(inverse, there, typical)
+    grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
+    return DepthPrior(inverse, grown * there, typical)
+
+
+def read_priors(data: Data, scene: Scene, budget_bytes: int | None = None) -> Priors | None:
     """The depth priors of a data set, aligned to its sparse points; None, and a warning, where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning.
     """
-    maps = find_maps(data.path, colmap.model_folder(data.path), [view.name for view in scene.train])
+    maps = find_maps(data.path, model_folder(data), [view.name for view in scene.train])
     if not maps:
         emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
         return None
-    observations = colmap.observations(data, scene.frame)
+    tracks = observations(data, scene)
     with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), observations, scene), scene.train))
+        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
     for at in _outliers(fits):
@@ -119,7 +105,7 @@ def read_priors(data: Data, scene: Scene) -> Priors | None:
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
     _warn_of_leaks(data, scene)
-    return Priors(scene.train, fits, typical_inverse_depth(scene.train, observations, scene))
+    return prior_cache(scene.train, fits, typical_inverse_depth(scene.train, tracks, scene), budget_bytes)
 
 
 def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:
@@ -143,11 +129,6 @@ def typical_inverse_depth(views: Sequence[View], observations: Observations, sce
     xyz = scene.cloud.xyz.to(torch.float64)  # a model without tracks: every point that is before a camera
     depths = torch.cat([xyz @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3] for view in views])
     return float((1 / depths[depths > 0]).median())
-
-
-def size_of(prior: DepthPrior) -> int:
-    """Bytes of its maps."""
-    return sum(t.numel() * t.element_size() for t in (prior.inverse, prior.confidence))
 
 
 def listed(reasons: Mapping[str, str]) -> str:

@@ -1,11 +1,8 @@
-"""Photographs as tensors, reduced to the size of their cameras and kept in memory."""
+"""Photographs as tensors, reduced to the size of their cameras."""
 
 from __future__ import annotations
 
-import os
-import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,40 +12,21 @@ from PIL import Image
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
 
 
-class Photos:
-    """The photographs of `views` by position, decoded ahead by a few threads and kept as uint8."""
+def photo_cache(views: Sequence[View], budget_bytes: int | None = None, threads: int | None = None) -> Cache[Tensor]:
+    """The photographs of views by position, (3, H, W) uint8."""
+    sizes = [3 * view.camera.width * view.camera.height for view in views]
+    return Cache(lambda at: view_photo(views[at]), sizes, budget_bytes, threads)
 
-    def __init__(self, views: Sequence[View], threads: int | None = None) -> None:
-        """Start decoding, in the order of `views`.
 
-        Args:
-            views: What will be asked for.
-            threads: Decoders; as many as there are cores, 4 at most, by default.
-        """
-        pool = ThreadPoolExecutor(threads or min(4, os.cpu_count() or 1), thread_name_prefix="photo")
-        self._decoded = [pool.submit(read_photo, view.path, (view.camera.width, view.camera.height)) for view in views]
-        pool.shutdown(wait=False)
-        self._stop = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
-
-    def __len__(self) -> int:
-        return len(self._decoded)
-
-    def __getitem__(self, at: int, /) -> Tensor:
-        """(3, H, W) uint8; waits until it is decoded.
-
-        Raises:
-            BadInput: The photograph is damaged.
-        """
-        return self._decoded[at].result()
-
-    def close(self) -> None:
-        """Decode no further photographs."""
-        self._stop()
+def view_photo(view: View) -> Tensor:
+    """(3, H, W) uint8 of the photograph of a view, at the size of its camera."""
+    return read_photo(view.path, (view.camera.width, view.camera.height), view.white)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
@@ -57,30 +35,31 @@ def photo_size(path: Path) -> tuple[int, int]:
     Raises:
         BadInput: The file is no picture that Pillow reads.
     """
-    return _opened(path, lambda image: image.size)
+    return opened(path, lambda image: image.size)
 
 
-def read_photo(path: Path, size: tuple[int, int]) -> Tensor:
-    """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter. Alpha lies over black.
+def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
+    """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter.
 
     Args:
-        path: Any 8-bit picture that Pillow reads, or a 16-bit grey one.
+        path: Any picture of 8 or 16 bits that Pillow reads.
         size: Width and height wanted.
+        white: Whether transparent pixels lie over white, or over black.
 
     Raises:
         BadInput: The file is damaged or holds another kind of pixel.
     """
 
     def decode(image: Image.Image) -> np.ndarray:
-        plain = _rgb(image, path)
+        plain = _rgb(image, path, 255 if white else 0)
         if plain.size != size:
             plain = plain.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
         return np.array(plain)
 
-    return torch.from_numpy(_opened(path, decode)).permute(2, 0, 1).contiguous()
+    return torch.from_numpy(opened(path, decode)).permute(2, 0, 1).contiguous()
 
 
-def _rgb(image: Image.Image, path: Path) -> Image.Image:
+def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
         grey = np.asarray(image).astype(np.int64).clip(0, 65535)
         return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
@@ -88,11 +67,11 @@ def _rgb(image: Image.Image, path: Path) -> Image.Image:
         raise BadInput(f"{path}: pixels are floating point; convert it to 8 bits, for example to PNG")
     if "A" in image.getbands() or "a" in image.getbands() or "transparency" in image.info:
         image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), image).convert("RGB")
-    return image.convert("RGB")
+        return Image.alpha_composite(Image.new("RGBA", image.size, (under, under, under, 255)), image).convert("RGB")
+    return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def _opened(path: Path, use: Callable[[Image.Image], T]) -> T:
+def opened(path: Path, use: Callable[[Image.Image], T]) -> T:
     """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput."""
     try:
         with Image.open(path) as image:

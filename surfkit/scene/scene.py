@@ -24,11 +24,15 @@ class View:
         name: Path of the photograph below the image folder, as the data set spells it.
         camera: At the size used in training.
         path: The photograph on disk.
+        mask: Its mask on disk, black where the photograph is to be ignored.
+        white: Whether its transparent pixels lie over white, or over black.
     """
 
     name: str
     camera: Camera
     path: Path
+    mask: Path | None = None
+    white: bool = False
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.scene.colmap import library
+from surfkit.scene.capture import library
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 
 

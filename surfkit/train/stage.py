@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Protocol
 
@@ -19,7 +19,7 @@ from surfkit.core.schedule import Interval, Steps
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Regularizer, Sample
+from surfkit.losses.base import Loss, Regularizer, Sample, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge
@@ -147,6 +147,8 @@ class Trainer:
         photos: Gives their pictures by position, (3, H, W) uint8.
         rasterizer: What draws.
         priors: Estimated depths by position, for losses that need them.
+        masks: Which pixels count, by position, (H, W) bool or None; None if all do.
+        expect: Told the positions in the order in which they will be asked for, whenever a new order begins.
     """
 
     stage: Stage
@@ -155,6 +157,8 @@ class Trainer:
     photos: Pictures
     rasterizer: Rasterizer
     priors: Sequence[DepthPrior | None] | None = None
+    masks: Sequence[Tensor | None] | None = None
+    expect: Callable[[Sequence[int]], None] | None = None
 
     def begin(self, points: Points, generator: torch.Generator) -> StageState:
         """The state before the first step."""
@@ -169,6 +173,7 @@ class Trainer:
     def run(self, state: StageState) -> Iterator[Done]:
         """Take the steps that are left; after each one, `state` can be saved, and the caller may stop."""
         wall, cpu = time.perf_counter(), time.process_time()
+        self.foretell(state.order)
         while state.index < self.stage.steps:
             done = self.step(state)
             state.seconds += time.perf_counter() - wall
@@ -177,12 +182,25 @@ class Trainer:
             emit(StepDone(done.index, self.stage.steps, done.losses, done.points))
             yield done
 
+    def foretell(self, order: Order) -> None:
+        """Say which views come next, so that their pictures can be read ahead."""
+        if self.expect is not None and order.at < len(order.queue):
+            self.expect(order.queue[order.at :].tolist())
+
+    def shown(self, state: StageState) -> tuple[int, Sample]:
+        """The view to show now: its position, and all that is known of it."""
+        if state.order.at == len(state.order.queue):
+            state.order.shuffle(state.generator)
+            self.foretell(state.order)
+        at = state.order.next(state.generator)
+        photo = self.photos[at].to(torch.float32).div_(255)
+        prior, mask = (None if known is None else known[at] for known in (self.priors, self.masks))
+        return at, Sample(self.views[at], photo, prior, mask)
+
     def step(self, state: StageState) -> Done:
         """Show one photograph, and let points and policies learn from it."""
         stage, index = self.stage, state.index + 1
-        shown = state.order.next(state.generator)
-        prior = None if self.priors is None else self.priors[shown]
-        sample = Sample(self.views[shown], self.photos[shown].to(torch.float32).div_(255), prior)
+        shown, sample = self.shown(state)
         active = {n: w for n, loss in stage.losses.items() if (w := loss.weight_at(index, stage.steps)) > 0}
         reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
@@ -213,6 +231,7 @@ class Trainer:
         leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
         leafy = Maps(**leaves)
         compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
+        compared, sample = ignoring(compared, sample)
         values = {name: weight * losses[name](compared, sample) for name, weight in active.items()}
         numbers = {name: float(value.detach()) for name, value in values.items()}
         if look is not None:

@@ -27,10 +27,14 @@ class Order:
     queue: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     at: int = 0
 
+    def shuffle(self, generator: torch.Generator) -> None:
+        """Begin a new order."""
+        self.queue, self.at = torch.randperm(self.count, generator=generator), 0
+
     def next(self, generator: torch.Generator) -> int:
         """The view to show now."""
         if self.at == len(self.queue):
-            self.queue, self.at = torch.randperm(self.count, generator=generator), 0
+            self.shuffle(generator)
         self.at += 1
         return int(self.queue[self.at - 1])
 

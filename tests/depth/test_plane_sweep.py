@@ -13,9 +13,9 @@ from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smoothed
-from surfkit.scene import colmap
 from surfkit.scene.camera import Camera
 from surfkit.scene.data import Data
+from surfkit.scene.read import observations, read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 CPU = torch.device("cpu")
@@ -29,8 +29,8 @@ def farm(tmp_path_factory):
     truth = photograph(Flight(kind="grid", views=20, width=120, height=90, points=600, test_every=0))
     write_colmap(folder, truth, tracks=True)
     data = Data(folder, test_every=0)
-    scene = colmap.read(data)
-    return scene, colmap.observations(data, scene.frame), truth
+    scene = read(data)
+    return scene, observations(data, scene), truth
 
 
 def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):

@@ -11,8 +11,8 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.scene import colmap
-from surfkit.scene.colmap import read
 from surfkit.scene.data import Data
+from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[2] / "examples" / "boruszyn"
@@ -204,8 +204,8 @@ def complaint(text, do):
     assert text in str(error.value) and "\n" not in str(error.value), str(error.value)
 
 
-def distort(farm):
-    edit(farm / "sparse/0/cameras.txt", lambda _: "7 SIMPLE_RADIAL 40 30 36 20 15 0.01\n")
+def panorama(farm):
+    edit(farm / "sparse/0/cameras.txt", lambda _: "7 EQUIRECTANGULAR 40 30 40 30\n")
     edit(farm / "sparse/0/images.txt", lambda text: text.replace(" 1 view", " 7 view"))
 
 
@@ -265,12 +265,12 @@ def no_focal(farm):
 @pytest.mark.parametrize(
     ("damage", "text"),
     [
-        (distort, "camera 7 has model SIMPLE_RADIAL; only PINHOLE and SIMPLE_PINHOLE work: undistort the photographs"),
+        (panorama, "camera 7 of view_000.png has model EQUIRECTANGULAR, a panorama"),
         (strange_model, "a camera model that COLMAP does not know"),
         (no_images, "images: no such folder of photographs"),
         (no_model, "no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0"),
         (half_a_model, "the COLMAP model lacks points3D.txt"),
-        (missing, "2 of 5 photographs of the model are missing, the first is 'view_002.png'; did you mean 'View_002"),
+        (missing, "1 of 5 photographs of the model are missing, the first is 'view_003.png'; did you mean '"),
         (other_size, "view_002.png: 40 x 20 px, but its camera 1 has 40 x 30"),
         (turned, "view_002.png: 30 x 40 px (turned by 90 degrees), but"),
         (no_picture, "view_002.png: not a whole picture"),
@@ -278,7 +278,7 @@ def no_focal(farm):
         (no_poses, "the model has no image with a pose"),
         (bad_text, "the COLMAP model is damaged"),
         (no_camera, "the COLMAP model is damaged"),
-        (no_focal, "camera 1 has size 40 x 30 and parameters"),
+        (no_focal, "camera 1 of view_000.png has size 40 x 30 and parameters"),
     ],
 )
 def test_damaged_folders(farm, damage, text):

@@ -12,11 +12,12 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.pipeline import noted
-from surfkit.scene import colmap
+from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import confidence_path, find_maps, map_path, write_map, write_record
-from surfkit.scene.depth_prior import Priors, read_priors, resized
+from surfkit.scene.depth_prior import read_priors, resized
+from surfkit.scene.read import observations
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 
@@ -34,7 +35,7 @@ def farm(made, tmp_path):
     """A copy to write maps into: its data, scene, and exact inverse depth by name, 1/input units."""
     folder, truth = made
     data = Data(Path(shutil.copytree(folder, tmp_path / "farm")))
-    scene = colmap.read(data)
+    scene = scenes.read(data)
     exact = {name: (truth.scene.frame.scale / e.depth.clamp_min(1e-9)).numpy() for name, e in truth.exact.items()}
     return data, scene, {name: np.where(truth.exact[name].depth > 0, inv, 0) for name, inv in exact.items()}
 
@@ -65,15 +66,15 @@ def check_exact(priors, scene, exact, share=2e-3):
 
 def test_tracks_project_to_where_they_are_observed(farm):
     data, scene, exact = farm
-    observations = colmap.observations(data, scene.frame)
+    tracks = observations(data, scene)
     for view in scene.train:
-        seen, camera = observations.seen[view.name], view.camera
+        seen, camera = tracks.seen[view.name], view.camera
         pose = camera.world_to_camera.numpy()
-        local = observations.xyz[seen.points] @ pose[:3, :3].T + pose[:3, 3]
+        local = tracks.xyz[seen.points] @ pose[:3, :3].T + pose[:3, 3]
         x = (camera.fx * local[:, 0] / local[:, 2] + camera.cx) / camera.width
         y = (camera.fy * local[:, 1] / local[:, 2] + camera.cy) / camera.height
         assert len(x) > 20 and np.abs(np.stack([x, y], 1) - seen.at).max() < 1e-4
-        at, inverse = observations.of(view)
+        at, inverse = tracks.of(view)
         error = np.abs(sample(exact[view.name], at) / scene.frame.scale / inverse - 1)
         assert np.median(error) < 0.01  # the map is sampled at pixels; points are anywhere
 
@@ -117,7 +118,7 @@ def test_relative_maps_are_aligned(farm):
     priors, notes = read(data, scene)
     assert notes == []
     check_exact(priors, scene, exact, share=0.03)  # sparse points are not at the centres of pixels
-    depths = [colmap.observations(data, scene.frame).of(view)[1] for view in scene.train]
+    depths = [observations(data, scene).of(view)[1] for view in scene.train]
     assert priors[0].typical == pytest.approx(float(np.median([np.median(c) for c in depths])))
 
 
@@ -264,17 +265,15 @@ def test_resizing_is_smooth_on_surfaces_and_sharp_between_them():
     assert resized(inverse, (8, 12)) is inverse
 
 
-def test_memory_is_bounded_and_priors_are_read_when_asked_for(farm):
+def test_memory_is_bounded_and_priors_are_read_ahead(farm):
     data, scene, exact = farm
     relative(data, exact)
-    priors, _ = read(data, scene)
-    one = 2 * 4 * 64 * 48
-    small = Priors(priors.views, priors.fits, priors.typical, budget_bytes=2 * one)
-    first = small[0]
-    assert small[0] is first
+    budget = 2 * 2 * 4 * 64 * 48
+    everything, small = (read_priors(data, scene, most) for most in (None, budget))
     for at in range(len(small)):
-        assert small[at] is not None and len(small._kept) <= 2
-    assert small[0] is not first and torch.equal(small[0].inverse, first.inverse)
-    camera = replace(scene.train[0].camera.resized(32, 24))
-    half = Priors([replace(scene.train[0], camera=camera)], priors.fits[:1], priors.typical)[0]
-    assert half.inverse.shape == half.confidence.shape == (24, 32)
+        assert torch.equal(small[at].inverse, everything[at].inverse)
+        assert torch.equal(small[at].confidence, everything[at].confidence)
+        assert small.bytes <= budget
+    half = replace(scene.train[0], camera=scene.train[0].camera.resized(32, 24))
+    smaller = read_priors(data, replace(scene, train=(half, *scene.train[1:])))[0]
+    assert smaller.inverse.shape == smaller.confidence.shape == (24, 32)

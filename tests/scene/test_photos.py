@@ -9,7 +9,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.scene.photos import Photos, photo_size, read_photo
+from surfkit.scene.photos import photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 
 
@@ -80,7 +80,7 @@ def test_the_rotation_in_exif_is_not_applied(tmp_path):
 
 def test_by_position_in_the_size_of_the_camera(tmp_path):
     paths = [save(tmp_path / f"{i}.png", np.full((6, 8, 3), i * 10, np.uint8)) for i in range(5)]
-    photos = Photos([view(path, 4, 3) for path in paths], threads=2)
+    photos = photo_cache([view(path, 4, 3) for path in paths], threads=2)
     assert len(photos) == 5
     for i in (3, 0, 4, 3, -1):
         assert photos[i].shape == (3, 3, 4) and (photos[i] == i % 5 * 10).all()
@@ -91,7 +91,7 @@ def test_a_damaged_photograph_is_named(tmp_path):
     whole = save(tmp_path / "whole.jpg", stripes(64, 48))
     cut = tmp_path / "cut.jpg"
     cut.write_bytes(whole.read_bytes()[:700])
-    photos = Photos([view(whole, 64, 48), view(cut, 64, 48)])
+    photos = photo_cache([view(whole, 64, 48), view(cut, 64, 48)])
     assert photos[0].shape == (3, 48, 64)
     with pytest.raises(BadInput, match="cut.jpg: not a whole picture: .*truncated") as error:
         photos[1]
@@ -101,3 +101,43 @@ def test_a_damaged_photograph_is_named(tmp_path):
         photo_size(tmp_path / "page.jpg")
     with pytest.raises(BadInput, match="no such photograph"):
         photo_size(Path(tmp_path / "none.jpg"))
+
+
+def test_sixteen_bits_of_colour_and_alpha(tmp_path):
+    """PNG of 16 bits a channel, which Pillow cannot write."""
+    import struct
+    import zlib
+
+    def chunk(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    for kind, channels in {2: 3, 6: 4}.items():
+        values = np.array([[[1000, 30000, 65535, 65535][:channels], [0, 257, 514, 0][:channels]]], ">u2")
+        rows = b"".join(b"\0" + row.tobytes() for row in values)
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", 2, 1, 16, kind, 0, 0, 0))
+        body = chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+        (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + body)
+        got = read_photo(tmp_path / "a.png", (2, 1))[:, 0].T.tolist()
+        assert np.abs(np.array(got[0]) - [1000 / 257, 30000 / 257, 255]).max() <= 1
+        assert got[1] == ([0, 1, 2] if kind == 2 else [0, 0, 0])
+        if kind == 6:
+            assert read_photo(tmp_path / "a.png", (2, 1), white=True)[:, 0, 1].tolist() == [255, 255, 255]
+
+
+def test_memory_stays_within_the_budget(tmp_path):
+    """160 photographs of 2 MB each, of which ten fit, in training order."""
+    import psutil
+
+    for i in range(40):
+        save(tmp_path / f"{i}.jpg", np.full((800, 900, 3), i, np.uint8))
+    views = [view(tmp_path / f"{i % 40}.jpg", 900, 800) for i in range(160)]
+    process, budget = psutil.Process(), 22_000_000
+    before, most = process.memory_info().rss, 0
+    cache = photo_cache(views, budget, threads=2)
+    order = torch.randperm(160, generator=torch.Generator().manual_seed(0)).tolist()
+    cache.expect(order)
+    for at in order:
+        assert abs(int(cache[at][0, 0, 0]) - at % 40) <= 1
+        assert cache.bytes <= budget
+        most = max(most, process.memory_info().rss)
+    assert most - before < budget + 80_000_000, "all of them are 346 MB; the rest is for decoding, and the allocator's"

@@ -1,0 +1,103 @@
+"""What a reader finds in a data set: photographs with poses and lenses, and sparse points, in the input's frame."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.registry import Component
+from surfkit.scene.data import Data
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph as the data set has it.
+
+    Attributes:
+        name: As the data set spells it; unique in the data set.
+        pose: (4, 4) float64 world_to_camera, input frame.
+        camera: pycolmap.Camera of any model; its size may be another one than the photograph's.
+        path: The photograph on disk.
+        mask: Its mask, where the data set names one; None leaves it to be found by its name.
+    """
+
+    name: str
+    pose: np.ndarray
+    camera: Any
+    path: Path
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A data set as it is.
+
+    Attributes:
+        shots: At least one.
+        xyz: (P, 3) float64 sparse points, input frame; none if the data set has none.
+        rgb: (P, 3) uint8.
+        held_out: Names that the data set itself keeps from training; None leaves it to `Data`.
+    """
+
+    shots: Sequence[Shot]
+    xyz: np.ndarray
+    rgb: np.ndarray
+    held_out: frozenset[str] | None = None
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Which sparse points were seen where.
+
+    Attributes:
+        xyz: (P, 3) float64, input frame.
+        error_px: (P,) float64 mean reprojection error.
+        seen: By name of the photograph: (K,) int64 rows of xyz, (K, 2) float64 pixels of the camera of its shot.
+        cameras: By name of the photograph: the camera.
+    """
+
+    xyz: np.ndarray
+    error_px: np.ndarray
+    seen: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    cameras: Mapping[str, Any]
+
+
+class Reader(Component):
+    """A layout of data sets: what lies where, and what the numbers mean."""
+
+    @abstractmethod
+    def recognises(self, root: Path) -> bool:
+        """Whether a folder looks like this layout, whole or damaged."""
+
+    @abstractmethod
+    def read(self, data: Data) -> Capture:
+        """What is in the folder `data.path`.
+
+        Raises:
+            BadInput: Something is missing or damaged; one line says what to do.
+        """
+
+
+class Tracked(ABC):
+    """What a reader also offers when its layout keeps a sparse model with observations."""
+
+    @abstractmethod
+    def model_folder(self, root: Path) -> Path:
+        """Where the sparse model lies."""
+
+    @abstractmethod
+    def tracks(self, data: Data) -> Tracks:
+        """The observations of the sparse model."""
+
+
+def library() -> Any:
+    """The module pycolmap, loaded after Pillow's PNG writer: the other way round, saving a PNG kills the process."""
+    import PIL.PngImagePlugin  # noqa: F401
+    import pycolmap
+
+    return pycolmap

@@ -1,0 +1,74 @@
+"""How much memory there is to use."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+from surfkit.core.check import BadInput
+
+SHARE = 0.5
+"""Of the free memory that the cache takes by default: the points and the rasterizer need the rest."""
+UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
+GROUPS = Path("/sys/fs/cgroup")
+OWN = Path("/proc/self/cgroup")
+
+
+def cache_bytes(text: str) -> int:
+    """Bytes of a size such as 4GB, 500 MB or 2GiB; a share of the free memory for "auto"."""
+    if text.strip().lower() == "auto":
+        return int(SHARE * free_bytes())
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
+    if not found or found[2] not in UNITS:
+        raise BadInput(f"--cache {text}: give a size such as 4GB or 500MB, or auto")
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+def free_bytes() -> int:
+    """Memory that this process may still take: what the machine has free, and what its control groups allow."""
+    return max(0, min([psutil.virtual_memory().available, *_allowed()]))
+
+
+def _allowed() -> Iterator[int]:
+    """What each control group above this process still allows; pages that only cache files count as free."""
+    for folder in _groups():
+        for limit, usage, cached in (
+            ("memory.max", "memory.current", "inactive_file"),
+            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+        ):
+            most, used = _number(folder / limit), _number(folder / usage)
+            if most is not None and used is not None:
+                yield most - used + _entry(folder / "memory.stat", cached)
+
+
+def _groups() -> Iterator[Path]:
+    """Folders of the groups that this process is in, and of those around them; version 2, then version 1."""
+    try:
+        lines = OWN.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, name = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        root = GROUPS / "memory" if controllers else GROUPS
+        path = Path(name.lstrip("/"))
+        yield from (root / inner for inner in (path, *path.parents))
+
+
+def _number(path: Path) -> int | None:
+    try:
+        return int(path.read_text())
+    except (OSError, ValueError):  # no such file, or "max"
+        return None
+
+
+def _entry(path: Path, name: str) -> int:
+    try:
+        rows = (line.split() for line in path.read_text().splitlines())
+        return next((int(value) for key, value in rows if key == name), 0)
+    except (OSError, ValueError):
+        return 0

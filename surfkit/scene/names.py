@@ -1,0 +1,57 @@
+"""Photographs that are called otherwise than their data set says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import TypeVar
+
+from surfkit.core.events import Warned, emit
+
+T = TypeVar("T")
+PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"})
+SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
+    lambda path: str(path).lower(),
+    lambda path: str(path.with_suffix("")).lower(),
+    lambda path: path.name.lower(),
+    lambda path: path.stem.lower(),
+)
+"""What of a name must agree: all but the case, nor the ending, nor the folders."""
+
+
+def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The file of each name that has one, by name; one note tells of all that are spelt otherwise.
+
+    Another spelling counts when it fits one file only and no other name.
+    """
+    found = {name: path for name in names if (path := folder / name.replace("\\", "/")).is_file()}
+    lost = [name for name in names if name not in found]
+    if not lost:
+        return found
+    taken = set(found.values())
+    spare = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in PICTURES and p not in taken and p.is_file()]
+    for spelling in SPELLINGS:
+        files = _groups({path: spelling(PurePosixPath(path.relative_to(folder).as_posix())) for path in spare})
+        wanted = _groups({name: spelling(PurePosixPath(name.replace("\\", "/"))) for name in lost})
+        pairs = {same[0]: files[key][0] for key, same in wanted.items() if len(same) == 1 == len(files.get(key, ()))}
+        found |= pairs
+        lost = [name for name in lost if name not in pairs]
+        spare = [path for path in spare if path not in pairs.values()]
+    _tell(folder, {name: path for name, path in found.items() if path not in taken})
+    return found
+
+
+def _groups(keys: Mapping[T, str]) -> dict[str, list[T]]:
+    groups: dict[str, list[T]] = {}
+    for item, key in keys.items():
+        groups.setdefault(key, []).append(item)
+    return groups
+
+
+def _tell(folder: Path, otherwise: dict[str, Path]) -> None:
+    if otherwise:
+        name, path = next(iter(otherwise.items()))
+        there = path.relative_to(folder).as_posix()
+        emit(
+            Warned(f"{len(otherwise)} photographs in {folder} are spelt otherwise in the model: {there} is {name}, say")
+        )

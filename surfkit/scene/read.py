@@ -1,0 +1,178 @@
+"""A data set of any known layout as a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import components, find
+from surfkit.scene.camera import Camera
+from surfkit.scene.capture import Capture, Reader, Shot, Tracked
+from surfkit.scene.colmap import COLMAP, MODELS
+from surfkit.scene.data import Data
+from surfkit.scene.masks import check_mask, find_masks
+from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.photos import photo_size
+from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.undistort import Picture, check_camera, is_pinhole, undistorted
+
+RANDOM_POINTS = 50_000
+"""Where a data set has no sparse points."""
+
+
+def read(data: Data) -> Scene:
+    """The scene in a data set, in its local frame; photographs of distorted cameras are undistorted on the way.
+
+    Raises:
+        BadInput: Something is missing, damaged, or of a kind that is not supported; one line says what to do.
+    """
+    reader = reader_of(data)
+    if data.layout is None and len(fitting := _fitting(data.path)) > 1:
+        others = ", ".join(name for name, other in fitting.items() if other != reader)
+        emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+    capture = reader.read(data)
+    shots = sorted(capture.shots, key=lambda shot: shot.name)
+    held_out = data.held_out([shot.name for shot in shots], capture.held_out)
+    poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
+    frame = Frame.around(poses, capture.xyz)
+    views = _views(data, shots, frame)
+    return Scene(
+        name=data.path.resolve().name,
+        train=tuple(view for view in views if view.name not in held_out),
+        held_out=tuple(view for view in views if view.name in held_out),
+        cloud=_cloud(capture, poses, frame),
+        frame=frame,
+    )
+
+
+def reader_of(data: Data) -> Reader:
+    """The reader for a data set: the one that `layout` names, or the one that recognises the folder."""
+    root = data.path
+    if not root.is_dir():
+        raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
+    if not any(root.iterdir()):
+        raise BadInput(f"{root}: the folder is empty; {_wanted()}")
+    if data.layout is not None:
+        return find(Reader, data.layout)()
+    fitting = _fitting(root)
+    if "colmap" in fitting:  # it has the points and their observations
+        return fitting["colmap"]
+    if len(fitting) > 1:
+        raise BadInput(f"{root}: could be of layout {' or '.join(fitting)}; choose one with --layout")
+    return next(iter(fitting.values()), COLMAP())
+
+
+def _fitting(root: Path) -> dict[str, Reader]:
+    """The readers that recognise a folder, by name."""
+    return {name: cls() for name, cls in components(Reader).items() if cls().recognises(root)}
+
+
+def observations(data: Data, scene: Scene) -> Observations:
+    """Which points of the sparse model each photograph shows; none where the layout keeps no observations.
+
+    Args:
+        data: The data set.
+        scene: That `read` gave for it.
+    """
+    reader = reader_of(data)
+    if not isinstance(reader, Tracked):
+        return Observations(np.zeros((0, 3)), np.zeros(0), {})
+    tracks, seen = reader.tracks(data), {}
+    for view in (*scene.train, *scene.held_out):
+        if view.name in tracks.seen:
+            rows, pixels = tracks.seen[view.name]
+            seen[view.name] = Seen(rows, _shares(pixels, tracks.cameras[view.name], view.camera))
+    return Observations(scene.frame.to_local(tracks.xyz), tracks.error_px, seen)
+
+
+def model_folder(data: Data) -> Path:
+    """Where the sparse model of a data set lies; the data set itself if its layout has none."""
+    reader = reader_of(data)
+    return reader.model_folder(data.path) if isinstance(reader, Tracked) else data.path
+
+
+def _wanted() -> str:
+    others = ", ".join(name for name in components(Reader) if name != "colmap")
+    return (
+        f"a data set is a folder with images/ and a COLMAP model in {', '.join(MODELS[:-1])} or {MODELS[-1]}, "
+        f"or of another layout: {others or 'none is registered'}"
+    )
+
+
+def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
+    """The photographs at the size to use them at, undistorted."""
+    for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
+        check_camera(shot.camera, shot.name)
+    masks = find_masks(data.path, data.masks, shots)
+    with ThreadPoolExecutor(4) as pool:
+        sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
+        for shot, size in zip(shots, sizes, strict=True):
+            _refuse_size(shot, size)
+            if shot.name in masks:
+                check_mask(masks[shot.name], size)
+        pictures = list(pool.map(lambda shot, size: _picture(data, shot, size, masks.get(shot.name)), shots, sizes))
+    return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
+
+
+def _picture(data: Data, shot: Shot, size: tuple[int, int], mask: Path | None) -> Picture:
+    used = Picture(shot.path, mask, shot.camera, data.size(*size), data.white)
+    return used if is_pinhole(shot.camera) else undistorted(used, data.path)
+
+
+def _refuse_size(shot: Shot, size: tuple[int, int]) -> None:
+    """BadInput unless the photograph is the camera's picture at some size, within a pixel."""
+    full = (shot.camera.width, shot.camera.height)
+    long = 0 if full[0] >= full[1] else 1
+    if abs(full[1 - long] * size[long] / full[long] - size[1 - long]) <= 1:
+        return
+    turned = " (turned by 90 degrees)" if size[0] * full[0] == size[1] * full[1] else ""
+    raise BadInput(
+        f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera {shot.camera.camera_id} has "
+        f"{full[0]} x {full[1]}; use the photographs that the model was made from, whole and unturned"
+    )
+
+
+def _view(shot: Shot, picture: Picture, frame: Frame) -> View:
+    lens = picture.camera
+    full = Camera(
+        world_to_camera=frame.local_pose(shot.pose),
+        fx=float(lens.focal_length_x),
+        fy=float(lens.focal_length_y),
+        cx=float(lens.principal_point_x),
+        cy=float(lens.principal_point_y),
+        width=int(lens.width),
+        height=int(lens.height),
+    )
+    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white)
+
+
+def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
+    """(K, 2) pixels of a lens as shares of the width and height of the undistorted picture."""
+    if is_pinhole(lens):
+        return pixels / (lens.width, lens.height)
+    rays = np.asarray(lens.cam_from_img(pixels), np.float64).reshape(-1, 2)
+    return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
+
+
+def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
+    if len(capture.xyz):
+        xyz = frame.to_local(capture.xyz).astype(np.float32)
+        return Cloud(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
+    emit(
+        Warned(
+            f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
+            "cameras and of what lies before them, which takes longer and leaves more floaters"
+        )
+    )
+    local = np.stack([frame.local_pose(pose).numpy() for pose in poses])
+    centres = -(local[:, :3, :3].transpose(0, 2, 1) @ local[:, :3, 3:])[..., 0]
+    corners = np.concatenate([centres, centres + local[:, 2, :3]])  # one extent ahead, along the optical axes
+    draw = np.random.default_rng(0)
+    xyz = draw.uniform(corners.min(0), corners.max(0), (RANDOM_POINTS, 3)).astype(np.float32)
+    return Cloud(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8))
