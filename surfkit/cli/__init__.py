@@ -15,7 +15,7 @@ import select
 import sys
 from collections.abc import Sequence
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
@@ -31,7 +31,10 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit status: 2 for what the user can put right, 130 when interrupted.
+    """Run a command line and return its exit status.
+
+    2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, and
+    130 for one that was interrupted.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -71,9 +74,9 @@ def _guarded(words: list[str]) -> int:
     """The exit status of a command line, with one line on stderr for what is not a mistake of ours."""
     try:
         return _dispatch(words)
-    except BadInput as error:
+    except (BadInput, Fault) as error:
         print(f"surfkit: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, BadInput) else 1
     except KeyboardInterrupt:
         print("surfkit: interrupted", file=sys.stderr)
         return 130

@@ -13,7 +13,8 @@ import surfkit
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
-from surfkit.pipeline import CHECKPOINT_EVERY, Run, run, with_steps
+from surfkit.folder import Run
+from surfkit.pipeline import CHECKPOINT_EVERY, run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
