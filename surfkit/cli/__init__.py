@@ -19,8 +19,8 @@ from surfkit.core.check import BadInput, Fault
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
-    "status": "Tell where a run stands.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
+    "status": "Tell where a run stands.",
     "export": "Write the result of a run for other programs.",
     "prepare": "Make what a data set may need before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
