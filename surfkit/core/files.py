@@ -8,6 +8,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
+UNFINISHED = (".*.part", ".tmp??????")
+"""Names of files that are being written, by us and by safetensors."""
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
@@ -38,5 +41,6 @@ def sync_folder(folder: Path) -> None:
 
 def sweep(folder: Path) -> None:
     """Delete what dead processes left unfinished in a folder that no other process works in."""
-    for path in folder.rglob(".*.part"):
-        path.unlink(missing_ok=True)
+    for pattern in UNFINISHED:
+        for path in folder.rglob(pattern):
+            path.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import errno
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,8 @@ GROUPS = ("params", "first", "second", "stats")
 SCALARS = ("index", "seconds", "cpu_seconds", "peak_memory_bytes", "reset_at", "sh_degree", "halvings", "skipped")
 """What of a state is written as it is."""
 FACTS = {"views", "shown", *SCALARS}
-FULL = "os error 28"
-"""How safetensors says that the disk is full."""
+SYSTEM = re.compile(r"os error (\d+)")
+"""How safetensors says what the system has refused."""
 
 
 def before(path: Path) -> Path:
@@ -118,7 +119,8 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
     try:
         save_file(tensors, part, metadata=metadata)
     except SafetensorError as error:
-        code = errno.ENOSPC if FULL in str(error) else errno.EIO
+        said = SYSTEM.search(str(error))
+        code = int(said[1]) if said else errno.EIO
         raise OSError(code, os.strerror(code), str(part)) from error
     with open(part, "rb+") as file:
         os.fsync(file.fileno())

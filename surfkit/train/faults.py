@@ -73,6 +73,6 @@ def in_one_line(out: Path) -> Iterator[None]:
         held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
         raise Fault(
             f"{out}: out of memory{held}; smaller photographs (--longest, --scale) or fewer points (a higher "
-            "pretrain.densify threshold, a lower primitive.sh-degree) need less, in a folder of their own; the last "
-            "checkpoint is whole, and where there is more memory the same command goes on from there"
+            "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
+            "last checkpoint is whole, and where there is more memory the same command goes on from there"
         ) from error

@@ -25,7 +25,7 @@ def test_what_fails_leaves_the_old_and_nothing_else(tmp_path):
 
 
 def test_what_the_dead_left_is_swept_away(tmp_path):
-    for name in ("x/.a.json.12.part", "x/a.json", ".c.part", ".hidden"):
+    for name in ("x/.a.json.12.part", "x/a.json", ".c.part", "x/.tmpAb1cD2", ".hidden"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     sweep(tmp_path)
