@@ -190,16 +190,19 @@ class Notes:
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
-        if isinstance(event, PhotoSkipped):
-            new, kept, text = event.name, self.skipped, f"{event.reason}; the run goes on without this photograph"
-        elif isinstance(event, Warned):
-            new, kept, text = event.text, self.texts, event.text
-        else:
-            return
-        say(f"note: {text}")
-        if new not in kept:
-            kept.append(new)
-            self.write()
+        if isinstance(event, Warned):
+            say(f"note: {event.text}")
+            self.keep(self.texts, event.text)
+        elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
+            say(f"note: {event.reason}; the run goes on without this photograph")
+
+    def keep(self, kept: list[str], text: str) -> bool:
+        """Keep a text unless it is there already; whether it is new."""
+        if text in kept:
+            return False
+        kept.append(text)
+        self.write()
+        return True
 
 
 @contextmanager
