@@ -25,7 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-STEPS = 60
+STEPS = 40
 WORDS = f"train recipe:2dgs --steps {STEPS} --checkpoint-every 7 --pictures-every 20 --device cpu"
 SETTINGS = "--primitive.sh-degree 1 --pretrain.densify.every 5 --pretrain.densify.start 10"
 KINDS = ("time", "operation", "torn")
@@ -183,7 +183,7 @@ class Kills:
         if kind == "time":
             after = self.draw.uniform(0, 0.8 * self.seconds)
             return attempt(self.data, out, lambda: None, after), kind, after
-        at = self.draw.randint(1, self.operations // 2 if kind == "operation" else 4)
+        at = self.draw.randint(1, self.operations * 4 // 5 if kind == "operation" else 4)
         deadly = Deadly(out, at) if kind == "operation" else Deadly(out, torn=at, share=self.draw.random())
         return attempt(self.data, out, deadly.install), kind, at
 
