@@ -24,8 +24,9 @@ def folder(tmp_path):
             if index == 100:
                 emit(FileWritten(out / "pretrain" / "checkpoint.safetensors", "checkpoint"))
     lines = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
-    for at, line in enumerate(lines):  # as if four steps had been made a second
-        line["time"] = 1000 + line.get("index", at) / 4
+    for at, line in enumerate(lines):  # as if four steps had been made a second, after ten slow ones
+        index = line.get("index", at)
+        line["time"] = 1000 + index / 4 if index > 10 else 10 * index
     (out / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return out
 
@@ -60,6 +61,8 @@ def test_a_finished_run(folder, capsys):
     (folder / "point_cloud.ply").touch()
     assert main(["status", str(folder)]) == 0
     assert "23.46 dB of 1 views\n" in capsys.readouterr().out
+    with held(folder):
+        assert main(["status", str(folder)]) == 3, "someone is at it again"
 
 
 def test_no_run_is_2(tmp_path, capsys):

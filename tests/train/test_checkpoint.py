@@ -134,6 +134,7 @@ def test_nothing_is_lost_between_the_two_renames(begin, tmp_path, monkeypatch):
         with pytest.raises(KeyboardInterrupt):
             save(path, state)
     assert not path.exists() and load_last(path)[1] is None and load_last(path)[0].index == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["c-before.safetensors"]
     save(path, state)
     assert load_last(path)[0].index == 0
 
