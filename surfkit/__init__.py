@@ -9,13 +9,15 @@ import importlib
 from typing import Any
 
 _HOME = {
-    "surfkit.core.check": ("BadInput", "expect"),
+    "surfkit.core.check": ("BadInput", "Fault", "expect"),
     "surfkit.core.codec": ("dump", "load", "read_json", "write_json"),
     "surfkit.core.registry": ("Component", "choice", "components", "find", "hookimpl"),
     "surfkit.core.schedule": ("Interval", "StepCount", "Steps", "log_linear", "rescale"),
     "surfkit.core.tree": ("evolve",),
     "surfkit.core.events": (
         "FileWritten",
+        "Measured",
+        "PhotoSkipped",
         "PointsEdited",
         "StageBegan",
         "StageEnded",

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
-import platform
-import sys
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +11,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, load, read_json, write_json
+from surfkit.core.check import BadInput, Fault
+from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit
-from surfkit.core.registry import hookimpl, plugins, records
+from surfkit.core.files import sweep
+from surfkit.core.journal import kept
+from surfkit.core.lock import held
+from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.schedule import rescale
-from surfkit.core.version import own_version
-from surfkit.evaluate.images import evaluate_views, frames_per_second
+from surfkit.evaluate.along import Along
+from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
+from surfkit.folder import Run, claim, discard, noted, refuse_changed, refuse_file, refuse_other, say
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
@@ -38,46 +38,25 @@ from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
+from surfkit.train.faults import MOST_HALVINGS, Diverged, in_one_line
 from surfkit.train.interrupt import graceful
-from surfkit.train.progress import Display, peak_memory_bytes
+from surfkit.train.progress import Display
 from surfkit.train.stage import StageState, Trainer
 
 CHECKPOINT_EVERY = 500
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run folder and what it was made from.
+class Every:
+    """Steps between what is written while a stage runs.
 
     Attributes:
-        out: The folder.
-        recipe: Part of it as recipe.json.
-        data: Part of it in run.json.
+        checkpoint: States of the optimisation.
+        pictures: Pictures of a few held-out views; 0 for none.
     """
 
-    out: Path
-    recipe: Recipe
-    data: Data
-
-    @property
-    def checkpoint(self) -> Path:
-        """The state of the optimisation."""
-        return self.out / "pretrain" / "checkpoint.safetensors"
-
-    @property
-    def metrics(self) -> Path:
-        """The measurements."""
-        return self.out / "metrics.json"
-
-    @property
-    def cloud(self) -> Path:
-        """The points, in the frame of the input."""
-        return self.out / "point_cloud.ply"
-
-    @property
-    def pictures(self) -> Path:
-        """Renders beside the photographs."""
-        return self.out / "pictures"
+    checkpoint: int = CHECKPOINT_EVERY
+    pictures: int = 0
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
@@ -93,94 +72,67 @@ def run(
     out: Path,
     device: Device = "auto",
     checkpoint_every: int = CHECKPOINT_EVERY,
+    pictures_every: int | None = None,
     cache: str = "auto",
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
 
-    `cache` is the memory for photographs, masks and depth priors, such as "4GB"; the result does not depend on it.
+    Args:
+        recipe: What to do.
+        data: What to do it with.
+        out: Run folder.
+        device: Where to compute.
+        checkpoint_every: Steps between checkpoints.
+        pictures_every: Steps between pictures of a few held-out views; a fifth of the run if None, 0 for none.
+        cache: Memory for photographs, masks and depth priors, such as "4GB"; the result does not depend on it.
 
     Raises:
-        BadInput: `out` holds a run of another recipe or of other data, or the data cannot be used.
+        BadInput: `out` holds a run of another recipe or of other data, another process works in it, or the data cannot
+            be used.
+        Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
         KeyboardInterrupt: The run was asked to stop, and has saved its state.
     """
     this = Run(out, recipe, replace(data, path=data.path.resolve()))
-    refuse_other(this)
+    pictures_every = max(1, recipe.pretrain.steps // 5) if pictures_every is None else pictures_every
+    refuse_file(out)
     budget = cache_bytes(cache)
-    with noted() as notes:
+    with noted() as notes, held(out), in_one_line(out):
+        sweep(out)
+        refuse_other(this)
         scene = read(this.data)
         rasterizer, backend = drawer(device)
-        state = saved(this, scene)
+        state = saved(this, scene, repair=True)
+        prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         unfinished = state is None or state.index < recipe.pretrain.steps
-        claim(this, backend, notes)
-        if unfinished:
-            discard(this.metrics, this.cloud)
-            state = optimise(this, scene, rasterizer, state, checkpoint_every, read_ahead(this, scene, budget))
-        elif this.metrics.exists() and this.cloud.exists():
-            say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
-            return read_json(this.metrics, Any)
-        if not this.cloud.exists():
-            export(this, state, scene)
-        return evaluate(this, state, scene, rasterizer, budget)
+        given = read_ahead(this, scene, budget) if unfinished else None
+        claim(this, backend, prints, notes)
+        with kept(out):
+            if unfinished:
+                discard(this.metrics, this.cloud)
+                every = Every(checkpoint_every, pictures_every)
+                state = optimise(this, scene, rasterizer, state, every, given)
+            elif this.metrics.exists() and this.cloud.exists():
+                say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
+                return read_json(this.metrics, Any)
+            if not this.cloud.exists():
+                export(this, state, scene)
+            return evaluate(this, state, scene, rasterizer, budget)
 
 
-def refuse_other(this: Run) -> None:
-    """BadInput if the folder holds a run that this one does not continue."""
-    if this.out.exists() and not this.out.is_dir():
-        raise BadInput(f"--out {this.out}: a file, not a folder; name another one")
-    for name, key, value in (("recipe.json", None, this.recipe), ("run.json", "data", this.data)):
-        path = this.out / name
-        if not path.exists():
-            continue
-        there = read_json(path, Any)
-        before = there if key is None else dump(load(Data, there.get(key), key))  # with the defaults of newer settings
-        found = difference(before, dump(value), key or "")
-        if found is not None:
-            at, old, new = found
-            raise BadInput(
-                f"--out {this.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
-                "name another folder, or delete that one"
-            )
+def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
+    """The state of the last whole checkpoint, if there is one and the data is still what it was.
 
-
-def difference(old: Any, new: Any, at: str) -> tuple[str, Any, Any] | None:
-    """Path and both values of the first difference between plain data; what a recipe says of itself does not count."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old)]:
-            path = f"{at}.{key}" if at else key
-            if path != "about" and (found := difference(old.get(key), new.get(key), path)):
-                return found
+    `repair`: put it in the place of a damaged one.
+    """
+    found = checkpoint.load_last(this.checkpoint)
+    if found is None:
         return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        pairs = enumerate(zip(old, new, strict=True))
-        return next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
-    return None if old == new else (at, old, new)
-
-
-def claim(this: Run, backend: str, notes: list[str]) -> None:
-    """Write down what the run is made from, and on what it runs."""
-    path = this.out / "run.json"
-    before = read_json(path, Any)["notes"] if path.exists() else []
-    write_json(this.out / "recipe.json", this.recipe)
-    write_json(
-        path,
-        {
-            "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
-            "plugins": [str(plugin) for plugin in records() if plugin.distribution],
-            "device": backend,
-            "threads": torch.get_num_threads(),
-            "seed": this.recipe.seed,
-            "data": this.data,
-            "notes": list(dict.fromkeys([*before, *notes])),
-        },
-    )
-
-
-def saved(this: Run, scene: Scene) -> StageState | None:
-    """The state of the last checkpoint, if there is one and the data is still what it was."""
-    if not this.checkpoint.exists():
-        return None
-    state = checkpoint.load(this.checkpoint)
+    state, damage = found
+    if damage is not None:
+        emit(Warned(f"{damage.partition(';')[0]}; the one before it, of step {state.index}, is used instead"))
+        if repair:
+            checkpoint.restore(this.checkpoint)
     if state.order.count != len(scene.train):
         raise BadInput(
             f"--out {this.out} was trained on {state.order.count} photographs and {this.data.path} now gives "
@@ -224,34 +176,79 @@ def optimise(
     scene: Scene,
     rasterizer: Rasterizer,
     state: StageState | None,
-    checkpoint_every: int,
+    every: Every,
     given: Material,
 ) -> StageState:
-    """Run the stage from its last state, or from the sparse points, to its end."""
+    """Run the stage from its last state, or from the sparse points, to its end.
+
+    After numbers that are not finite it goes back to its last checkpoint with half the learning rates, twice at most.
+    """
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
     sources = (given.photos, rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, scene.train, *sources)
-    if state is None:
+    along = Along(this.out / "progress", scene.held_out) if every.pictures and scene.held_out else None
+
+    def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
-        state = trainer.begin(Points.fresh(primitive.init(scene.cloud, generator)), generator)
-    else:
+        return trainer.begin(Points.fresh(primitive.init(scene.cloud, generator)), generator)
+
+    if state is not None:
         say(f"{this.out}: going on after step {state.index} of {stage.steps}")
-    emit(StageBegan("pretrain", stage.steps, len(state.points), state.index + 1))
-    seconds = state.seconds
-    with graceful() as request, Display("pretrain", stage.steps) as display:
+    state = state or begin()
+    while True:
+        try:
+            return take_steps(this, trainer, state, every, along)
+        except Diverged as error:
+            state = rolled_back(this, state.halvings, error, begin)
+
+
+def take_steps(this: Run, trainer: Trainer, state: StageState, every: Every, along: Along | None) -> StageState:
+    """Take the steps that are left, and write checkpoints and pictures on the way."""
+    steps, seconds = trainer.stage.steps, state.seconds
+    emit(StageBegan("pretrain", steps, len(state.points), state.index + 1))
+    with graceful() as request, Display("pretrain", steps) as display:
         for done in trainer.run(state):
             display.show(done)
-            if request.asked or done.index % checkpoint_every == 0 or done.index == stage.steps:
+            if along is not None and done.index % every.pictures == 0 and done.index < steps:
+                along.look(done.index, drawing(this, state, trainer.rasterizer))
+            if request.asked or done.index % every.checkpoint == 0 or done.index == steps:
                 state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
                 checkpoint.save(this.checkpoint, state)
                 emit(FileWritten(this.checkpoint, "checkpoint"))
             if request.asked:
                 break
     if request.asked:
-        say(f"stopped after step {state.index} of {stage.steps}; the same command goes on from there")
+        say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
-    emit(StageEnded("pretrain", stage.steps, len(state.points), state.seconds - seconds))
+    emit(StageEnded("pretrain", steps, len(state.points), state.seconds - seconds))
     return state
+
+
+def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], StageState]) -> StageState:
+    """The last good state, or a new beginning, with half the learning rates; it is saved, so that nothing forgets it.
+
+    Raises:
+        Fault: They have been halved often enough.
+    """
+    if halvings >= MOST_HALVINGS:
+        raise Fault(
+            f"{this.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
+            "and its camera, or lower pretrain.rates in another folder; the last checkpoint is whole"
+        ) from error
+    found = checkpoint.load_last(this.checkpoint)
+    state = found[0] if found else begin()
+    state.halvings = halvings + 1
+    times = f"{state.halvings} of {MOST_HALVINGS} times"
+    emit(Warned(f"{error}; back to step {state.index}, with learning rates halved ({times})"))
+    checkpoint.save(this.checkpoint, state)
+    return state
+
+
+def drawing(this: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
+    """What draws the points of a state, as they are to be looked at."""
+    stage = this.recipe.pretrain
+    splats = this.recipe.primitive.shape(stage.finished(state), state.sh_degree)
+    return lambda view: rasterizer.render(splats, view.camera, stage.near, geometry).maps
 
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
@@ -265,15 +262,7 @@ def evaluate(
     this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int | None = None
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
-    stage, primitive = this.recipe.pretrain, this.recipe.primitive
-    degree = min(primitive.sh_degree, state.index // stage.sh_every)
-    splats = primitive.shape(stage.finished(state), degree)
-
-    def draw(view: View) -> Maps:
-        return rasterizer.render(splats, view.camera, stage.near).maps
-
-    def colors(view: View) -> Maps:
-        return rasterizer.render(splats, view.camera, stage.near, geometry=False).maps
+    draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
@@ -284,7 +273,7 @@ def evaluate(
         draw,
         timed=colors,
         show=show,
-        correct_color=stage.appearance is not None,
+        correct_color=this.recipe.pretrain.appearance is not None,
         masks=mask_cache(scene.held_out, budget_bytes),
     )
     metrics = {
@@ -336,45 +325,3 @@ def warn_of_gaps(scene: Scene, state: StageState | None) -> None:
     """Say what the data does not allow."""
     if state is None and not scene.held_out:
         emit(Warned("no photograph is kept from training, so the quality cannot be measured; see --test-every"))
-
-
-class Notes:
-    """Keeps and prints the warnings of a run."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-
-    @hookimpl
-    def surfkit_event(self, event: Any) -> None:
-        """See one event."""
-        if isinstance(event, Warned):
-            self.texts.append(event.text)
-            say(f"note: {event.text}")
-
-
-@contextmanager
-def noted() -> Iterator[list[str]]:
-    """The warnings of what happens within, as a list that grows."""
-    notes = Notes()
-    plugins().register(notes, "notes of the run")
-    try:
-        yield notes.texts
-    finally:
-        plugins().unregister(notes)
-
-
-def discard(*paths: Path) -> None:
-    """Delete results that further steps make wrong."""
-    for path in paths:
-        path.unlink(missing_ok=True)
-
-
-def say(text: str) -> None:
-    """Tell the person who watches."""
-    print(text, file=sys.stderr)
-
-
-def short(value: Any) -> str:
-    """A value in a few words."""
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."

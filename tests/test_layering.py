@@ -15,6 +15,7 @@ FLOORS = (
     "densify appearance",
     "train partition compress mesh evaluate",
     "recipe",
+    "folder",
     "pipeline",
     "report",
     "recipes",

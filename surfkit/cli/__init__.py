@@ -15,11 +15,12 @@ import select
 import sys
 from collections.abc import Sequence
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
+    "status": "Tell where a run stands.",
     "export": "Write the result of a run for other programs.",
     "prepare": "Make what a data set may need before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
@@ -31,7 +32,10 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit status: 2 for what the user can put right, 130 when interrupted.
+    """Run a command line and return its exit status.
+
+    2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, and
+    130 for one that was interrupted.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -71,9 +75,9 @@ def _guarded(words: list[str]) -> int:
     """The exit status of a command line, with one line on stderr for what is not a mistake of ours."""
     try:
         return _dispatch(words)
-    except BadInput as error:
+    except (BadInput, Fault) as error:
         print(f"surfkit: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, BadInput) else 1
     except KeyboardInterrupt:
         print("surfkit: interrupted", file=sys.stderr)
         return 130

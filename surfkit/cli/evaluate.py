@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.cli.result import show
+from surfkit.folder import noted
 from surfkit.pipeline import drawer, evaluate, load_run
 from surfkit.raster.select import Device
 
@@ -25,9 +26,10 @@ class Evaluate:
 
     def run(self) -> None:
         """Measure, and show what came out."""
-        this, state, scene = load_run(self.run_folder)
-        rasterizer, _ = drawer(self.device)
-        show(this, evaluate(this, state, scene, rasterizer))
+        with noted():
+            this, state, scene = load_run(self.run_folder)
+            rasterizer, _ = drawer(self.device)
+            show(this, evaluate(this, state, scene, rasterizer))
 
 
 COMMAND = Evaluate

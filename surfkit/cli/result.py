@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from surfkit.cli.table import print_table
-from surfkit.pipeline import Run
+from surfkit.folder import Run
 
 
 def show(this: Run, metrics: dict[str, Any]) -> None:

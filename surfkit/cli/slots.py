@@ -40,13 +40,14 @@ def choices_first(command: type, argv: Sequence[str]) -> list[str]:
     A setting before the choice it belongs to would choose the default part. A choice without alternatives is left out:
     tyro sees no choice there.
     """
-    known, done = slots(command, argv), handled(argv)
+    known = slots(command, argv)
+    done = handled(argv) if "recipe" in known else set()
     argv = [word for word in argv if word not in done]
     names = {word: known.get(word.partition(":")[0], ()) for word in argv}
     choices = [word for word in argv if word.partition(":")[2] in names[word]]
     others = [word for word in argv if word.partition(":")[2] not in names[word]]
     choices.sort(key=lambda word: (not word.startswith(WHOLE), word.partition(":")[0].count(".")))
-    done = handled(argv)
+    done = handled(argv) if "recipe" in known else set()
     return [word for word in choices if len(names[word]) > 1 and word not in done] + [
         w for w in others if w not in done
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,9 +14,11 @@ import surfkit
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
-from surfkit.pipeline import CHECKPOINT_EVERY, Run, run, with_steps
+from surfkit.folder import Run
+from surfkit.pipeline import CHECKPOINT_EVERY, run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
+from surfkit.report.tensorboard import tensorboard
 from surfkit.scene.data import Data
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
@@ -31,8 +34,10 @@ def named_recipe() -> str:
 class Train:
     """Reconstruct a surface from photographs with known cameras.
 
-    An interrupted run goes on when the same command is given again. Any part of the recipe can be swapped with
-    `field:NAME`, such as `primitive:gaussian3d` or `pretrain.densify:none`; `surfkit components` lists the names.
+    An interrupted run goes on when the same command is given again, and a finished one when --steps is raised. Any part
+    of the recipe can be swapped with `field:NAME`, such as `primitive:gaussian3d` or `pretrain.densify:none`; `surfkit
+    components` lists the names. Exits 1 when memory, disk or finite numbers give out, 2 for words and data to put
+    right, 130 when interrupted.
     """
 
     recipe: Annotated[Recipe, chosen_recipe]
@@ -46,7 +51,8 @@ class Train:
     """Run folder; runs/DATA-RECIPE by default."""
 
     steps: int | None = None
-    """Length of the run. Every schedule of the recipe is scaled along, so that a short run is a small whole run."""
+    """Length of the run. Every schedule of the recipe is scaled along, so that a short run is a small whole run. Raised
+    later, the run goes on under the schedules of the new length."""
 
     scale: float | None = None
     """Divide the size of every photograph by this."""
@@ -76,7 +82,14 @@ class Train:
     """Where to compute."""
 
     checkpoint_every: int = CHECKPOINT_EVERY
-    """Steps between checkpoints."""
+    """Steps between checkpoints, of which the last two are kept; there is also one at an interruption."""
+
+    pictures_every: int | None = None
+    """Steps between pictures of up to three held-out photographs, in progress/ of the run folder; a fifth of the run by
+    default, 0 for none."""
+
+    tensorboard: bool = False
+    """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder."""
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
@@ -87,6 +100,8 @@ class Train:
     def __post_init__(self) -> None:
         if self.checkpoint_every < 1:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
+        if self.pictures_every is not None and self.pictures_every < 0:
+            raise BadInput(f"--pictures-every {self.pictures_every}: give 0 (none) or more steps")
         if not self.folder:  # the words of the command line are only known while it is parsed
             object.__setattr__(self, "folder", named_recipe())
 
@@ -96,7 +111,8 @@ class Train:
         data = Data(self._data(), self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
-        metrics = run(recipe, data, out, self.device, self.checkpoint_every, self.cache)
+        with tensorboard(out) if self.tensorboard else nullcontext():
+            metrics = run(recipe, data, out, self.device, self.checkpoint_every, self.pictures_every, self.cache)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

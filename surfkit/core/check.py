@@ -12,6 +12,13 @@ class BadInput(ValueError):
     """
 
 
+class Fault(RuntimeError):
+    """A sound run that cannot go on: memory, disk or numbers gave out. The command line prints one line and exits 1.
+
+    The message says where, what happened, what is still there and what to do.
+    """
+
+
 def expect(name: str, array: Any, shape: tuple[int | str, ...], sizes: dict[str, int] | None = None) -> dict[str, int]:
     """The size behind each letter of `shape`, or BadInput if the array has another shape.
 

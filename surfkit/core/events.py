@@ -40,12 +40,14 @@ class StepDone:
         steps: How many the stage has.
         losses: Weighted value of each loss, by its name in the recipe.
         points: After the step.
+        peak_memory_bytes: Most memory held so far; 0 where the system does not tell.
     """
 
     index: int
     steps: int
     losses: Mapping[str, float]
     points: int
+    peak_memory_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,32 @@ class Warned:
 
 
 @dataclass(frozen=True)
+class PhotoSkipped:
+    """A photograph cannot be read, and the run goes on without it.
+
+    Attributes:
+        name: As the data set spells it.
+        reason: What is wrong with it.
+    """
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Renders of held-out photographs were measured along the way.
+
+    Attributes:
+        index: Of the step.
+        psnr: Of each photograph, dB, by its name.
+    """
+
+    index: int
+    psnr: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class StageEnded:
     """An optimisation run is complete.
 
@@ -108,7 +136,7 @@ class StageEnded:
     seconds: float
 
 
-Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | StageEnded
+Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | PhotoSkipped | Measured | StageEnded
 
 _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""

@@ -36,9 +36,18 @@ def rescale(value: T, factor: float) -> T:
         value: Frozen dataclasses, tuples and dicts of them. Counts of 0 (never, or at once) stay 0; None stays None.
         factor: New length over old length of the run, above 0.
     """
+    return rescale_like(value, factor, None)
+
+
+def rescale_like(value: T, factor: float, like: Any) -> T:
+    """As `rescale`, but with the counts of `like` wherever they are the same up to rounding.
+
+    So a schedule that was shortened from a third one and then made longer can be compared with one that was shortened
+    from it at once.
+    """
     if not (math.isfinite(factor) and factor > 0):
         raise BadInput(f"steps can be scaled by a factor above 0, got {factor}")
-    return _rescale(type(value), value, factor)
+    return _rescale(type(value), value, factor, like)
 
 
 def log_linear(start: float, end: float, share: float) -> float:
@@ -49,24 +58,33 @@ def log_linear(start: float, end: float, share: float) -> float:
     return start ** (1 - share) * end**share
 
 
-def _rescale(hint: Any, value: Any, factor: float) -> Any:
+def _rescale(hint: Any, value: Any, factor: float, like: Any) -> Any:
     marker = _marker(hint)
     if marker is not None and isinstance(value, int) and value > 0:
-        return max(math.floor(value * factor + 0.5), min(marker.floor, value))
+        scaled = max(math.floor(value * factor + 0.5), min(marker.floor, value))
+        return like if isinstance(like, int) and _alike(marker, value, like, factor) else scaled
     if is_dataclass(value) and not isinstance(value, type):
         hints = get_type_hints(type(value), include_extras=True)
         old = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
-        new = {name: _rescale(hints[name], item, factor) for name, item in old.items()}
+        new = {name: _rescale(hints[name], item, factor, getattr(like, name, None)) for name, item in old.items()}
         try:
             return replace(value, **{name: item for name, item in new.items() if item is not old[name]})
         except ValueError as error:
             raise BadInput(f"scaling the steps by {factor:g}: {error}") from error
     inner = _element_hints(hint, value)
     if isinstance(value, tuple):
-        return tuple(_rescale(hint, item, factor) for hint, item in zip(inner, value, strict=True))
+        likes = like if isinstance(like, tuple) and len(like) == len(value) else [None] * len(value)
+        return tuple(_rescale(*pair, factor, other) for *pair, other in zip(inner, value, likes, strict=True))
     if isinstance(value, dict):
-        return {key: _rescale(inner[0], item, factor) for key, item in value.items()}
+        likes = like if isinstance(like, dict) else {}
+        return {key: _rescale(inner[0], item, factor, likes.get(key)) for key, item in value.items()}
     return value
+
+
+def _alike(marker: StepCount, value: int, like: int, factor: float) -> bool:
+    """Whether one count may be rounded from what the other, times `factor`, was rounded from."""
+    lowest = marker.floor if value <= marker.floor else value * factor - (1 + factor) / 2
+    return lowest <= like <= value * factor + (1 + factor) / 2
 
 
 def _alternatives(hint: Any) -> list[Any]:

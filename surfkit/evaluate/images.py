@@ -10,6 +10,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
+from surfkit.core.events import PhotoSkipped, emit
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim, ssim_map
 from surfkit.scene.scene import View
@@ -80,6 +82,8 @@ def evaluate_views(
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
+    A photograph that cannot be read is left out, and `PhotoSkipped` tells so.
+
     Args:
         views: Held-out views.
         photos: By position in `views`.
@@ -91,8 +95,12 @@ def evaluate_views(
     """
     per_image = {}
     for at, view in enumerate(views):
-        photo, maps = photos[at], draw(view)
-        mask = None if masks is None else masks[at]
+        try:
+            photo = photos[at]
+        except BadInput as error:
+            emit(PhotoSkipped(view.name, str(error)))
+            continue
+        maps, mask = draw(view), None if masks is None else masks[at]
         if mask is None or mask.any():
             render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
             per_image[view.name] = _measured(render, target, mask, correct_color)

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from surfkit.core.files import replacing
 from surfkit.raster.api import Maps
-from surfkit.scene.ply import replacing
 
 RAMP = np.array(
     [

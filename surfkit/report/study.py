@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 
 from surfkit import pipeline
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
 from surfkit.raster.select import Device
@@ -163,7 +163,7 @@ def attempt(trial: Trial, plan: Plan) -> Outcome:
     trace = trial.folder / TRACE
     try:
         metrics = pipeline.run(trial.recipe, plan.data, trial.folder, plan.device)
-    except BadInput as error:
+    except (BadInput, Fault) as error:
         return Outcome(failed=" ".join(str(error).split()))
     except Exception as error:
         write_text(trace, traceback.format_exc())

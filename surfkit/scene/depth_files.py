@@ -11,7 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
-from surfkit.scene.ply import replacing
+from surfkit.core.files import replacing
 
 FOLDER = "estimated_depths"
 RECORD = "depth.json"

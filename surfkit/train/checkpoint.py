@@ -1,28 +1,48 @@
-"""A stage on disk: everything needed to go on as if nothing had happened, without pickle."""
+"""A stage on disk: everything needed to go on as if nothing had happened, without pickle.
+
+The last two states are kept, and each carries a digest of itself. When the last one turns out damaged, the one before
+takes its place.
+"""
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import os
+import re
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.files import sync_folder
 from surfkit.primitives.points import Points
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
 
-FORMAT = "surfkit-stage-2"
+FORMAT = "surfkit-stage-3"
 GROUPS = ("params", "first", "second", "stats")
-FACTS = {"index", "views", "shown", "seconds", "cpu_seconds", "peak_memory_bytes", "reset_at"}
+SCALARS = ("index", "seconds", "cpu_seconds", "peak_memory_bytes", "reset_at", "sh_degree", "halvings", "skipped")
+"""What of a state is written as it is."""
+FACTS = {"views", "shown", *SCALARS}
+SYSTEM = re.compile(r"os error (\d+)")
+"""How safetensors says what the system has refused."""
+
+
+def before(path: Path) -> Path:
+    """Where the state before the last one lies."""
+    return path.with_name(f"{path.stem}-before{path.suffix}")
 
 
 def save(path: Path, state: StageState) -> None:
-    """Write a state; the file at `path` is replaced at once or not at all."""
-    from safetensors.torch import save_file
+    """Write a state, and keep the one that was there as the one before; nothing is lost at any moment.
 
+    Raises:
+        OSError: It cannot be written; what was there stays.
+    """
     tensors = {
         f"{group}.{name}": value.contiguous()
         for group in GROUPS
@@ -30,21 +50,47 @@ def save(path: Path, state: StageState) -> None:
     }
     tensors |= {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
-    facts = {
-        "index": state.index,
-        "views": state.order.count,
-        "shown": state.order.at,
-        "seconds": state.seconds,
-        "cpu_seconds": state.cpu_seconds,
-        "peak_memory_bytes": state.peak_memory_bytes,
-        "reset_at": state.reset_at,
-    }
+    facts = {"views": state.order.count, "shown": state.order.at} | {name: getattr(state, name) for name in SCALARS}
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    save_file(tensors, part, metadata={"format": FORMAT, "facts": json.dumps(facts)})
-    with open(part, "rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(part, path)
+    try:
+        _write(part, tensors, json.dumps(facts))
+        if path.exists():
+            os.replace(path, before(path))
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def load_last(path: Path) -> tuple[StageState, str | None] | None:
+    """The last state that is whole, and what is wrong with the file that should hold it; None if nothing was saved.
+
+    Raises:
+        BadInput: There are files, and none of them can be used.
+    """
+    there = [file for file in (path, before(path)) if file.exists()]
+    wrong = []
+    for file in there:
+        try:
+            return load(file), wrong[0] if wrong else None
+        except BadInput as error:
+            wrong.append(str(error))
+    if wrong:
+        raise BadInput("; ".join(wrong))
+    return None
+
+
+def restore(path: Path) -> None:
+    """Put the state before in the place of a damaged last one, so that the next one does not push it out."""
+    os.replace(before(path), path)
+    sync_folder(path.parent)
+
+
+def discard(path: Path) -> None:
+    """Delete all states."""
+    for file in (path, before(path)):
+        file.unlink(missing_ok=True)
 
 
 def load(path: Path) -> StageState:
@@ -61,13 +107,26 @@ def load(path: Path) -> StageState:
     generator = torch.Generator()
     generator.set_state(tensors["generator"])
     order = Order(facts["views"], tensors["order"], facts["shown"])
-    done = ("index", "seconds", "cpu_seconds", "peak_memory_bytes")
-    state = StageState(points, order, generator, *(facts[name] for name in done))
-    state.looks, state.reset_at = looks, facts["reset_at"]
-    return state
+    return StageState(points, order, generator, looks=looks, **{name: facts[name] for name in SCALARS})
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict]:
+def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
+    """Write a file and let the disk know it."""
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    metadata = {"format": FORMAT, "facts": facts, "digest": _digest(tensors, facts)}
+    try:
+        save_file(tensors, part, metadata=metadata)
+    except SafetensorError as error:
+        said = SYSTEM.search(str(error))
+        code = int(said[1]) if said else errno.EIO
+        raise OSError(code, os.strerror(code), str(part)) from error
+    with open(part, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -78,15 +137,29 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict]:
                     f"{path} is of format {metadata.get('format')!r}, not {FORMAT!r}; delete it to start anew"
                 )
             tensors, facts = {name: file.get_tensor(name) for name in file.keys()}, json.loads(metadata["facts"])
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
+    if _digest(tensors, metadata["facts"]) != metadata.get("digest"):
+        raise BadInput(f"{path} is damaged: its digest does not fit what is in it; delete it to start anew")
     wanted = {"params.means", "order", "generator"}
     if missing := (wanted - tensors.keys()) | (FACTS - facts.keys()):
         raise BadInput(f"{path} lacks {', '.join(sorted(missing))}; delete it to start anew")
     return tensors, facts
 
 
-def _check(path: Path, points: Points, order: Tensor, facts: dict) -> None:
+def _digest(tensors: dict[str, Tensor], facts: str) -> str:
+    """SHA-256 of names, types, shapes, bytes and facts."""
+    found = hashlib.sha256(facts.encode())
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        found.update(f"\0{name}\0{value.dtype}\0{tuple(value.shape)}\0".encode())
+        found.update(value.reshape(-1).view(torch.uint8).numpy() if value.numel() else b"")
+    return found.hexdigest()
+
+
+def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> None:
     """Every column must have a row per point, every parameter its moments, and the order every view."""
     count = len(points)
     for group in GROUPS:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +12,8 @@ from torch import Tensor
 
 from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
-from surfkit.core.events import PointsEdited, StepDone, emit
+from surfkit.core.events import PhotoSkipped, PointsEdited, StepDone, emit
+from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import choice
 from surfkit.core.schedule import Interval, Steps
 from surfkit.densify.adc import ADC
@@ -27,6 +27,7 @@ from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.train.adam import Rate, adam_step
+from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.views import Order, Survey
 
@@ -116,6 +117,12 @@ class StageState:
     """What is known of the look of each photograph (`train.look`)."""
     reset_at: int = 0
     """Step that last lowered the opacities; 0 if none has."""
+    sh_degree: int = 0
+    """Of the spherical harmonics so far. It never falls, also when the schedule becomes a longer one."""
+    halvings: int = 0
+    """How often the learning rates have been halved, after numbers that were not finite."""
+    skipped: list[int] = field(default_factory=list)
+    """Positions of photographs that turned out damaged, and are not shown any more."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +186,7 @@ class Trainer:
             state.seconds += time.perf_counter() - wall
             state.cpu_seconds += time.process_time() - cpu
             wall, cpu = time.perf_counter(), time.process_time()
-            emit(StepDone(done.index, self.stage.steps, done.losses, done.points))
+            emit(StepDone(done.index, self.stage.steps, done.losses, done.points, peak_memory_bytes()))
             yield done
 
     def foretell(self, order: Order) -> None:
@@ -187,24 +194,15 @@ class Trainer:
         if self.expect is not None and order.at < len(order.queue):
             self.expect(order.queue[order.at :].tolist())
 
-    def shown(self, state: StageState) -> tuple[int, Sample]:
-        """The view to show now: its position, and all that is known of it."""
-        if state.order.at == len(state.order.queue):
-            state.order.shuffle(state.generator)
-            self.foretell(state.order)
-        at = state.order.next(state.generator)
-        photo = self.photos[at].to(torch.float32).div_(255)
-        prior, mask = (None if known is None else known[at] for known in (self.priors, self.masks))
-        return at, Sample(self.views[at], photo, prior, mask)
-
     def step(self, state: StageState) -> Done:
         """Show one photograph, and let points and policies learn from it."""
         stage, index = self.stage, state.index + 1
-        shown, sample = self.shown(state)
+        shown, sample = self.sample(state)
         active = {n: w for n, loss in stage.losses.items() if (w := loss.weight_at(index, stage.steps)) > 0}
         reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
-        shape = self.primitive.shape(leaves, min(self.primitive.sh_degree, index // stage.sh_every))
+        state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
+        shape = self.primitive.shape(leaves, state.sh_degree)
         splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
 
         geometry, distortion = bool(reads & GEOMETRY), "distortion" in reads
@@ -212,16 +210,35 @@ class Trainer:
         losses, total, chosen = self.cotangents(active, render.maps, sample, self.look(state, shown))
         terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
         losses |= {name: float(term.detach()) for name, term in terms.items()}
-        if not math.isfinite(sum(losses.values())):
-            raise RuntimeError(f"step {index}, view {sample.view.name}: the losses are {losses}; lower the rates")
+        require_finite_losses(index, sample.view.name, losses)
         gradients = render.backward(total, chosen, stage.signal.absolute)
         facts = self.facts(state, splats, sample, render, gradients)
         edit = self.wanted(state.points, facts)
         adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
+        require_finite_values(index, sample.view.name, state.points.params)
         if edit is not None:
             state.points = self.edited(state, edit, index)
         state.index = index
         return Done(index, losses, len(state.points), render.maps, sample)
+
+    def sample(self, state: StageState) -> tuple[int, Sample]:
+        """Position and photograph of the view to show now; damaged ones are passed over, and named once."""
+        while len(state.skipped) < len(self.views):
+            if state.order.at == len(state.order.queue):
+                state.order.shuffle(state.generator)
+                self.foretell(state.order)
+            shown = state.order.next(state.generator)
+            if shown in state.skipped:
+                continue
+            try:
+                photo = self.photos[shown]
+            except BadInput as error:
+                state.skipped.append(shown)
+                emit(PhotoSkipped(self.views[shown].name, str(error)))
+                continue
+            prior, mask = (None if known is None else known[shown] for known in (self.priors, self.masks))
+            return shown, Sample(self.views[shown], photo.to(torch.float32).div_(255), prior, mask)
+        raise BadInput(f"none of the {len(self.views)} photographs can be read, {self.views[0].path} for one")
 
     def cotangents(
         self, active: Mapping[str, float], maps: Maps, sample: Sample, look: Look | None
@@ -247,7 +264,7 @@ class Trainer:
         """The look of a photograph, if the stage learns any."""
         if self.stage.appearance is None:
             return None
-        rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps)
+        rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps) / 2**state.halvings
         return Look(self.stage.appearance, state.looks, shown, rate)
 
     def facts(self, state: StageState, splats: Splats, sample: Sample, render: Render, gradients: Gradients) -> Step:
@@ -264,7 +281,7 @@ class Trainer:
             image_px=max(sample.view.camera.width, sample.view.camera.height),
             views=Survey(self.views, self.rasterizer, splats, self.stage.near),
             since_reset=index - state.reset_at,
-            rates={name: rate.at(index, self.stage.steps) for name, rate in self.stage.rates.items()},
+            rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.stage.rates.items()},
             seed=(state.generator.initial_seed() * 1_000_003 + index) % 2**63,
         )
 

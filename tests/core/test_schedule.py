@@ -1,9 +1,10 @@
 import math
+from dataclasses import dataclass
 
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.core.schedule import log_linear, rescale
+from surfkit.core.schedule import Interval, Steps, log_linear, rescale, rescale_like
 
 
 def test_marked_counts_are_scaled_at_any_depth(world):
@@ -46,3 +47,20 @@ def test_log_linear():
     assert log_linear(1e-2, 1e-4, 7.0) == 1e-4
     with pytest.raises(BadInput, match="above 0"):
         log_linear(1.0, 0.0, 0.5)
+
+
+def test_a_schedule_made_shorter_and_longer_is_like_one_made_shorter_at_once():
+    @dataclass(frozen=True)
+    class Part:
+        every: Interval = 100
+        start: Steps = 1_000
+        until: Steps | None = None
+        never: Steps = 0
+
+    whole = {"a": (Part(), Part(every=70, until=15_000)), "steps": 1}
+    for short, long in [(2e-3, 4e-3), (2e-3, 5e-3), (1e-3, 1.0), (0.01, 0.013)]:
+        at_once = rescale(whole, long)
+        again = rescale_like(rescale(whole, short), long / short, at_once)
+        assert again == at_once, (short, long)
+    other = {"a": (Part(every=300), whole["a"][1]), "steps": 1}
+    assert rescale_like(rescale(whole, 0.5), 2, other) == whole, "what is not alike is scaled"

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.pipeline import noted
+from surfkit.folder import noted
 from surfkit.scene import undistort
 from surfkit.scene.capture import library
 from surfkit.scene.data import Data
@@ -46,7 +46,8 @@ def farm(made, tmp_path):
 
 def noticed(data):
     """The scene, and what was said of it."""
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         return read(data), notes
 
 

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.pipeline import noted
+from surfkit.folder import noted
 from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data
@@ -42,7 +42,8 @@ def farm(made, tmp_path):
 
 def read(data, scene):
     """The priors, and what was warned of."""
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         return read_priors(data, scene), notes
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
-from surfkit.pipeline import noted
+from surfkit.folder import noted
 from surfkit.scene.data import Data
 from surfkit.scene.photos import view_photo
 from surfkit.scene.ply import write_points
@@ -108,7 +108,8 @@ def test_nerfstudio_with_its_own_split_intrinsics_by_frame_masks_and_points_as_t
     head += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue"))
     text = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{head}end_header\n{rows}\n"
     (tmp_path / "sparse_pc.ply").write_text(text)
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         scene = read(Data(tmp_path))
     same(scene, truth)
     assert [view.name for view in scene.held_out] == ["images/view_002.png"]
@@ -140,7 +141,8 @@ def test_blender(tmp_path, truth, white):
                 frames.append({"file_path": f"./{part}/{stem}", "transform_matrix": to_world(truth, view)})
         contents = {"camera_angle_x": angle, "frames": frames}
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps(contents))
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         scene = read(Data(tmp_path, white=white))
     assert [view.name for view in scene.held_out] == ["test/view_000.png", "test/view_003.png"]
     camera = scene.train[0].camera
@@ -193,7 +195,8 @@ def odm(folder, truth, kind="brown", **coefficients):
 
 
 def test_opendronemap(tmp_path, truth):
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         scene = read(Data(odm(tmp_path, truth), test_every=3))
     same(scene, truth)
     assert len(notes) == 1 and "has 2 reconstructions; the largest is used, of 6 photographs" in notes[0]
@@ -244,7 +247,8 @@ def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, t
         read(Data(tmp_path))
     assert len(read(Data(tmp_path, layout="nerfstudio", test_every=0)).train) == 6
     write_colmap(tmp_path, truth)
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         assert observations(Data(tmp_path), read(Data(tmp_path))).seen
     assert len(notes) == 1 and "read as COLMAP; it could also be read with --layout nerfstudio, odm" in notes[0]
 

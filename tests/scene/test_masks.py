@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.pipeline import noted
+from surfkit.folder import noted
 from surfkit.scene.data import Data
 from surfkit.scene.masks import mask_cache, read_mask, view_mask
 from surfkit.scene.photos import view_photo
@@ -41,7 +41,8 @@ def put(path, pixels=None):
 
 
 def scene_of(farm, **settings):
-    with noted() as notes:
+    with noted() as kept:
+        notes = kept.texts
         return read(Data(farm, test_every=0, **settings)), notes
 
 

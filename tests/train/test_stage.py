@@ -5,6 +5,7 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
+from surfkit.core.events import PhotoSkipped
 from surfkit.densify import ADC, AbsGradient, LossGradient, Trim
 from surfkit.densify.base import Prune
 from surfkit.losses.photometric import L1, SSIM
@@ -13,6 +14,7 @@ from surfkit.losses.surface import NormalConsistency
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Edit
 from surfkit.train.adam import Rate
+from surfkit.train.faults import Diverged
 from surfkit.train.progress import psnr
 from surfkit.train.stage import RATES, Stage
 
@@ -195,8 +197,69 @@ class Broken(L1):
 
 def test_a_loss_that_is_not_finite_names_step_and_view(begin):
     trainer, state = begin(replace(QUIET, losses={"l1": Broken()}))
-    with pytest.raises(RuntimeError, match=r"step 1, view \d.png: the losses are"):
+    with pytest.raises(Diverged, match=r"step 1, view \d.png: the losses are") as error:
         list(trainer.run(state))
+    assert error.value.index == 1 and error.value.view in {view.name for view in trainer.views}
+
+
+@dataclass(frozen=True)
+class Spoiling(Prune):
+    """Spoils the scale of a point at step 3."""
+
+    def edit(self, points, step):
+        if step.index == 3:
+            points.params["scales"][5, 1] = float("inf")
+
+
+def test_parameters_that_are_not_finite_name_step_and_view(begin):
+    trainer, state = begin(replace(QUIET, prune=(Spoiling(),)))
+    with pytest.raises(Diverged, match=r"step 3, view \d.png: the scales are not finite"):
+        list(trainer.run(state))
+
+
+def test_halved_rates_move_everything_half_as_far(begin):
+    moved = []
+    for halvings in (0, 1):
+        trainer, state = begin(replace(QUIET, appearance=Exposure()))
+        state.halvings = halvings
+        start = {name: value.clone() for name, value in (state.points.params | state.looks).items()}
+        trainer.step(state)
+        moved.append({name: (state.points.params | state.looks)[name] - start[name] for name in start})
+    for name in ("means", "sh0", "opacities", "value"):
+        assert moved[0][name].any() and torch.allclose(moved[0][name], 2 * moved[1][name], atol=1e-6), name
+
+
+class Damaged(list):
+    """Photographs of which some cannot be read."""
+
+    bad = frozenset({1, 4})
+
+    def __getitem__(self, at):
+        if at in self.bad:
+            raise BadInput(f"{at}.png: not a whole picture")
+        return super().__getitem__(at)
+
+
+def test_damaged_photographs_are_passed_over_and_named_once(begin, monkeypatch):
+    trainer, state = begin(replace(QUIET, steps=12))
+    said = []
+    monkeypatch.setattr("surfkit.train.stage.emit", said.append)
+    trainer = replace(trainer, photos=Damaged(trainer.photos))
+    shown = [done.sample.view.name for done in trainer.run(state)]
+    assert sorted(state.skipped) == [1, 4] and len(shown) == 12
+    assert {shown.count(name) for name in ("0.png", "2.png", "3.png", "5.png")} == {3}, "all others, evenly"
+    assert [event.name for event in said if isinstance(event, PhotoSkipped)] in (["1.png", "4.png"], ["4.png", "1.png"])
+    monkeypatch.setattr(Damaged, "bad", range(6))
+    with pytest.raises(BadInput, match="none of the 6 photographs can be read, 0.png for one"):
+        list(replace(trainer, stage=replace(QUIET, steps=20)).run(state))
+
+
+def test_the_degree_of_the_harmonics_never_falls(begin):
+    trainer, state = begin(replace(QUIET, steps=6, sh_every=5))
+    list(trainer.run(state))
+    assert state.sh_degree == 1
+    list(replace(trainer, stage=replace(QUIET, steps=8, sh_every=50)).run(state))
+    assert state.sh_degree == 1
 
 
 def test_stages_that_make_no_sense_are_refused(begin):

@@ -1,0 +1,64 @@
+"""`surfkit status`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.cli.table import print_table
+from surfkit.report.status import Status, as_json, status
+
+UNFINISHED = 3
+
+
+@dataclass(frozen=True)
+class StatusOf:
+    """Tell where a run stands: step, speed, time left, memory, measurements, warnings, and who works on it.
+
+    Exits 0 when the run is finished, 3 when it is not, 2 when there is no run.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def run(self) -> int:
+        """Tell."""
+        found = status(self.run_folder)
+        if self.json:
+            print(as_json(found))
+        else:
+            print_table(("what", "value"), rows(found))
+        return 0 if found.state == "finished" else UNFINISHED
+
+
+def rows(found: Status) -> list[tuple[str, str]]:
+    """What a person is shown; what is not known is left out."""
+    told: list[tuple[str, str]] = [("state", f"{found.state}{f', {found.process}' if found.process else ''}")]
+    told.append(("step", f"{found.step:,} of {found.steps:,}{f' of {found.stage}' if found.stage else ''}"))
+    if found.saved_step is not None:
+        told.append(("last checkpoint", f"step {found.saved_step:,}"))
+    if found.steps_per_second is not None:
+        told.append(("speed", f"{found.steps_per_second:.1f} it/s"))
+    if found.seconds_left is not None:
+        minutes, seconds = divmod(round(found.seconds_left), 60)
+        told.append(("time left", f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"))
+    if found.points is not None:
+        told.append(("points", f"{found.points:,}"))
+    if found.loss is not None:
+        told.append(("loss", f"{found.loss:.4f}"))
+    if found.peak_memory_bytes:
+        told.append(("peak memory", f"{found.peak_memory_bytes / 1e6:.0f} MB"))
+    if found.metrics and found.metrics["psnr"] is not None:
+        when = f" after step {found.metrics['step']:,}" if "step" in found.metrics else ""
+        told.append(("PSNR", f"{found.metrics['psnr']:.2f} dB of {found.metrics['views']} views{when}"))
+    told += [("skipped", name) for name in found.skipped]
+    return told + [("warning", text) for text in found.warnings]
+
+
+COMMAND = StatusOf

@@ -1,0 +1,46 @@
+"""Files that are whole or not there, also when the process dies or the power fails."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+UNFINISHED = (".*.part", ".tmp??????")
+"""Names of files that are being written, by us and by safetensors."""
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A new file that takes the place of `path` when all went well, and vanishes when not."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with unfinished.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(unfinished, path)
+        sync_folder(path.parent)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Let the disk know the names in a folder, where the file system has a way to be asked."""
+    with suppress(OSError):
+        here = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(here)
+        finally:
+            os.close(here)
+
+
+def sweep(folder: Path) -> None:
+    """Delete what dead processes left unfinished in a folder that no other process works in."""
+    for pattern in UNFINISHED:
+        for path in folder.rglob(pattern):
+            path.unlink(missing_ok=True)

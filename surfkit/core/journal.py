@@ -1,0 +1,97 @@
+"""events.jsonl: what happened in a run, one JSON object a line, as it happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.codec import dump
+from surfkit.core.events import FileWritten, StageBegan, StageEnded
+from surfkit.core.files import replacing
+from surfkit.core.registry import hookimpl, plugins
+
+NAME = "events.jsonl"
+COUNTED = {"StepDone", "PointsEdited", "Measured"}
+"""Events that carry the index of their step."""
+
+
+class Journal:
+    """Writes every event down at once, so that a killed process loses none, and lets the disk know at checkpoints.
+
+    When a stage goes on from a checkpoint, what was written of the steps after it is taken out: they come again.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / NAME
+        self.file: int | None = None
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if isinstance(event, StageBegan):
+            self.close()
+        if self.file is None:
+            forget(self.path, event.first if isinstance(event, StageBegan) else sys.maxsize)
+            self.file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        facts = dump(event)
+        if isinstance(event, FileWritten) and event.path.is_relative_to(self.folder):
+            facts["path"] = event.path.relative_to(self.folder).as_posix()
+        line = {"time": round(time.time(), 3), "event": type(event).__name__, **facts}
+        os.write(self.file, (json.dumps(line, allow_nan=False) + "\n").encode())
+        if isinstance(event, (FileWritten, StageEnded)):
+            os.fsync(self.file)
+
+    def close(self) -> None:
+        """Let go of the file; the next event opens it again."""
+        if self.file is not None:
+            os.close(self.file)
+            self.file = None
+
+
+@contextmanager
+def kept(folder: Path) -> Iterator[None]:
+    """Within, events are written into the journal of a run folder."""
+    journal = Journal(folder)
+    plugins().register(journal, "journal of the run")
+    try:
+        yield
+    finally:
+        plugins().unregister(journal)
+        journal.close()
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The lines of a journal; those that a dying process did not finish are left out."""
+    return [line for _, line in _lines(path)]
+
+
+def forget(path: Path, first: int) -> None:
+    """Take out the events of step `first` and all later ones, and lines that are not whole."""
+    if not path.exists():
+        return
+    stays = [text for text, line in _lines(path) if line["event"] not in COUNTED or line.get("index", 0) < first]
+    text = "".join(stays).encode()
+    if len(text) != path.stat().st_size:
+        with replacing(path) as file:
+            file.write(text)
+
+
+def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    if not path.exists():
+        return []
+    found = []
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
+        try:
+            line = json.loads(text)
+        except ValueError:
+            continue
+        if text.endswith("\n") and isinstance(line, dict) and "event" in line:
+            found.append((text, line))
+    return found

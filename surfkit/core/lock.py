@@ -1,0 +1,110 @@
+"""One process at a time in a folder. The kernel lets go of the lock when its process dies, however it dies."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+
+NAME = "lock"
+PATIENCE_S = 0.5
+"""How long to ask again: a process that only looks (`holder`) has the lock for a moment."""
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Within, no other process gets here for this folder, which is made and, if left empty, removed again.
+
+    Raises:
+        BadInput: Another process has it; names the process and its host.
+    """
+    made = _make(folder)
+    try:
+        file = _locked(folder / NAME, folder)
+        try:
+            yield
+        finally:
+            if file is not None:
+                (folder / NAME).unlink(missing_ok=True)
+                os.close(file)
+    finally:
+        with suppress(OSError):  # what is not empty stays
+            for path in made:
+                path.rmdir()
+
+
+def holder(folder: Path) -> str | None:
+    """Who works in a folder, as "process PID on HOST"; None if nobody does."""
+    import fcntl
+
+    try:
+        file = os.open(folder / NAME, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return _named(folder / NAME) if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
+    finally:
+        os.close(file)
+    return None
+
+
+def _make(folder: Path) -> list[Path]:
+    """The folders that were missing, innermost first; now they are there."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _locked(path: Path, folder: Path) -> int | None:
+    """The open, locked file; None where the file system has no locks."""
+    import fcntl
+
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(file, path):
+                os.ftruncate(file, 0)
+                os.write(file, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+                return file
+        except OSError as error:
+            os.close(file)
+            if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):
+                emit(Warned(f"{folder} lies where files cannot be locked; see to it that only one process works there"))
+                return None
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                raise
+            if time.monotonic() > until:
+                raise BadInput(
+                    f"{folder}: {_named(path)} works in it; wait for its end or stop it, or name another folder"
+                ) from error
+            time.sleep(PATIENCE_S / 10)
+        else:
+            os.close(file)  # the one before had deleted it by the time we had it
+
+
+def _is_at(file: int, path: Path) -> bool:
+    """Whether an open file is still the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _named(path: Path) -> str:
+    try:
+        said = json.loads(path.read_text(encoding="utf-8"))
+        return f"process {int(said['pid'])} on {said['host']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process"

@@ -1,0 +1,234 @@
+"""A run folder: what lies where, what it was made from, and whether this run may go on in it."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, load, read_json, write_json
+from surfkit.core.events import PhotoSkipped, Warned, emit
+from surfkit.core.registry import hookimpl, plugins, records
+from surfkit.core.schedule import rescale_like
+from surfkit.core.version import own_version
+from surfkit.recipe import Recipe
+from surfkit.scene.data import Data
+from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
+from surfkit.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder and what it was made from.
+
+    Attributes:
+        out: The folder.
+        recipe: Part of it as recipe.json.
+        data: Part of it in run.json.
+    """
+
+    out: Path
+    recipe: Recipe
+    data: Data
+
+    @property
+    def checkpoint(self) -> Path:
+        """The state of the optimisation."""
+        return self.out / "pretrain" / "checkpoint.safetensors"
+
+    @property
+    def metrics(self) -> Path:
+        """The measurements."""
+        return self.out / "metrics.json"
+
+    @property
+    def cloud(self) -> Path:
+        """The points, in the frame of the input."""
+        return self.out / "point_cloud.ply"
+
+    @property
+    def pictures(self) -> Path:
+        """Renders beside the photographs."""
+        return self.out / "pictures"
+
+    @property
+    def record(self) -> Path:
+        """What the run was made from and what happened."""
+        return self.out / "run.json"
+
+    @property
+    def inputs(self) -> Path:
+        """The fingerprint of the data."""
+        return self.out / "inputs.json"
+
+
+def refuse_file(out: Path) -> None:
+    """BadInput if a file is in the place of a run folder."""
+    if out.exists() and not out.is_dir():
+        raise BadInput(f"--out {out}: a file, not a folder; name another one")
+
+
+def refuse_other(this: Run) -> None:
+    """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
+    there = read_json(this.out / "recipe.json", Any) if (this.out / "recipe.json").exists() else None
+    found = None if there is None else difference(there, dump(this.recipe))
+    if found and not (found := longer(this, there)):
+        emit(
+            Warned(
+                f"the run is made longer, from {there['pretrain']['steps']} steps to {this.recipe.pretrain.steps}: "
+                "steps still to come follow the schedules of the new length, those already made followed the old ones, "
+                "so the result is not that of a run of this length from the start"
+            )
+        )
+    if not found and this.record.exists():
+        before = dump(load(Data, read_json(this.record, Any).get("data"), "data"))  # with defaults of newer settings
+        found = difference(before, dump(this.data), "data")
+    if found:
+        at, old, new = found
+        raise BadInput(
+            f"--out {this.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
+            "name another folder, or delete that one"
+        )
+
+
+def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
+    """What else than its length distinguishes a longer recipe from the one in the folder; None if nothing does.
+
+    Longer with all schedules scaled along (`--steps`), or with none (`--pretrain.steps`).
+    """
+    plain = difference(there, dump(this.recipe))
+    now = this.recipe.pretrain.steps
+    before = there.get("pretrain", {}).get("steps") if isinstance(there, dict) else None
+    if not isinstance(before, int) or not 0 < before < now:
+        return plain
+    old = read_json(this.out / "recipe.json", Recipe)
+    if dump(replace(old, about=this.recipe.about, pretrain=replace(old.pretrain, steps=now))) == dump(this.recipe):
+        return None
+    return difference(dump(rescale_like(old, now / before, this.recipe)), dump(this.recipe))
+
+
+def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
+    """Path and both values of the first difference between plain data; what a recipe says of itself does not count."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            path = f"{at}.{key}" if at else key
+            if path != "about" and (found := difference(old.get(key), new.get(key), path)):
+                return found
+        return None
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        pairs = enumerate(zip(old, new, strict=True))
+        return next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
+    return None if old == new else (at, old, new)
+
+
+def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
+    """The fingerprint of the data, or BadInput if it is not that of the data which the run began with.
+
+    Args:
+        this: The run.
+        scene: Its data.
+        skipped: Names of photographs that the run has found damaged; they do not count.
+    """
+    before = read_json(this.inputs, Fingerprint) if this.inputs.exists() else None
+    now = fingerprint(scene, before)
+    if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
+        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+        raise BadInput(
+            f"--out {this.out}: the data in {this.data.path} are not those that the run began with: {found[0].what}"
+            f"{more}; put them back, name another folder, or delete that one"
+        )
+    return now
+
+
+def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
+    """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
+    before = read_json(this.record, Any) if this.record.exists() else {}
+    notes.begin(
+        this.record,
+        {
+            "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
+            "plugins": [str(plugin) for plugin in records() if plugin.distribution],
+            "device": backend,
+            "threads": torch.get_num_threads(),
+            "seed": this.recipe.seed,
+            "data": this.data,
+        },
+        before,
+    )
+    write_json(this.inputs, prints)
+    write_json(this.out / "recipe.json", this.recipe)
+
+
+class Notes:
+    """Prints the warnings of a run, and keeps them and the photographs it passed over in run.json."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+        self.skipped: list[str] = []
+        self.path: Path | None = None
+        self.facts: dict[str, Any] = {}
+
+    def begin(self, path: Path, facts: dict[str, Any], before: dict[str, Any]) -> None:
+        """Keep all in a file from now on, after what a run that was interrupted had kept there `before`."""
+        self.path, self.facts = path, facts
+        self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
+        self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
+        self.write()
+
+    def write(self) -> None:
+        """Save what there is."""
+        if self.path is not None:
+            write_json(self.path, self.facts | {"notes": self.texts, "skipped": self.skipped})
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if isinstance(event, Warned):
+            say(f"note: {event.text}")
+            self.keep(self.texts, event.text)
+        elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
+            say(f"note: {event.reason}; the run goes on without this photograph")
+
+    def keep(self, kept: list[str], text: str) -> bool:
+        """Keep a text unless it is there already; whether it is new."""
+        if text in kept:
+            return False
+        kept.append(text)
+        self.write()
+        return True
+
+
+@contextmanager
+def noted() -> Iterator[Notes]:
+    """Within, warnings are printed and kept."""
+    notes = Notes()
+    plugins().register(notes, "notes of the run")
+    try:
+        yield notes
+    finally:
+        plugins().unregister(notes)
+
+
+def discard(*paths: Path) -> None:
+    """Delete results that further steps make wrong."""
+    for path in paths:
+        path.unlink(missing_ok=True)
+
+
+def say(text: str) -> None:
+    """Tell the person who watches."""
+    print(text, file=sys.stderr)
+
+
+def short(value: Any) -> str:
+    """A value in a few words."""
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."

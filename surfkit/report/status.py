@@ -1,0 +1,135 @@
+"""Where a run stands, from what it has written so far; needs neither torch nor the data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from surfkit.core import journal
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.lock import holder
+
+PACE_OVER = 100
+"""Last steps that the speed is the mean of."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where a run stands.
+
+    Attributes:
+        state: "finished", "running" while a process works in the folder, else "stopped".
+        process: Which one does, "process PID on HOST".
+        stage: The one it is in, or was in last.
+        step: Done, whether in a checkpoint or not.
+        steps: Of the stage.
+        saved_step: Of the last checkpoint.
+        steps_per_second: Over the last steps.
+        seconds_left: To the end of the stage, at this speed; None when nothing runs.
+        points: After the last step.
+        loss: Of the last step.
+        peak_memory_bytes: Most memory held.
+        metrics: PSNR and SSIM of held-out photographs, at the end or when they were last looked at.
+        warnings: Notes of the run.
+        skipped: Photographs that could not be read.
+    """
+
+    state: str
+    process: str | None = None
+    stage: str | None = None
+    step: int = 0
+    steps: int = 0
+    saved_step: int | None = None
+    steps_per_second: float | None = None
+    seconds_left: float | None = None
+    points: int | None = None
+    loss: float | None = None
+    peak_memory_bytes: int | None = None
+    metrics: dict[str, Any] | None = None
+    warnings: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
+
+
+def status(out: Path) -> Status:
+    """Where the run in a folder stands.
+
+    Raises:
+        BadInput: There is no run.
+    """
+    recipe, record, process = out / "recipe.json", out / "run.json", holder(out)
+    if not recipe.exists() or not record.exists():
+        doing = f"; {process} is about to begin one" if process else ""
+        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it){doing}")
+    kept, lines = read_json(record, Any), journal.read(out / journal.NAME)
+    last, metrics = _last(lines), _metrics(out, lines)
+    steps = int(read_json(recipe, Any)["pretrain"]["steps"])
+    step = int(last["StepDone"].get("index", 0))
+    finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
+    pace = _pace(lines)
+    return Status(
+        state="finished" if finished and not process else "running" if process else "stopped",
+        process=process,
+        stage=last["StageBegan"].get("stage"),
+        step=step,
+        steps=steps,
+        saved_step=_saved(lines),
+        steps_per_second=pace,
+        seconds_left=round((steps - step) / pace, 1) if process and pace else None,
+        points=last["StepDone"].get("points"),
+        loss=_total(last["StepDone"].get("losses")),
+        peak_memory_bytes=last["StepDone"].get("peak_memory_bytes") or None,
+        metrics=metrics,
+        warnings=tuple(kept.get("notes", [])),
+        skipped=tuple(kept.get("skipped", [])),
+    )
+
+
+def _last(lines: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The last event of each kind that matters; empty if there was none."""
+    return {
+        kind: next((line for line in reversed(lines) if line["event"] == kind), {})
+        for kind in ("StepDone", "StageBegan", "Measured")
+    }
+
+
+def _pace(lines: list[dict[str, Any]]) -> float | None:
+    """Steps a second, over the last ones of the last attempt."""
+    began = max((at for at, line in enumerate(lines) if line["event"] == "StageBegan"), default=0)
+    times = [line["time"] for line in lines[began:] if line["event"] == "StepDone"][-PACE_OVER - 1 :]
+    return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else None
+
+
+def _saved(lines: list[dict[str, Any]]) -> int | None:
+    """The step of the last checkpoint: that of the last step before it was written."""
+    index = saved = None
+    for line in lines:
+        if line["event"] == "StepDone":
+            index = line["index"]
+        elif line["event"] == "FileWritten" and line["what"] == "checkpoint":
+            saved = index
+    return saved
+
+
+def _metrics(out: Path, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
+    if (out / "metrics.json").exists():
+        images = read_json(out / "metrics.json", Any)["images"]
+        return {"psnr": images["psnr"], "ssim": images["ssim"], "views": len(images["per_image"])}
+    found = _last(lines)["Measured"]
+    if not found:
+        return None
+    values = list(found["psnr"].values())
+    return {"psnr": sum(values) / len(values), "views": len(values), "step": found["index"]}
+
+
+def _total(losses: dict[str, Any] | None) -> float | None:
+    return None if losses is None else sum(map(float, losses.values()))
+
+
+def as_json(found: Status) -> str:
+    """The status as JSON."""
+    from surfkit.core.codec import dump
+
+    return json.dumps(dump(found), indent=2, ensure_ascii=False)

@@ -1,0 +1,127 @@
+"""A cheap fingerprint of a data set, by which a run notices that its data are not what they were."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from surfkit.scene.scene import Scene, View
+
+PIECE = 1 << 16
+"""Bytes that are read at the start, in the middle and at the end of a photograph."""
+
+
+@dataclass(frozen=True)
+class Print:
+    """What is known of one photograph.
+
+    Attributes:
+        camera: Digest of the camera.
+        size: Of the file, bytes; -1 if it cannot be read.
+        time_ns: When the file was last written. While this and the size stay, its content is not read again.
+        content: Digest of three pieces of the file, or of all of it when it is not longer.
+        held_out: Whether it is kept from training.
+    """
+
+    camera: str
+    size: int
+    time_ns: int
+    content: str
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """What is known of a data set.
+
+    Attributes:
+        points: Digest of the sparse points, in the local frame.
+        photographs: By name.
+    """
+
+    points: str
+    photographs: dict[str, Print]
+
+
+@dataclass(frozen=True)
+class Change:
+    """One difference: in words, and the name of the photograph that it is about, if it is about one."""
+
+    what: str
+    name: str | None = None
+
+
+def fingerprint(scene: Scene, before: Fingerprint | None = None) -> Fingerprint:
+    """The fingerprint of a scene; photographs that were not touched since the one `before` are not read again."""
+    known = before.photographs if before else {}
+    views = [(view, False) for view in scene.train] + [(view, True) for view in scene.held_out]
+    return Fingerprint(digest(scene.cloud), {view.name: _print(view, out, known.get(view.name)) for view, out in views})
+
+
+def changed(old: Fingerprint, new: Fingerprint) -> list[Change]:
+    """Every difference between two fingerprints, one for each photograph at most."""
+    a, b = old.photographs, new.photographs
+    found = [Change("the sparse points have changed")] if old.points != new.points else []
+    found += [Change(f"photograph {name} is no longer there", name) for name in a if name not in b]
+    found += [Change(f"photograph {name} is new", name) for name in b if name not in a]
+    for name in a:
+        if name not in b:
+            continue
+        if a[name].held_out != b[name].held_out:
+            found.append(Change(f"photograph {name} is {'now' if b[name].held_out else 'no longer'} held out", name))
+        elif a[name].camera != b[name].camera:
+            found.append(Change(f"the camera of {name} has changed", name))
+        elif (a[name].size, a[name].content) != (b[name].size, b[name].content):
+            found.append(Change(f"photograph {name} has changed", name))
+    return found
+
+
+def digest(value: Any) -> str:
+    """Twenty hex digits for plain data, arrays and dataclasses of them.
+
+    Floats count as float32, so that a last bit that another version of a library rounds differently does not.
+    """
+    found = hashlib.sha256()
+    _feed(found, value)
+    return found.hexdigest()[:20]
+
+
+def _feed(found: Any, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value.detach().cpu().numpy()
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            found.update(f"\0{field.name}".encode())
+            _feed(found, getattr(value, field.name))
+    elif isinstance(value, (np.ndarray, float)):
+        array = np.asarray(value)
+        array = array.astype("<f4") if array.dtype.kind == "f" else array
+        found.update(f"\0{array.dtype.str}{array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    else:
+        found.update(f"\0{value!r}".encode())
+
+
+def _print(view: View, held_out: bool, before: Print | None) -> Print:
+    camera = digest(view.camera)
+    try:
+        state = view.path.stat()
+        same = before is not None and (before.size, before.time_ns) == (state.st_size, state.st_mtime_ns)
+        content = before.content if same else _content(view.path, state.st_size)
+    except OSError:
+        return Print(camera, -1, 0, "", held_out)
+    return Print(camera, state.st_size, state.st_mtime_ns, content, held_out)
+
+
+def _content(path: Path, size: int) -> str:
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        for start in sorted({0, max(0, (size - PIECE) // 2), max(0, size - PIECE)}):
+            file.seek(start)
+            found.update(file.read(PIECE))
+    return found.hexdigest()[:20]

@@ -1,0 +1,78 @@
+"""What can go wrong inside a run, recognised and said in one line."""
+
+from __future__ import annotations
+
+import errno
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import Fault
+from surfkit.core.memory import peak_memory_bytes
+
+MOST_HALVINGS = 2
+"""Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+NO_MEMORY = ("not enough memory", "can't allocate memory", "out of memory", "alloc_cpu")
+"""Words of torch's errors on processors, which have no class of their own."""
+
+
+class Diverged(RuntimeError):
+    """A step made a number that is not finite.
+
+    Attributes:
+        index: Of the step.
+        view: Name of its photograph.
+    """
+
+    def __init__(self, index: int, view: str, what: str) -> None:
+        super().__init__(f"step {index}, view {view}: {what}")
+        self.index, self.view = index, view
+
+
+def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) -> None:
+    """Diverged if the losses of a step are not finite."""
+    if not math.isfinite(sum(losses.values())):
+        raise Diverged(index, view, f"the losses are {dict(losses)}")
+
+
+def require_finite_values(index: int, view: str, params: Mapping[str, Tensor]) -> None:
+    """Diverged if a parameter is not finite after a step. A sum tells, in one pass and without a copy."""
+    for name, total in [(name, value.sum()) for name, value in params.items()]:
+        if not math.isfinite(total) and not torch.isfinite(params[name]).all():
+            raise Diverged(index, view, f"the {name} are not finite")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory gave out, of the processor or of the device."""
+    if isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError)):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
+
+
+@contextmanager
+def in_one_line(out: Path) -> Iterator[None]:
+    """Within, what gives out in the run in the folder `out` becomes a `Fault`; the checkpoints stay as they are."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        where = error.filename or out
+        raise Fault(
+            f"{where}: the disk is full ({error.strerror}); the last checkpoint in {out} is whole: free some space, "
+            "and the same command goes on from there"
+        ) from error
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
+        raise Fault(
+            f"{out}: out of memory{held}; smaller photographs (--longest, --scale) or fewer points (a higher "
+            "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
+            "last checkpoint is whole, and where there is more memory the same command goes on from there"
+        ) from error

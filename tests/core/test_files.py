@@ -1,0 +1,32 @@
+import os
+
+import pytest
+
+from surfkit.core.files import replacing, sweep
+
+
+def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
+    path, order = tmp_path / "a" / "b.txt", []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *args, name=name, real=real: (order.append(name), real(*args))[1])
+    with replacing(path) as file:
+        file.write(b"new")
+    assert path.read_bytes() == b"new" and order == ["fsync", "replace", "fsync"], "file, name, folder"
+
+
+def test_what_fails_leaves_the_old_and_nothing_else(tmp_path):
+    path = tmp_path / "b.txt"
+    path.write_text("old")
+    with pytest.raises(ValueError), replacing(path) as file:  # noqa: PT011
+        file.write(b"new")
+        raise ValueError
+    assert [p.name for p in tmp_path.iterdir()] == ["b.txt"] and path.read_text() == "old"
+
+
+def test_what_the_dead_left_is_swept_away(tmp_path):
+    for name in ("x/.a.json.12.part", "x/a.json", ".c.part", "x/.tmpAb1cD2", ".hidden"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    sweep(tmp_path)
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [".hidden", "a.json"]

@@ -1,0 +1,304 @@
+"""Runs that are interrupted, made longer, damaged, or met by what gives out."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from surfkit import pipeline
+from surfkit.cli.recipes import recipes
+from surfkit.core import journal, lock
+from surfkit.core.check import BadInput, Fault
+from surfkit.core.lock import held
+from surfkit.core.tree import evolve
+from surfkit.densify.base import Prune
+from surfkit.evaluate import images
+from surfkit.pipeline import load_run, run, with_steps
+from surfkit.scene.data import Data
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+
+STEPS = 24
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("source")
+    write_colmap(folder, photograph(Flight(width=40, height=30, points=150)))
+    return folder
+
+
+@pytest.fixture
+def data(source, tmp_path) -> Data:
+    """A data set of one's own, that may be spoilt."""
+    shutil.copytree(source, tmp_path / "data")
+    return Data(tmp_path / "data")
+
+
+@pytest.fixture(scope="module")
+def whole_recipe():
+    return evolve(recipes()["2dgs"], "primitive.sh_degree", 1)
+
+
+@pytest.fixture(scope="module")
+def recipe(whole_recipe):
+    return with_steps(whole_recipe, STEPS)
+
+
+def notes(out):
+    return json.loads((out / "run.json").read_text())["notes"]
+
+
+def steps(out):
+    return [line["index"] for line in journal.read(out / "events.jsonl") if line["event"] == "StepDone"]
+
+
+def interrupted(recipe, data, out, at, monkeypatch, **settings):
+    """A run that is asked to stop after a step."""
+
+    class Interrupting(pipeline.Display):
+        def show(self, done):
+            if done.index == at:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "Display", Interrupting)
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, data, out, **settings)
+
+
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_path, monkeypatch, capsys):
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    run(recipe, data, whole)
+    interrupted(recipe, data, out, 17, monkeypatch, checkpoint_every=8)
+    path = out / "pretrain" / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:-40])
+    run(recipe, data, out)
+    assert "going on after step 16 of 24" in capsys.readouterr().err
+    assert len(notes(out)) == 1 and "the one before it, of step 16, is used" in notes(out)[0]
+    assert (out / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    assert steps(out) == list(range(1, STEPS + 1))
+
+
+def test_a_damaged_checkpoint_does_not_push_out_the_good_one(data, recipe, tmp_path, monkeypatch):
+    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, checkpoint_every=8)
+    path = tmp_path / "run" / "pretrain" / "checkpoint.safetensors"
+    path.write_bytes(b"")
+    interrupted(recipe, data, tmp_path / "run", 18, monkeypatch)
+    assert [checkpoint.load(p).index for p in (checkpoint.before(path), path)] == [16, 18]
+
+
+@pytest.mark.parametrize("stopped", [None, 13])
+def test_a_run_is_made_longer(data, recipe, whole_recipe, tmp_path, monkeypatch, stopped):
+    out, long = tmp_path / "run", with_steps(whole_recipe, 40)
+    if stopped:
+        interrupted(recipe, data, out, stopped, monkeypatch)
+    else:
+        run(recipe, data, out)
+    metrics = run(long, data, out)
+    assert metrics["steps"] == 40 and load_run(out)[0].recipe == long and steps(out) == list(range(1, 41))
+    assert len(notes(out)) == 1 and notes(out)[0].startswith("the run is made longer, from 24 steps to 40")
+    assert run(long, data, out) == metrics and len(notes(out)) == 1
+    with pytest.raises(BadInput, match=r"pretrain.steps 40, and this one has 24"):
+        run(recipe, data, out)
+
+
+def test_a_run_is_made_longer_under_its_old_schedule(data, recipe, tmp_path):
+    run(recipe, data, tmp_path / "run")
+    assert run(evolve(recipe, "pretrain.steps", 30), data, tmp_path / "run")["steps"] == 30
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("pretrain.losses.l1.weight", 0.7, r"l1.weight 0.8, and this one has 0.7"),
+        ("pretrain.densify.every", 9, r"densify.every \d+, and this one has 9"),
+        ("seed", 3, "seed 0, and this one has 3"),
+    ],
+)
+def test_a_longer_run_of_another_recipe_is_refused(data, recipe, whole_recipe, tmp_path, path, value, message):
+    run(recipe, data, tmp_path / "run")
+    with pytest.raises(BadInput, match=message):
+        run(evolve(with_steps(whole_recipe, 40), path, value), data, tmp_path / "run")
+
+
+def test_a_folder_in_use_is_refused(data, recipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    with held(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on \S+ works in it"):
+        run(recipe, data, tmp_path / "run")
+
+
+def touched(path, change):
+    state = path.stat()
+    content = bytearray(path.read_bytes())
+    change(content)
+    path.write_bytes(content)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns + 1))
+
+
+def flip(content):
+    content[len(content) // 2] ^= 1
+
+
+def test_data_that_changed_are_named(data, recipe, tmp_path, monkeypatch):
+    out, images = tmp_path / "run", data.path / "images"
+    interrupted(recipe, data, out, 5, monkeypatch)
+    for path in images.iterdir():
+        path.touch()  # copied, say; the content is the same
+    interrupted(recipe, data, out, 6, monkeypatch)
+    photo = images / "view_003.png"
+    before = photo.read_bytes()
+    touched(photo, flip)
+    with pytest.raises(BadInput, match=r"began with: photograph view_003.png has changed; put them back"):
+        run(recipe, data, out)
+    photo.write_bytes(before)
+    model = data.path / "sparse" / "0"
+    for name, change, message in [
+        ("images.txt", moved, r"began with: the camera of view_000.png has changed; put"),
+        ("points3D.txt", shortened, "began with: the sparse points have changed; put"),
+    ]:
+        text = (model / name).read_text()
+        (model / name).write_text(change(text))
+        with pytest.raises(BadInput, match=message):
+            run(recipe, data, out)
+        (model / name).write_text(text)
+    run(recipe, data, out)
+
+
+def shortened(text):
+    """The text of points3D.txt without the last point."""
+    return "".join(text.splitlines(keepends=True)[:-1])
+
+
+def moved(text):
+    """The text of images.txt with the first camera elsewhere."""
+    lines = text.splitlines()
+    at = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    words = lines[at].split()
+    words[5] = repr(float(words[5]) + 0.5)
+    lines[at] = " ".join(words)
+    return "\n".join(lines) + "\n"
+
+
+def test_damaged_photographs_are_passed_over(data, recipe, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+    for name in ("view_003.png", "view_008.png"):  # one to train with, one held out
+        path = data.path / "images" / name
+        path.write_bytes(path.read_bytes()[:-300])
+    interrupted(recipe, data, out, 15, monkeypatch)
+    metrics = run(recipe, data, out)
+    record = json.loads((out / "run.json").read_text())
+    assert sorted(record["skipped"]) == ["view_003.png", "view_008.png"] and record["notes"] == []
+    said = capsys.readouterr().err
+    for name in ("view_003.png", "view_008.png"):
+        assert said.count(f"{name}: not a whole picture") == 1
+    assert list(metrics["images"]["per_image"]) == ["view_000.png"]
+
+
+def test_a_photograph_that_broke_meanwhile_may_stay_so_if_it_is_skipped(data, recipe, tmp_path, monkeypatch):
+    path, out = data.path / "images" / "view_003.png", tmp_path / "run"
+    fingerprint = pipeline.refuse_changed
+
+    def breaking(*args):
+        prints = fingerprint(*args)
+        path.write_bytes(path.read_bytes()[:-300])
+        return prints
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "refuse_changed", breaking)
+        interrupted(recipe, data, out, 15, monkeypatch)
+    assert run(recipe, data, out)["steps"] == STEPS
+
+
+@dataclass(frozen=True)
+class Spoiling(Prune):
+    """Spoils a point at a step, while the rates are above something."""
+
+    at: int = 0
+    above: float = 0.0
+
+    def edit(self, points, step):
+        if step.index == self.at and step.rates["scales"] > self.above:
+            points.params["scales"][0] = float("nan")
+
+
+def spoilt(recipe, at, above, monkeypatch):
+    monkeypatch.setattr("surfkit.core.codec.name_of", lambda part: type(part).__name__.lower())
+    return evolve(recipe, "pretrain.prune", (Spoiling(at, above),))
+
+
+def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data, recipe, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    rate = recipe.pretrain.rates["scales"].start
+    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, checkpoint_every=10)
+    assert metrics["steps"] == STEPS and checkpoint.load(out / "pretrain" / "checkpoint.safetensors").halvings == 2
+    assert [("(1 of 2" in text, "(2 of 2" in text) for text in notes(out)] == [(True, False), (False, True)]
+    for text in notes(out):
+        assert "step 13, view view_0" in text and "the scales are not finite; back to step 10" in text
+    assert steps(out) == list(range(1, STEPS + 1))
+
+
+@pytest.mark.parametrize("at", [3, 13])
+def test_a_third_time_is_the_last(data, recipe, tmp_path, monkeypatch, at):
+    bad, out = spoilt(recipe, at, 0.0, monkeypatch), tmp_path / "run"
+    for _ in range(2):  # the same command again knows that the rates were halved
+        with pytest.raises(
+            Fault, match=rf"step {at}, view view_0\d\d.png: the scales are not finite, also after .* 2 t"
+        ):
+            run(bad, data, out, checkpoint_every=10)
+    state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
+    assert state.halvings == 2 and state.index == (10 if at == 13 else 0) and len(notes(out)) == 2
+    assert all(torch.isfinite(value).all() for value in state.points.params.values())
+
+
+def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    interrupted(recipe, data, out, 9, monkeypatch)
+    path = out / "pretrain" / "checkpoint.safetensors"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size // 2, limits[1]))
+    try:
+        with pytest.raises(Fault, match=r"the disk is full .* last checkpoint in .*run is whole: free some space"):
+            run(recipe, data, out, checkpoint_every=5)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert checkpoint.load(path).index == 9 and not list(out.rglob(".*"))
+    assert run(recipe, data, out)["steps"] == STEPS and steps(out) == list(range(1, STEPS + 1))
+
+
+def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_path, monkeypatch):
+    step = pipeline.Trainer.step
+
+    def short(self, state):
+        if state.index == 12:
+            torch.empty(2**60, dtype=torch.uint8)
+        return step(self, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline.Trainer, "step", short)
+        with pytest.raises(Fault, match="out of memory.*--longest"):
+            run(recipe, data, tmp_path / "run", checkpoint_every=10)
+    assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
+    run(recipe, data, tmp_path / "run")
+
+
+def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
+    a = run(recipe, data, tmp_path / "a", pictures_every=0)
+    b = run(recipe, data, tmp_path / "b", pictures_every=10)
+    assert a["images"] == b["images"] and not (tmp_path / "a" / "progress").exists()
+    found = sorted(p.relative_to(tmp_path / "b" / "progress").as_posix() for p in (tmp_path / "b").rglob("0000*/*.png"))
+    assert found == [f"0000{step}/view_00{view}.png.png" for step in (10, 20) for view in (0, 8)]
+    seen = [line for line in journal.read(tmp_path / "b" / "events.jsonl") if line["event"] == "Measured"]
+    assert [line["index"] for line in seen] == [10, 20] and set(seen[0]["psnr"]) == {"view_000.png", "view_008.png"}
+    assert all(5 < value < 40 for line in seen for value in line["psnr"].values())
+
+
+def test_the_psnr_along_the_way_is_that_of_the_end(data, recipe, tmp_path):
+    metrics = run(recipe, data, tmp_path / "run", pictures_every=STEPS - 1)
+    line = next(line for line in journal.read(tmp_path / "run" / "events.jsonl") if line["event"] == "Measured")
+    assert images.statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)
