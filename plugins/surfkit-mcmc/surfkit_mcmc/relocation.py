@@ -44,7 +44,8 @@ class Relocation(Densify):
     units of scenes of an extent of about 5; here the extent is 1, hence 25 times as much."""
 
     filters: tuple[Annotated[Filter, choice(Filter)], ...] = ()
-    """Conditions that a point must meet for others to move onto it."""
+    """Conditions that a point must meet for others to move onto it. The number of points is limited by `cap`: a filter
+    that admits nobody once there are enough would stop the moves too."""
 
     def __post_init__(self) -> None:
         if self.cap < 1 or self.every < 1:
@@ -61,7 +62,7 @@ class Relocation(Densify):
         nudge = {"means": self._noise(step, draw)} if self.noise > 0 else {}
         if not (self.start < step.index <= self.until and step.index % self.every == 0):
             return Edit(nudge=nudge) if nudge else None
-        return self._move(step, nudge, draw)
+        return self._move(points, step, nudge, draw)
 
     def _noise(self, step: Step, draw: torch.Generator) -> Tensor:
         """(N, 3) drawn with the covariance squared, so within the disc of a surfel; faint points move the most."""
@@ -71,7 +72,7 @@ class Relocation(Densify):
         faint = torch.sigmoid(100 * (1 - shape.opacities - 0.995))
         return self.noise * step.rates["means"] * faint[:, None] * rotated(spread * normal, shape.quats)
 
-    def _move(self, step: Step, nudge: dict[str, Tensor], draw: torch.Generator) -> Edit:
+    def _move(self, points: Points, step: Step, nudge: dict[str, Tensor], draw: torch.Generator) -> Edit:
         opacities, scales = step.shape.opacities, step.shape.scales
         dead = opacities <= self.dead
         alive = admitted(self.filters, step, opacities * ~dead) * opacities
@@ -80,9 +81,9 @@ class Relocation(Densify):
         if not bool(alive.any()):
             return Edit(nudge=nudge or None)
         copies = drawn(alive, moved, draw)
-        opacity, shrink = shared(opacities, copies + 1, self.dead)
+        opacity, shrink = shared(opacities, copies + 1, min(1.01 * self.dead, 0.999))
         nudge = nudge | {
-            "opacities": torch.where(copies > 0, opacity.logit() - opacities.clamp(1e-7, 1 - 1e-6).logit(), 0.0),
+            "opacities": torch.where(copies > 0, opacity.logit() - points.params["opacities"], 0.0),
             "scales": torch.where(copies > 0, shrink.log(), 0.0)[:, None].expand_as(scales),
         }
         return Edit(drop=dead, clone=copies, nudge=nudge, forget=copies > 0)
@@ -104,7 +105,7 @@ def shared(opacities: Tensor, number: Tensor, least: float) -> tuple[Tensor, Ten
     Args:
         opacities: (N,) of the one point.
         number: (N,) int64, 1 or more.
-        least: No opacity below this, so that a point just moved is not dead.
+        least: No opacity below this; a little above that of the dead, so that a point just moved is alive.
     """
     n = number.clamp_max(MOST).double()
     one = opacities.double().clamp_max(1 - 1e-6)

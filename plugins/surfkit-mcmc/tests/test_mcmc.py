@@ -14,6 +14,7 @@ from surfkit import BadInput, Densify, Points, Step, components
 from surfkit.core.registry import plugins
 from surfkit.densify import Elongation
 from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.primitives.base import apply
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
@@ -93,6 +94,31 @@ def test_the_dead_move_and_a_few_more_come_up_to_the_cap():
     moved, number = edit.clone > 0, edit.clone + 1
     assert torch.allclose(1 - (1 - opacity[moved]) ** number[moved], step.shape.opacities[moved], atol=1e-4)
     assert (edit.nudge["scales"][moved] < 0).all() and not edit.nudge["scales"][~moved].any()
+
+
+def test_a_move_is_carried_out_as_asked():
+    points, step = crowd()
+    after = apply(Gaussian3D(sh_degree=1), points, Relocation().edit(points, step), torch.Generator())
+    assert len(after) == 1.05 * N and (after.params["opacities"].sigmoid() > 0.005).all(), "no dead point is left"
+    capped = Relocation(cap=N).edit(points, step)
+    assert len(apply(Gaussian3D(sh_degree=1), points, capped, torch.Generator())) == N
+
+
+@pytest.mark.parametrize("logit", [-5.2, 25.0])
+def test_points_nearly_dead_and_wholly_opaque_move_too(logit):
+    primitive, (points, step) = Gaussian3D(sh_degree=1), crowd()
+    points.params["opacities"][60:] = logit  # 0.0055, less than twice that of the dead; 1 in float32
+    step = replace(step, shape=primitive.shape(points.params, 1))
+    edit = Relocation(noise=0).edit(points, step)
+    after = (points.params["opacities"] + edit.nudge["opacities"]).sigmoid()[edit.clone > 0]
+    wanted, _ = shared(step.shape.opacities, edit.clone + 1, 0.00505)
+    assert torch.allclose(after, wanted[edit.clone > 0], rtol=1e-4) and (after > 0.005).all()
+
+
+def test_the_seed_of_the_step_decides():
+    points, step = crowd()
+    one, other = Relocation().edit(points, step), Relocation().edit(points, replace(step, seed=8))
+    assert not torch.equal(one.clone, other.clone) and not torch.equal(one.nudge["means"], other.nudge["means"])
 
 
 def test_steps_between_moves_only_add_noise():
