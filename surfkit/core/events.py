@@ -83,6 +83,21 @@ class FileWritten:
 
 
 @dataclass(frozen=True)
+class Progress:
+    """Part of a piece of work with a known end is done.
+
+    Attributes:
+        what: The work, in a few words, such as "fusing views".
+        done: So far.
+        total: When it ends.
+    """
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
 class Warned:
     """Something the user should know that does not stop the run.
 

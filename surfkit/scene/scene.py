@@ -60,10 +60,14 @@ class Frame:
     Attributes:
         origin: (3,) float64, input units.
         scale: Local units per input unit.
+        metres: Metres per input unit; None where the data set does not say.
+        crs: Coordinate reference system of the input frame, such as "EPSG:32632"; None where there is none.
     """
 
     origin: np.ndarray
     scale: float
+    metres: float | None = None
+    crs: str | None = None
 
     @classmethod
     def around(cls, poses: np.ndarray, points: np.ndarray) -> Frame:
@@ -81,6 +85,11 @@ class Frame:
         if not 0 < extent < np.inf:
             raise BadInput("all training cameras and points lie in one place; a scene needs views from several places")
         return cls(origin, float(1 / extent))
+
+    @property
+    def local_metres(self) -> float | None:
+        """Metres per local unit, or None where the data set does not say."""
+        return None if self.metres is None else self.metres / self.scale
 
     def to_local(self, xyz: np.ndarray) -> np.ndarray:
         """(..., 3) float64 local positions of positions in the input frame."""

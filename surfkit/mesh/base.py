@@ -1,0 +1,68 @@
+"""What a mesher is: splats, the views that saw them, and a way to draw them, to triangles."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from surfkit.core.registry import Component
+from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.scene.scene import Frame, View
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the local frame.
+
+    Attributes:
+        vertices: (V, 3) float32 local positions.
+        faces: (F, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
+        colors: (V, 3) uint8, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is to be meshed.
+
+    Attributes:
+        splats: Activated values, local frame.
+        views: Training views, with cameras in the local frame.
+        draw: Maps of a view, geometry included: color, alpha, depth, median, normal.
+        rasterizer: For what `draw` does not give.
+        near: Local units, of the stage that trained the splats.
+        frame: From the local frame back to the input's; knows metres if the data set does.
+        budget_bytes: Memory to stay within; work is split into tiles when it would be exceeded.
+        generator: Of every random draw.
+        keep: (H, W) bool mask of a view by its position, or None for all of it; false where nothing is to be fused.
+    """
+
+    splats: Splats
+    views: Sequence[View]
+    draw: Callable[[View], Maps]
+    rasterizer: Rasterizer
+    near: float
+    frame: Frame
+    budget_bytes: int
+    generator: torch.Generator = field(default_factory=torch.Generator)
+    keep: Callable[[int], torch.Tensor | None] = lambda at: None
+
+
+class Mesher(Component):
+    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`."""
+
+    @abstractmethod
+    def mesh(self, subject: Subject) -> Mesh:
+        """The surface.
+
+        Raises:
+            BadInput: There is nothing to mesh, such as no depth in any view.
+        """
