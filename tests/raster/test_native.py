@@ -320,6 +320,29 @@ def test_culling_never_loses_a_pixel(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_what_only_grazes_the_image_is_seen(kind):
+    """Splats of every size around the rim: those that reach a pixel are drawn, most of the others are left out."""
+    draws, count = Draw(5), 1_500
+    view = replace(camera(draws), cx=9.0)
+    z = draws.uniform(0.6, 4.0, count)
+    x, y = (draws.uniform(-120, size + 120, count) for size in (view.width, view.height))
+    local = torch.stack([(x - view.cx) / view.fx * z, (y - view.cy) / view.fy * z, z], -1)
+    means = (local - view.world_to_camera[:3, 3]) @ view.world_to_camera[:3, :3]
+    columns = 3 if kind == "gaussian" else 2
+    scales = torch.exp(draws.uniform(-1.0, 3.7, count, columns)) * (z / view.fx)[:, None]
+    given = (means, draws.normal(count, 4), scales, draws.uniform(0.05, 1.0, count), torch.zeros(count, 1, 3))
+    shown = Splats(kind, *(value.float() for value in given))
+    prints = (surfels if kind == "surfel" else gaussians)(double(shown), view, NEAR)
+    rays = view.rays(torch.float64)
+    at = [(rays[k] * f + c).flatten() for k, f, c in ((0, view.fx, view.cx), (1, view.fy, view.cy))]
+    rho, _, opacity = prints.at(torch.arange(count), *at, torch.zeros(2).double())
+    reaches = ((opacity * torch.exp(-rho / 2)).amax(1) > (1 + 1e-4) * ALPHA_MIN) & prints.drawn
+    seen = NativeRasterizer().render(shown, view, NEAR, geometry=False).seen
+    assert not (reaches & ~seen).any()
+    assert 100 < reaches.sum() <= seen.sum() < 2 * reaches.sum()
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [("scales", float("nan"), "not finite"), ("means", float("inf"), "not finite"), ("scales", -1.0, "not positive"),

@@ -166,6 +166,43 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
     return true;
 }
 
+// What a camera sees, for leaving out early what lies well outside: in a large scene that is nearly everything.
+struct Outlook {
+    static constexpr double kMargin = 3;  // pixels; the low-pass filter of a surfel reaches 2.36
+    const CameraModel<double>& cam;
+    Vec<double> side[4];  // unit normals of the planes through the camera and the sides of the image, pointing away
+
+    explicit Outlook(const CameraModel<double>& camera) : cam(camera) {
+        const double left = -kMargin - cam.cx, right = cam.width + kMargin - cam.cx, top = -kMargin - cam.cy,
+                     bottom = cam.height + kMargin - cam.cy;
+        const Vec<double> away[4] = {{-cam.fx, 0, left}, {cam.fx, 0, -right}, {0, -cam.fy, top}, {0, cam.fy, -bottom}};
+        for (int k = 0; k < 4; k++) side[k] = (1 / std::sqrt(splat::dot(away[k], away[k]))) * away[k];
+    }
+
+    // Whether a splat with its centre at c in the camera frame surely touches no pixel.
+    bool misses(Kind kind, const SplatIn<double>& in, Vec<double> c) const {
+        if (!(c.z > cam.near)) return true;
+        const double reach =
+            std::max({in.scale[0], in.scale[1], in.scale[2]}) * std::sqrt(splat::kCutoffSquared) * 1.0001;
+        if (kind == kGaussian) return misses_blurred(reach, c);
+        for (const Vec<double>& away : side)
+            if (splat::dot(away, c) > reach) return true;
+        return false;
+    }
+
+  private:
+    // The footprint of a gaussian is affine in its covariance, at a slope that is held near the image.
+    bool misses_blurred(double reach, Vec<double> c) const {
+        const auto apart = [&](double slope, double f, double principal, int pixels) {
+            const double more = 0.15 * pixels / f,
+                         held = std::clamp(slope, -principal / f - more, (pixels - principal) / f + more);
+            const double half = f / c.z * reach * std::sqrt(1 + held * held) + 2 + kMargin, at = f * slope + principal;
+            return at + half < 0 || at - half > pixels;
+        };
+        return apart(c.x / c.z, cam.fx, cam.cx, cam.width) || apart(c.y / c.z, cam.fy, cam.cy, cam.height);
+    }
+};
+
 // Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + 0.5 ... 16 t + 15.5.
 template <class F>
 void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
@@ -246,6 +283,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
     seen_in_.assign(chunks, 0);
     Record* records = (Record*)records_.get();
     std::vector<int64_t> invalid(chunks, -1);
+    const Outlook outlook(camera_);
     parallel(chunks, threads, [&](int64_t c) {
         int64_t at = c * kChunk;
         std::vector<uint32_t> touched;  // moved at the end: neighbours in tiles_of_ share cache lines between threads
@@ -257,6 +295,8 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
                 if (invalid[c] < 0) invalid[c] = i;
                 continue;
             }
+            const Vec<double> centre = splat::mul(camera_.turn, in.mean) + camera_.shift;
+            if (outlook.misses(kind_, in, centre)) continue;
             Record r;
             Bound<double> b;
             if (!project_one(in, camera_, antialias_, r, b)) continue;
@@ -272,7 +312,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             for (int k = 0; k < 3; k++) r.color[k] = (float)std::max(look.rgb[k], 0.0);
             records[at] = r;
             index_[at] = i;
-            depth_[at] = (float)(splat::mul(camera_.turn, in.mean) + camera_.shift).z;
+            depth_[at] = (float)centre.z;
             tiles_[at] = tiles;
             seen[i] = true;
             radii[i] = (float)radius;
