@@ -36,6 +36,9 @@ class Ablate:
     steps: int | None = None
     """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: rows look alike."""
 
+    max_points: int | None = None
+    """No row grows beyond this number of points, so that rows are compared at equal size, and fit the machine."""
+
     seeds: int = 1
     """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
 
@@ -51,7 +54,7 @@ class Ablate:
     def run(self) -> int:
         """Run the table and show it; 1 if a row failed."""
         out = self.out or Path("runs") / f"{self.data.path.resolve().name}-ablate-{self.table.name}"
-        plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device)
+        plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device, self.max_points)
         try:
             with Screen() as screen:
                 report = ablate(plan, screen)

@@ -9,6 +9,7 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.registry import unknown
 from surfkit.core.tree import evolve
+from surfkit.densify.filters import CountCap
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe
 
@@ -82,6 +83,14 @@ def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
         return recipe
     share = recipe.pretrain.steps / table.base.pretrain.steps
     return with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
+
+
+def capped(recipe: Recipe, points: int | None) -> Recipe:
+    """The recipe with a limit on the number of points, if there is one to set."""
+    if points is None or recipe.pretrain.densify is None:
+        return recipe
+    filters = getattr(recipe.pretrain.densify, "filters", ())
+    return evolve(recipe, "pretrain.densify.filters", (*filters, CountCap(points)))
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:

@@ -19,7 +19,7 @@ from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
-from surfkit.report.ablation import Table, build, pick, scaled
+from surfkit.report.ablation import Table, build, capped, pick, scaled
 from surfkit.report.compare import compare, figures
 from surfkit.report.table import markdown
 from surfkit.scene.data import Data
@@ -41,6 +41,7 @@ class Plan:
         seeds: Runs of each row.
         rows: Numbers or labels of those to run; all if empty.
         device: Where to compute.
+        max_points: No row grows beyond this number of points.
     """
 
     table: Table
@@ -50,6 +51,7 @@ class Plan:
     seeds: int = 1
     rows: tuple[str, ...] = ()
     device: Device = "auto"
+    max_points: int | None = None
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -109,13 +111,18 @@ def ablate(plan: Plan, watch: Watch) -> dict[str, Any]:
 
 def trials(plan: Plan) -> list[Trial]:
     """Every row with every seed; all rows with the first seed come first, so that the table is soon whole."""
-    recipes = {label: scaled(recipe, plan.table, plan.steps) for label, recipe in build(plan.table).items()}
+    recipes = {label: sized(recipe, plan) for label, recipe in build(plan.table).items()}
     found = []
     for at in range(plan.seeds):
         for label, recipe in recipes.items():
             seeded = replace(recipe, seed=recipe.seed + at)
             found.append(Trial(label, seeded.seed, seeded, plan.out / "runs" / fingerprint(seeded, plan.data)))
     return found
+
+
+def sized(recipe: Recipe, plan: Plan) -> Recipe:
+    """A row's recipe at the length and with the limit of the plan."""
+    return capped(scaled(recipe, plan.table, plan.steps), plan.max_points)
 
 
 def unfinished(every: Sequence[Trial], labels: Collection[str], outcomes: Collection[Path]) -> list[Trial]:
@@ -199,6 +206,7 @@ def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) 
         "table": plan.table.name,
         "about": plan.table.about,
         "steps": scaled(plan.table.base, plan.table, plan.steps).pretrain.steps,
+        "max_points": plan.max_points,
         "seeds": plan.seeds,
         "data": dump(replace(plan.data, path=plan.data.path.resolve())),
         "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},

@@ -39,7 +39,8 @@ def markdown(report: Mapping[str, Any]) -> str:
     marks = ["---:" if at != 1 else "---" for at in range(len(head))]
     table = ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in [head, marks, *rows]]
     data = report["data"]["path"].rpartition("/")[2]
-    what = f"{report['about']}. Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}."
+    limit = f"; at most {report['max_points']:,} points" if report["max_points"] else ""
+    what = f"{report['about']}. Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}{limit}."
     broken = [f"- {text}" for text in failures(report)]
     parts = [f"# table:{report['table']}", what, "\n".join(table), LEGEND, "\n".join(broken)]
     return "\n\n".join(part for part in parts if part) + "\n"

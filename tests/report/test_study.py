@@ -9,12 +9,13 @@ from rich.console import Console
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
-from surfkit.recipes.ablations import COARSE_BASELINE
+from surfkit.densify import CountCap, Elongation
+from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
 from surfkit.report import study
 from surfkit.report.ablation import Row, Table
 from surfkit.report.screen import Screen
-from surfkit.report.study import Plan, ablate, fingerprint
-from surfkit.report.table import lines
+from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
+from surfkit.report.table import lines, markdown
 from surfkit.scene.data import Data
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
@@ -89,6 +90,18 @@ def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
     for run in base["runs"] + less["runs"]:
         assert (tmp_path / run["folder"] / "metrics.json").exists()
     assert len(list((tmp_path / "runs").iterdir())) == 4
+
+
+def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
+    plan = Plan(MODEL, data, tmp_path, max_points=500)
+    recipes = [trial.recipe for trial in trials(plan)]
+    assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * len(MODEL.rows)
+    assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
+    free = trials(replace(plan, max_points=None))
+    assert not {trial.folder for trial in trials(plan)} & {trial.folder for trial in free}
+    assert "at most 500 points" in markdown(report_of(plan, [], {}))
+    with pytest.raises(BadInput, match="points"):
+        trials(replace(plan, max_points=0))
 
 
 def test_what_is_saved(data, runs, tmp_path):
