@@ -55,10 +55,17 @@ class NativeRasterizer(Rasterizer):
         return total, count
 
 
-class _Pass:
-    """Splats projected onto one camera and sorted into tiles."""
+    def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+        drawn = _Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
+        opacity = torch.empty(len(points), dtype=torch.float32)
+        drawn.native.probe(camera.project(points).contiguous(), opacity, torch.get_num_threads())
+        return opacity
 
-    def __init__(self, splats: Splats, camera: Camera, near: float) -> None:
+
+class _Pass:
+    """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn."""
+
+    def __init__(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> None:
         self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         validate(splats, values=False)
         self.seen = torch.empty(len(splats), dtype=torch.bool)
@@ -72,6 +79,7 @@ class _Pass:
             camera.height,
             near,
             splats.antialias,
+            rim,
             self.seen,
             self.radii,
             torch.get_num_threads(),

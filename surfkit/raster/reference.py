@@ -154,6 +154,20 @@ class Reference(Rasterizer):
                 count[rows] += (alpha > 0).sum(1)
         return total, count
 
+    def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+        validate(splats)
+        x, y, z = camera.project(points).to(splats.means).unbind(1)
+        inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        found = torch.full_like(z, torch.nan)
+        with torch.no_grad():
+            prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
+            rows = prints.drawn.nonzero()[:, 0]
+            for some in inside.nonzero()[:, 0].split(TILE * TILE):
+                rho, depth, opacity = prints.at(rows, x[some], y[some], x.new_zeros(2))
+                alpha = (opacity * torch.exp(-rho / 2)).clamp_max(ALPHA_MAX)
+                found[some] = 1 - torch.where((alpha >= ALPHA_MIN) & (depth <= z[some]), 1 - alpha, 1.0).prod(0)
+        return found
+
 
 class ReferenceRender(Render):
     """A view drawn by the reference; autograd takes it back."""

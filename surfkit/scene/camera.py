@@ -47,6 +47,12 @@ class Camera:
         by = max(1.0, max(self.width, self.height) / longest)
         return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
 
+    def project(self, points: Tensor) -> Tensor:
+        """(P, 3) float64 x and y in pixels and z along the axis, of (P, 3) points of the world; z may be negative."""
+        local = points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        z = local[:, 2]
+        return torch.stack([self.fx * local[:, 0] / z + self.cx, self.fy * local[:, 1] / z + self.cy, z], 1)
+
     def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
         x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx

@@ -179,6 +179,36 @@ def test_contribution_is_exact_away_from_thresholds(kind):
             assert (total - true_total).abs() <= 1e-5 * (1 + true_total)
 
 
+@each_case
+def test_opacity_before_points_equals_the_reference(name, kind):
+    """Points on the splats, before and behind them, anywhere in a pixel, outside and behind the camera."""
+    c = case(name, kind)
+    draws = Draw(3)
+    near_by = c.splats.means.double().repeat(3, 1) + 0.1 * draws.normal(3 * len(c.splats), 3)
+    around = 3 * draws.normal(200, 3)
+    points = torch.cat([near_by, around])
+    found = NativeRasterizer().opacity_before(c.splats, c.view, NEAR, points)
+    exact = Reference().opacity_before(double(c.splats), c.view, NEAR, points)
+    assert torch.equal(found.isnan(), exact.isnan())
+    inside = ~exact.isnan()
+    assert 20 < inside.sum() < len(points)
+    error = (found.double() - exact).abs()[inside]
+    risky = error > 1e-4  # a splat at the limit of opacity, or at the point's own depth
+    assert risky.double().mean() < 0.01 and error.median() < 1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_opacity_before_a_point_behind_everything_is_that_of_the_image(kind):
+    shown, view = make("plain", kind)
+    rays = view.rays(torch.float64).flatten(1).T * 50
+    points = (rays - view.world_to_camera[:3, 3]) @ view.world_to_camera[:3, :3]
+    found = NativeRasterizer().opacity_before(shown, view, NEAR, points)
+    alpha = NativeRasterizer().render(shown, view, NEAR, geometry=False).maps.alpha.flatten()
+    assert ((found - alpha).abs() < 2e-4).all()  # the image stops at a transmittance of 1e-4
+    points = (rays / 50 * (2 * NEAR) - view.world_to_camera[:3, 3]) @ view.world_to_camera[:3, :3]
+    assert not NativeRasterizer().opacity_before(shown, view, NEAR, points).any()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_backward_is_linear(kind):
     c = case("opaque", kind)

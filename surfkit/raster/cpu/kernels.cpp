@@ -618,6 +618,29 @@ void contribution_tile(const Tile& tile, float alpha_power, float open_power, fl
     }
 }
 
+// ---- opacity in front of points
+
+template <class K>
+void probe_tile(const Tile& tile, const Probes& probes) {
+    for (int64_t k = tile.begin; k < tile.end; k++) {
+        fetch<K, 8>(tile, k);
+        const auto& s = record_of<K>(tile, k);
+        const typename K::Local local(s, tile.ox - s.ax, tile.oy - s.ay);
+        for (int64_t g = 0; g < probes.count; g += kLanes) {
+            if (probes.z[g + kLanes - 1] < s.z_low) continue;
+            const Floats z = load(probes.z + g), open = load(probes.open + g);
+            typename K::Pixel at;
+            at.shape(local, load(probes.x + g), load(probes.y + g));
+            const Floats alpha = lower(local.opacity * exp_negative(-at.half_rho), broadcast(kAlphaMax));
+            Mask m = less_equal(kAlphaMin, alpha);
+            if (!any(m)) continue;
+            at.depth(local);
+            m = m & less_equal(at.z, z);
+            store(probes.open + g, open * (1.0f - keep(m, alpha)));
+        }
+    }
+}
+
 // ---- dispatch
 
 template <class K>
@@ -674,6 +697,10 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
                     : contribution_tile<Gaussians>(Tile(job, tile), alpha_power, open_power, sums, touched);
 }
 
+void probe(Kind kind, const Job& job, int64_t tile, const Probes& probes) {
+    kind == kSurfel ? probe_tile<Surfels>(Tile(job, tile), probes) : probe_tile<Gaussians>(Tile(job, tile), probes);
+}
+
 }  // namespace
 
 #define SURFKIT_NAME_(x) #x
@@ -685,6 +712,7 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                forward,
                                backward,
                                contribution,
+                               probe,
                                ssim_rows,
                                ssim_gradient_rows,
                                normal_rows,

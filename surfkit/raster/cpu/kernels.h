@@ -73,6 +73,15 @@ struct NormalJob {
     float *d_normal, *to_right, *to_left, *to_below, *to_above;
 };
 
+// Points in a tile in the order of their depths, kProbes of them or a multiple of it; x and y in pixels from the tile's
+// centre. `open` begins with 1.
+constexpr int kProbes = 16;
+struct Probes {
+    int64_t count;
+    const float *x, *y, *z;
+    float* open;
+};
+
 struct Kernels {
     const char* name;
     void (*forward)(Kind, Level, const Job&, int64_t tile, const Planes& out, const Saved&);
@@ -82,6 +91,8 @@ struct Kernels {
     // Sum and count per slot of alpha^a T^b.
     void (*contribution)(Kind, const Job&, int64_t tile, float alpha_power, float open_power, float* sums,
                          uint8_t* touched);
+    // What is left open of the rays to points in a tile.
+    void (*probe)(Kind, const Job&, int64_t tile, const Probes&);
     // Rows [y0, y1) of one plane: SSIM summed, and its three partial-derivative planes.
     double (*ssim_rows)(const float* x, const float* y, int width, int height, int y0, int y1, float* d_mean,
                         float* d_square, float* d_cross);

@@ -22,6 +22,7 @@ const Kernels* active = nullptr;
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
+using Points = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Optional = std::optional<Array>;
 
 float* data(const Optional& a) { return a ? a->data() : nullptr; }
@@ -84,11 +85,12 @@ NB_MODULE(_native, m) {
     nb::class_<Pass>(m, "Pass")
         .def("__init__",
              [](Pass* self, bool surfel, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens,
-                int width, int height, double near, bool antialias, Flags seen, Array radii, int threads) {
+                int width, int height, double near, bool antialias, double rim, Flags seen, Array radii, int threads) {
                  const auto s = arrays(splats);
                  const auto c = camera(pose, lens, width, height, near);
                  nb::gil_scoped_release free;
-                 new (self) Pass(surfel ? kSurfel : kGaussian, s, c, antialias, threads, seen.data(), radii.data());
+                 new (self)
+                     Pass(surfel ? kSurfel : kGaussian, s, c, antialias, rim, threads, seen.data(), radii.data());
              })
         .def_ro("first_invalid", &Pass::first_invalid)
         .def_prop_ro("pairs", &Pass::pairs)
@@ -116,7 +118,11 @@ NB_MODULE(_native, m) {
              [](Pass& self, double alpha_power, double open_power, Array sum, Counts count, int threads) {
                  nb::gil_scoped_release free;
                  self.contribution((float)alpha_power, (float)open_power, sum.data(), count.data(), threads);
-             });
+             })
+        .def("probe", [](Pass& self, Points points, Array opacity, int threads) {
+            nb::gil_scoped_release free;
+            self.probe(points.data(), (int64_t)points.shape(0), opacity.data(), threads);
+        });
 
     m.def(
         "kernels",

@@ -203,14 +203,15 @@ struct Outlook {
     }
 };
 
-// Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + 0.5 ... 16 t + 15.5.
+// Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + rim ... 16 t + 16 - rim with
+// a rim of 0.5; with none, what lies between them too.
 template <class F>
-void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
-    const auto first = [](double low, int tiles) {
-        return (int)std::clamp(std::ceil((low - 15.5) / kTile), 0.0, (double)tiles);
+void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double rim, F f) {
+    const auto first = [&](double low, int tiles) {
+        return (int)std::clamp(std::ceil((low + rim) / kTile - 1), 0.0, (double)tiles);
     };
-    const auto end = [](double high, int tiles) {
-        return (int)std::clamp(std::floor((high - 0.5) / kTile) + 1, 0.0, (double)tiles);
+    const auto end = [&](double high, int tiles) {
+        return (int)std::clamp(std::floor((high - rim) / kTile) + 1, 0.0, (double)tiles);
     };
     const splat::Outline<double> o = splat::outline(b);
     const double disc = b.r2 > 0 ? std::sqrt(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
@@ -221,7 +222,7 @@ void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, F f) {
     if (left >= right) return;
     for (int y = y0; y < y1; y++) {
         double low, high;
-        if (!splat::bound_span(b, o, y * kTile + 0.5, y * kTile + 15.5, low, high)) continue;
+        if (!splat::bound_span(b, o, y * kTile + rim, (y + 1) * kTile - rim, low, high)) continue;
         const int x1 = end(high, tiles_x);
         for (int x = first(low, tiles_x); x < x1; x++) f((uint32_t)(y * tiles_x + x));
     }
@@ -257,11 +258,12 @@ void Pass::each_seen(int threads, F f) const {
     });
 }
 
-Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, bool antialias, int threads,
-           bool* seen, float* radii)
+Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, bool antialias, double rim,
+           int threads, bool* seen, float* radii)
     : kind_(kind),
       camera_(camera),
       antialias_(antialias),
+      rim_(rim),
       count_(splats.count),
       tiles_x_((camera.width + kTile - 1) / kTile),
       tiles_y_((camera.height + kTile - 1) / kTile) {
@@ -304,7 +306,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             b = widened(b);
             fill_bound(r, b);
             const size_t before = touched.size();
-            each_tile(b, tiles_x_, tiles_y_, [&](uint32_t tile) { touched.push_back(tile); });
+            each_tile(b, tiles_x_, tiles_y_, rim_, [&](uint32_t tile) { touched.push_back(tile); });
             const uint32_t tiles = (uint32_t)(touched.size() - before);
             if (!tiles) continue;
             const Shade look = shade(splats, i, in, camera_);
@@ -530,6 +532,36 @@ void Pass::contribution(float alpha_power, float open_power, float* sum, int64_t
             }
         sum[index_[r]] = (float)total;
         count[index_[r]] = (int64_t)pixels;
+    });
+}
+
+void Pass::probe(const double* points, int64_t count, float* opacity, int threads) {
+    const int tiles = tiles_x_ * tiles_y_;
+    std::vector<std::vector<int64_t>> inside(tiles);
+    for (int64_t i = 0; i < count; i++) {
+        const double x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
+        opacity[i] = std::numeric_limits<float>::quiet_NaN();
+        if (z > camera_.near && x >= 0 && y >= 0 && x < camera_.width && y < camera_.height)
+            inside[(size_t)((int)y / kTile) * tiles_x_ + (int)x / kTile].push_back(i);
+    }
+    const Job work = job();
+    const Kernels& k = kernels();
+    parallel(tiles, threads, [&](int64_t tile) {
+        std::vector<int64_t>& here = inside[tile];
+        if (here.empty()) return;
+        std::sort(here.begin(), here.end(),
+                  [&](int64_t a, int64_t b) { return points[3 * a + 2] < points[3 * b + 2]; });
+        const size_t size = (here.size() + kProbes - 1) / kProbes * kProbes;
+        std::vector<float> x(size), y(size), z(size), open(size, 1.0f);
+        const double ox = tile % tiles_x_ * kTile + kTile / 2, oy = tile / tiles_x_ * kTile + kTile / 2;
+        for (size_t j = 0; j < size; j++) {
+            const double* p = points + 3 * here[std::min(j, here.size() - 1)];
+            x[j] = (float)(p[0] - ox);
+            y[j] = (float)(p[1] - oy);
+            z[j] = (float)p[2];
+        }
+        k.probe(kind_, work, tile, {(int64_t)size, x.data(), y.data(), z.data(), open.data()});
+        for (size_t j = 0; j < here.size(); j++) opacity[here[j]] = 1 - open[j];
     });
 }
 

@@ -26,15 +26,19 @@ struct GradientArrays {
 
 class Pass {
   public:
-    // Projects and bins. `seen` and `radii` are written for every splat.
-    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, bool antialias, int threads,
-         bool* seen, float* radii);
+    // Projects and bins. `seen` and `radii` are written for every splat. `rim`: 0.5 if pixel centres are to be drawn, 0
+    // if anything between them.
+    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, bool antialias, double rim,
+         int threads, bool* seen, float* radii);
 
     void forward(Level level, const Planes& out, int threads);
     // `absolute`: the pixels' shares of the chosen signal are summed without their signs.
     void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute,
                   const GradientArrays& out, int threads);
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
+
+    // 1 - product of 1 - alpha of the splats met on the way to points (x px, y px, z); NaN where they are not in view.
+    void probe(const double* points, int64_t count, float* opacity, int threads);
 
     int64_t first_invalid = -1;  // a splat whose values are not finite or not positive; nothing else was done then
     int64_t pairs() const { return pairs_; }
@@ -52,6 +56,7 @@ class Pass {
     Kind kind_;
     splat::CameraModel<double> camera_;
     bool antialias_;
+    double rim_;
     int64_t count_;
     int tiles_x_, tiles_y_;
     // Per projected splat; those of chunk c start at c * kChunk, their numbers are in seen_in_.
