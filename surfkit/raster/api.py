@@ -175,7 +175,7 @@ class Rasterizer(ABC):
 
     @abstractmethod
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
-        """(P,) in [0, 1], what the splats hide of each of (P, 3) points of the world (the opacity field of one view, GOF).
+        """(P,) in [0, 1], what the splats hide of (P, 3) points of the world: the opacity field of one view (GOF).
 
         That is 1 - product of (1 - alpha) of the splats that the ray from the camera through the point meets no farther
         than the point. NaN where the point is outside the image or not beyond `near`.

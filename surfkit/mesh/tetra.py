@@ -1,0 +1,148 @@
+"""Marching tetrahedra over points that the splats place, where they are needed.
+
+Gaussian Opacity Fields (Yu et al. 2024): the corners of the splats' boxes and their centres are tetrahedralised, the
+field says at every point how much the splats hide of it from the view that sees it best, and the surface is where that
+is a half.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.delaunay import EDGES, crossing
+from surfkit.mesh.field import Field, vertex_colors
+from surfkit.raster.footprints import rotations
+
+TRIANGLES = (
+    (), (0, 1, 2), (0, 4, 3), (1, 2, 4, 1, 4, 3), (1, 3, 5), (0, 5, 2, 0, 3, 5), (0, 4, 5, 0, 5, 1), (2, 4, 5),
+    (2, 5, 4), (0, 1, 5, 0, 5, 4), (0, 5, 3, 0, 2, 5), (1, 5, 3), (1, 3, 4, 1, 4, 2), (0, 3, 4), (0, 2, 1), (),
+)  # fmt: skip
+"""Edges of a positively oriented tetrahedron whose points make its triangles, by the bits of the vertices inside."""
+
+
+@dataclass(frozen=True)
+class Tetra(Mesher):
+    """Marching tetrahedra on points around the splats, with the opacity field of the views (GOF)."""
+
+    reach: float = 3.0
+    """Sigmas from the centre of a splat to the sides of its box, whose corners become points."""
+
+    thickness: float = 0.1
+    """Half thickness of a surfel's box, as a share of its smaller half side."""
+
+    faint: float = 0.05
+    """Splats of less opacity give no points."""
+
+    level: float = 0.5
+    """Opacity at the surface."""
+
+    bisections: int = 8
+    """Halvings of each edge in search of the surface."""
+
+    min_views: int = 2
+    """A place that fewer views show, hidden or not, is unknown, and no surface ends there."""
+
+    longest: float = 1.0
+    """No triangle comes from an edge longer than this times the boxes of the splats at its ends; 0 allows any."""
+
+    def __post_init__(self) -> None:
+        if not (self.reach > 0 and self.thickness > 0):
+            raise BadInput(f"mesh: tetra.reach is {self.reach} and thickness {self.thickness}; both must be positive")
+        if not 0 < self.level < 1:
+            raise BadInput(f"mesh: tetra.level is {self.level}; it must lie between 0 and 1")
+        if self.bisections < 0 or self.min_views < 1 or self.longest < 0:
+            raise BadInput(
+                f"mesh: tetra.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
+                "give 0 or more, 1 or more, 0 or more"
+            )
+
+    def mesh(self, subject: Subject) -> Mesh:
+        """See `Mesher.mesh`."""
+        points, sizes = self._points(subject)
+        field = Field(subject)
+        value, views = field.at(points, "looking at points")
+        known, inside = (views >= self.min_views).numpy(), (value > self.level).numpy()
+        if not (known & inside).any() or not (known & ~inside).any():
+            raise BadInput(
+                f"mesh: of {len(points):,} points around the splats {int((known & inside).sum()):,} are hidden and "
+                f"{int((known & ~inside).sum()):,} in the open, so no surface lies between; train longer, or lower "
+                "--mesh.faint"
+            )
+        tets, doubtful = crossing(points.numpy(), known, inside, subject.budget_bytes)
+        if doubtful:
+            told = f"mesh: {doubtful:,} of {len(tets):,} tetrahedra at the borders of tiles may not fit"
+            emit(Warned(f"{told}; give more memory"))
+        edges, faces = triangles(tets, inside, points.numpy())
+        ends = torch.from_numpy(edges)
+        low, high = points[ends[:, 0]], points[ends[:, 1]]  # inside, outside
+        length = (low - high).norm(dim=1)
+        for at in range(self.bisections):
+            middle = (low + high) / 2
+            hidden = field.at(middle, f"searching the surface, {at + 1} of {self.bisections}")[0] > self.level
+            low, high = torch.where(hidden[:, None], middle, low), torch.where(hidden[:, None], high, middle)
+        vertices = (low + high) / 2
+        if self.longest:
+            near = (length <= self.longest * (sizes[ends[:, 0]] + sizes[ends[:, 1]])).numpy()
+            faces = faces[near[faces].all(1)]
+        vertices, faces = used(vertices.numpy(), faces)
+        return Mesh(vertices.astype(np.float32), faces.astype(np.int32), vertex_colors(subject, vertices))
+
+    def _points(self, subject: Subject) -> tuple[Tensor, Tensor]:
+        """(P, 3) float64 centres and corners of boxes, and (P,) the half diagonals of these boxes."""
+        splats = subject.splats
+        kept = splats.opacities >= self.faint
+        if not kept.any():
+            raise BadInput(f"mesh: none of {len(splats):,} splats has an opacity of {self.faint}; lower --mesh.faint")
+        half = self.reach * splats.scales[kept].double()
+        if half.shape[1] == 2:
+            half = torch.cat([half, self.thickness * half.amin(1, keepdim=True)], 1)
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+        signs = torch.cat([torch.zeros(1, 3, dtype=torch.float64), signs])
+        offsets = (half[:, None] * signs) @ rotations(splats.quats[kept].double()).transpose(1, 2)
+        points = (splats.means[kept].double()[:, None] + offsets).flatten(0, 1)
+        size = half.norm(dim=1).repeat_interleave(len(signs))
+        # The corners of a box lie on one sphere, where a tetrahedralisation is not unique.
+        points += (
+            1e-3 * size[:, None] * (torch.rand(points.shape, generator=subject.generator, dtype=torch.float64) - 0.5)
+        )
+        return points, size
+
+
+def triangles(tets: np.ndarray, inside: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges that the surface crosses and the triangles between them, facing outwards.
+
+    Args:
+        tets: (T, 4) rows of `points`.
+        inside: (P,) bool.
+        points: (P, 3).
+
+    Returns:
+        (E, 2) int64 rows of points, the one inside first, and (F, 3) int64 rows of edges.
+    """
+    tets = np.sort(tets, axis=1)  # which diagonal cuts a quadrilateral must not depend on the tile
+    a, b, c, d = points[tets].transpose(1, 0, 2)
+    turned = np.einsum("ni,ni->n", np.cross(b - a, c - a), d - a) < 0
+    tets = np.where(turned[:, None], tets[:, [1, 0, 2, 3]], tets)
+    case = (inside[tets] << np.arange(4)).sum(1)
+    found = []
+    for bits, table in enumerate(TRIANGLES):
+        rows = tets[case == bits]
+        ends = rows[:, np.array(EDGES)[list(table)]] if table else np.empty((0, 3, 2), np.int64)
+        found.append(ends.reshape(-1, 3, 2))
+    ends = np.concatenate(found).reshape(-1, 2)
+    ends = np.where(inside[ends[:, :1]], ends, ends[:, ::-1])
+    edges, at = np.unique(ends, axis=0, return_inverse=True)
+    return edges, at.reshape(-1, 3)
+
+
+def used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that some face needs, and the faces by their new rows."""
+    kept, at = np.unique(faces, return_inverse=True)
+    return vertices[kept], at.reshape(-1, 3)
