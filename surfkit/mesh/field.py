@@ -17,26 +17,36 @@ NEAR_SURFACE = 0.01
 
 @dataclass(frozen=True)
 class Field:
-    """The opacity field of a subject: how much the splats hide of a place from the view that sees it best (GOF)."""
+    """The opacity field of a subject: how much the splats hide of a place from the views that see it best.
+
+    With one view to agree it is that of GOF, where a single wrong view cuts a hole.
+
+    Attributes:
+        subject: Splats and views.
+        agree: The value is that of the view with so many-th lowest opacity, counted from 1.
+    """
 
     subject: Subject
+    agree: int
 
     def at(self, points: Tensor, what: str) -> tuple[Tensor, Tensor]:
-        """(P,) opacity, 1 where no view looks, and (P,) the number of views that look there; points are (P, 3).
+        """(P,) opacity, 1 where too few views look, and (P,) the number of views that do; points are (P, 3).
 
         `what`: The work, for those who wait.
         """
-        value, views = torch.ones(len(points)), torch.zeros(len(points), dtype=torch.int32)
+        lowest = torch.ones(self.agree, len(points))
+        views = torch.zeros(len(points), dtype=torch.int32)
         given = self.subject
         for index, view in enumerate(given.views):
             here = given.rasterizer.opacity_before(given.splats, view.camera, given.near, points).float()
             if (keep := given.keep(index)) is not None:
                 here = torch.where(shown(keep.float(), view.camera.project(points)) > 0.5, here, torch.nan)
-            looked = ~here.isnan()
-            value = torch.where(looked, torch.minimum(value, here), value)
-            views += looked
+            views += ~here.isnan()
+            here = here.nan_to_num(1.0)
+            for rank in lowest:
+                rank[:], here = torch.minimum(rank, here), torch.maximum(rank, here)
             emit(Progress(what, index + 1, len(given.views)))
-        return value, views
+        return lowest[-1], views
 
 
 def shown(image: Tensor, places: Tensor) -> Tensor:

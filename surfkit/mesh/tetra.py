@@ -1,7 +1,7 @@
 """Marching tetrahedra over points that the splats place, where they are needed.
 
 Gaussian Opacity Fields (Yu et al. 2024): the corners of the splats' boxes and their centres are tetrahedralised, the
-field says at every point how much the splats hide of it from the view that sees it best, and the surface is where that
+field says at every point how much the splats hide of it from the views that see it best, and the surface is where that
 is a half.
 """
 
@@ -46,8 +46,9 @@ class Tetra(Mesher):
     bisections: int = 8
     """Halvings of each edge in search of the surface."""
 
-    min_views: int = 2
-    """A place that fewer views show, hidden or not, is unknown, and no surface ends there."""
+    agree: int = 3
+    """Views that must see a place in the open for it to be so (GOF: 1). Where fewer look, nothing is known, and no
+    surface ends."""
 
     longest: float = 1.0
     """No triangle comes from an edge longer than this times the boxes of the splats at its ends; 0 allows any."""
@@ -57,18 +58,18 @@ class Tetra(Mesher):
             raise BadInput(f"mesh: tetra.reach is {self.reach} and thickness {self.thickness}; both must be positive")
         if not 0 < self.level < 1:
             raise BadInput(f"mesh: tetra.level is {self.level}; it must lie between 0 and 1")
-        if self.bisections < 0 or self.min_views < 1 or self.longest < 0:
+        if self.bisections < 0 or self.agree < 1 or self.longest < 0:
             raise BadInput(
-                f"mesh: tetra.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
+                f"mesh: tetra.bisections {self.bisections}, agree {self.agree}, longest {self.longest}: "
                 "give 0 or more, 1 or more, 0 or more"
             )
 
     def mesh(self, subject: Subject) -> Mesh:
         """See `Mesher.mesh`."""
         points, sizes = self._points(subject)
-        field = Field(subject)
+        field = Field(subject, self.agree)
         value, views = field.at(points, "looking at points")
-        known, inside = (views >= self.min_views).numpy(), (value > self.level).numpy()
+        known, inside = (views >= self.agree).numpy(), (value > self.level).numpy()
         if not (known & inside).any() or not (known & ~inside).any():
             raise BadInput(
                 f"mesh: of {len(points):,} points around the splats {int((known & inside).sum()):,} are hidden and "
