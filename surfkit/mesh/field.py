@@ -17,36 +17,35 @@ NEAR_SURFACE = 0.01
 
 @dataclass(frozen=True)
 class Field:
-    """The opacity field of a subject: how much the splats hide of a place from the views that see it best.
-
-    With one view to agree it is that of GOF, where a single wrong view cuts a hole.
+    """Which places lie in the open, by the opacity fields of the views (GOF).
 
     Attributes:
         subject: Splats and views.
-        agree: The value is that of the view with so many-th lowest opacity, counted from 1.
+        level: Opacity up to which a view sees a place in the open.
+        agree: Share of the views looking at a place that must see it so, one at least. (GOF takes the view that sees
+            it best, that is one; then a single wrong view cuts a hole.)
     """
 
     subject: Subject
-    agree: int
+    level: float
+    agree: float
 
-    def at(self, points: Tensor, what: str) -> tuple[Tensor, Tensor]:
-        """(P,) opacity, 1 where too few views look, and (P,) the number of views that do; points are (P, 3).
+    def hidden(self, points: Tensor, what: str) -> tuple[Tensor, Tensor]:
+        """(P,) bool, places that are inside of something, and (P,) the number of views that look; points are (P, 3).
 
         `what`: The work, for those who wait.
         """
-        lowest = torch.ones(self.agree, len(points))
-        views = torch.zeros(len(points), dtype=torch.int32)
+        looking, open_to = (torch.zeros(len(points), dtype=torch.int32) for _ in range(2))
         given = self.subject
         for index, view in enumerate(given.views):
-            here = given.rasterizer.opacity_before(given.splats, view.camera, given.near, points).float()
+            opacity = given.rasterizer.opacity_before(given.splats, view.camera, given.near, points)
+            looks = ~opacity.isnan()
             if (keep := given.keep(index)) is not None:
-                here = torch.where(shown(keep.float(), view.camera.project(points)) > 0.5, here, torch.nan)
-            views += ~here.isnan()
-            here = here.nan_to_num(1.0)
-            for rank in lowest:
-                rank[:], here = torch.minimum(rank, here), torch.maximum(rank, here)
+                looks &= shown(keep.float(), view.camera.project(points)) > 0.5
+            looking += looks
+            open_to += looks & (opacity <= self.level)
             emit(Progress(what, index + 1, len(given.views)))
-        return lowest[-1], views
+        return open_to < (self.agree * looking).clamp_min(1), looking
 
 
 def shown(image: Tensor, places: Tensor) -> Tensor:

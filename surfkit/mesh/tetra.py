@@ -46,9 +46,11 @@ class Tetra(Mesher):
     bisections: int = 8
     """Halvings of each edge in search of the surface."""
 
-    agree: int = 3
-    """Views that must see a place in the open for it to be so (GOF: 1). Where fewer look, nothing is known, and no
-    surface ends."""
+    agree: float = 0.1
+    """Share of the views looking at a place that must see it in the open for it to be so; at 0 one is enough (GOF)."""
+
+    min_views: int = 2
+    """Where fewer views look, nothing is known, and no surface ends."""
 
     longest: float = 1.0
     """No triangle comes from an edge longer than this times the boxes of the splats at its ends; 0 allows any."""
@@ -56,20 +58,20 @@ class Tetra(Mesher):
     def __post_init__(self) -> None:
         if not (self.reach > 0 and self.thickness > 0):
             raise BadInput(f"mesh: tetra.reach is {self.reach} and thickness {self.thickness}; both must be positive")
-        if not 0 < self.level < 1:
-            raise BadInput(f"mesh: tetra.level is {self.level}; it must lie between 0 and 1")
-        if self.bisections < 0 or self.agree < 1 or self.longest < 0:
+        if not (0 < self.level < 1 and 0 <= self.agree < 1):
+            raise BadInput(f"mesh: tetra.level is {self.level} and agree {self.agree}; both must lie between 0 and 1")
+        if self.bisections < 0 or self.min_views < 1 or self.longest < 0:
             raise BadInput(
-                f"mesh: tetra.bisections {self.bisections}, agree {self.agree}, longest {self.longest}: "
+                f"mesh: tetra.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
                 "give 0 or more, 1 or more, 0 or more"
             )
 
     def mesh(self, subject: Subject) -> Mesh:
         """See `Mesher.mesh`."""
         points, sizes = self._points(subject)
-        field = Field(subject, self.agree)
-        value, views = field.at(points, "looking at points")
-        known, inside = (views >= self.agree).numpy(), (value > self.level).numpy()
+        field = Field(subject, self.level, self.agree)
+        hidden, views = field.hidden(points, "looking at points")
+        known, inside = (views >= self.min_views).numpy(), hidden.numpy()
         if not (known & inside).any() or not (known & ~inside).any():
             raise BadInput(
                 f"mesh: of {len(points):,} points around the splats {int((known & inside).sum()):,} are hidden and "
@@ -86,7 +88,7 @@ class Tetra(Mesher):
         length = (low - high).norm(dim=1)
         for at in range(self.bisections):
             middle = (low + high) / 2
-            hidden = field.at(middle, f"searching the surface, {at + 1} of {self.bisections}")[0] > self.level
+            hidden, _ = field.hidden(middle, f"searching the surface, {at + 1} of {self.bisections}")
             low, high = torch.where(hidden[:, None], middle, low), torch.where(hidden[:, None], high, middle)
         vertices = (low + high) / 2
         if self.longest:

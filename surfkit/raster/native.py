@@ -54,7 +54,6 @@ class NativeRasterizer(Rasterizer):
         drawn.native.contribution(alpha_power, transmittance_power, total, count, torch.get_num_threads())
         return total, count
 
-
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = _Pass(replace(splats, sh=torch.zeros(len(splats), 1, 3)), camera, near, rim=0.0)
         opacity = torch.empty(len(points), dtype=torch.float32)

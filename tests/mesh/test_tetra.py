@@ -80,7 +80,7 @@ def volume(vertices, faces) -> float:
 
 @pytest.mark.parametrize("kind", ["surfel", "gaussian"])
 def test_a_ball_becomes_a_closed_ball(kind):
-    mesh = Tetra(longest=0, agree=1).mesh(ball(kind))
+    mesh = Tetra(longest=0, agree=0).mesh(ball(kind))
     assert is_closed(mesh.faces)
     assert len(mesh.vertices) - len(edges_of(mesh.faces)) // 2 + len(mesh.faces) == 2
     radius = np.linalg.norm(mesh.vertices, axis=1)
@@ -137,11 +137,11 @@ def test_what_no_view_shows_has_no_surface():
     """One camera: what the ball hides from it is the inside of something, and no triangle reaches into it."""
     given = ball()
     one, direction = given.views[:1], given.views[0].camera.centre.numpy() / 2
-    mesh = Tetra(agree=1).mesh(replace(given, views=one))
+    mesh = Tetra(min_views=1).mesh(replace(given, views=one))
     assert len(mesh.faces) > 200
     assert (mesh.vertices @ direction).min() > -0.1 and (Tetra().mesh(given).vertices @ direction).min() < -0.48
     with pytest.raises(BadInput, match="no surface"):
-        Tetra(agree=2).mesh(replace(given, views=one))
+        Tetra(min_views=2).mesh(replace(given, views=one))
 
 
 def test_masked_pixels_show_nothing():
@@ -157,7 +157,9 @@ def test_faint_splats_give_no_points():
         Tetra(faint=0.99).mesh(given)
 
 
-@pytest.mark.parametrize("settings", [{"level": 1.0}, {"reach": 0.0}, {"agree": 0}, {"bisections": -1}])
+@pytest.mark.parametrize(
+    "settings", [{"level": 1.0}, {"reach": 0.0}, {"min_views": 0}, {"agree": 1.0}, {"bisections": -1}]
+)
 def test_bad_settings(settings):
     with pytest.raises(BadInput, match="tetra"):
         Tetra(**settings)

@@ -1,0 +1,166 @@
+"""How a scene is cut: cells on the ground that own every point exactly once."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surfkit.core.registry import Component
+from surfkit.raster.api import Rasterizer, Splats
+from surfkit.scene.scene import View
+
+UPRIGHT = math.cos(math.radians(25))
+"""A ground this close to two axes of the frame is taken to lie along them."""
+
+Box = tuple[float | None, float | None, float | None, float | None]
+"""Lower x and y, upper x and y of a cell, half open; None where it has no end."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane on which a scene is cut.
+
+    Attributes:
+        x: Its first axis, a unit vector of the local frame.
+        y: The second.
+    """
+
+    x: tuple[float, float, float]
+    y: tuple[float, float, float]
+
+    @classmethod
+    def under(cls, centres: Tensor, points: Tensor) -> Ground:
+        """The plane along which cameras, (V, 3), spread the most, or points, (N, 3), where those stand in a line.
+
+        If it is nearly a plane of two axes of the frame, as in a georeferenced scene, it is that one.
+        """
+        spread, axes = _axes(centres)
+        if len(centres) < 3 or spread[1] < 0.05 * spread[2]:
+            axes = _axes(points)[1]
+        up = axes[:, 0]
+        if float(up.abs().max()) >= UPRIGHT:
+            flat = [axis for axis in range(3) if axis != int(up.abs().argmax())]
+            axes = torch.eye(3, dtype=torch.float64)[:, flat]
+        else:
+            axes = axes[:, [2, 1]]
+        first, second = (tuple(axis.tolist()) for axis in axes.T)
+        return cls(first, second)
+
+    def flat(self, points: Tensor) -> Tensor:
+        """(N, 2) float64 places on the ground of (N, 3) points."""
+        return points.double() @ torch.tensor([self.x, self.y], dtype=torch.float64).T
+
+
+def _axes(points: Tensor) -> tuple[Tensor, Tensor]:
+    """(3,) standard deviations and (3, 3) principal axes in columns, the smallest first."""
+    centred = points.double() - points.double().mean(0)
+    values, vectors = torch.linalg.eigh(centred.T @ centred / max(1, len(points)))
+    return values.clamp_min(0).sqrt(), vectors
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """Unbounded ground in the unit square, a foreground box in its middle (CityGaussian; Mip-NeRF 360).
+
+    Attributes:
+        low: Lower corner of the foreground on the ground; it becomes (1/4, 1/4).
+        high: Upper corner; it becomes (3/4, 3/4).
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    def contracted(self, flat: Tensor) -> Tensor:
+        """(N, 2) places in the unit square of (N, 2) places on the ground."""
+        low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (self.low, self.high))
+        at = (flat - (low + high) / 2) / ((high - low) / 2)
+        size = at.abs().amax(1, keepdim=True)
+        far = (2 - 1 / size.clamp_min(1)) * at / size.clamp_min(1)
+        return torch.where(size > 1, far, at) / 4 + 0.5
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells that tile the ground: every place is in exactly one, the outer ones reach to infinity.
+
+    Attributes:
+        ground: What they lie on.
+        boxes: Of each cell, on the ground or in the unit square of the contraction.
+        blocks: The block that each cell belongs to, counted from 0.
+        contraction: Applied before boxes are looked up.
+    """
+
+    ground: Ground
+    boxes: tuple[Box, ...]
+    blocks: tuple[int, ...]
+    contraction: Contraction | None = None
+
+    @property
+    def count(self) -> int:
+        """Blocks."""
+        return max(self.blocks) + 1
+
+    def owner(self, points: Tensor) -> Tensor:
+        """(N,) int64, the block that owns each of (N, 3) points; -1 for one that is not finite."""
+        flat = self.ground.flat(points)
+        if self.contraction is not None:
+            flat = self.contraction.contracted(flat)
+        owner = torch.full((len(points),), -1, dtype=torch.int64)
+        for (x0, y0, x1, y1), block in zip(self.boxes, self.blocks, strict=True):
+            here = flat.isfinite().all(1)
+            for axis, low, high in ((0, x0, x1), (1, y0, y1)):
+                if low is not None:
+                    here &= flat[:, axis] >= low
+                if high is not None:
+                    here &= flat[:, axis] < high
+            owner[here] = block
+        return owner
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A coarse model and the views it was trained on.
+
+    Attributes:
+        splats: Activated values, local frame.
+        views: Training views.
+        rasterizer: Draws the splats.
+        near: Local units.
+    """
+
+    splats: Splats
+    views: Sequence[View]
+    rasterizer: Rasterizer
+    near: float
+
+    @property
+    def centres(self) -> Tensor:
+        """(V, 3) float64 positions of the cameras."""
+        return torch.stack([view.camera.centre for view in self.views])
+
+    @property
+    def pixels(self) -> Tensor:
+        """(V,) float64 sizes of the photographs."""
+        return torch.tensor([view.camera.width * view.camera.height for view in self.views], dtype=torch.float64)
+
+    def share(self, at: int) -> Tensor:
+        """(N,) the part of the picture of a view that each splat makes up: the mean over its pixels of alpha T."""
+        total, _ = self.rasterizer.contribution(self.splats, self.views[at].camera, self.near, 1.0, 1.0)
+        return total / float(self.pixels[at])
+
+
+class Partition(Component):
+    """A way to cut a scene into blocks."""
+
+    @abstractmethod
+    def cells(self, sight: Sight) -> Cells:
+        """The cells; they depend on nothing but the model and the cameras.
+
+        Raises:
+            BadInput: The scene cannot be cut so.
+        """
