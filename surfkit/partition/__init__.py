@@ -1,0 +1,34 @@
+"""Cutting a large scene into blocks, and putting them together again."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
+from surfkit.partition.balanced import Balanced
+from surfkit.partition.base import Cells, Partition, Sight
+from surfkit.partition.grid import ContractedGrid, QuantileGrid
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """What this folder offers."""
+    return {
+        "contracted-grid": ContractedGrid,
+        "quantile-grid": QuantileGrid,
+        "balanced": Balanced,
+        "ssim-difference": SSIMDifference,
+        "picture-share": PictureShare,
+    }
+
+
+__all__ = [
+    "Assign",
+    "Balanced",
+    "Cells",
+    "ContractedGrid",
+    "Partition",
+    "PictureShare",
+    "QuantileGrid",
+    "SSIMDifference",
+    "Sight",
+]

@@ -1,0 +1,149 @@
+"""The plan of the blocks: their cells, views and sizes, and nothing that is silently left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.partition.assign import Assign
+from surfkit.partition.base import Cells, Partition, Sight
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block.
+
+    Attributes:
+        index: Counted from 0.
+        views: Names of the views it is tuned on; empty if it stays as it is in the coarse model.
+        cameras: How many of them stand inside.
+        points: Of the coarse model that it owns.
+        work: Pixels of the views times the points, as a share of all blocks'.
+    """
+
+    index: int
+    views: tuple[str, ...]
+    cameras: int
+    points: int
+    work: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a scene is cut, and who trains on what.
+
+    Attributes:
+        cells: Which block owns what.
+        blocks: In the order of their index.
+    """
+
+    cells: Cells
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Fewest:
+    """How many views a block needs.
+
+    Attributes:
+        views: In a large scene.
+        share: In a small one: of the views that each block would get if they were divided among the blocks.
+    """
+
+    views: int = 50
+    share: float = 0.25
+
+    def of(self, views: int, blocks: int) -> int:
+        """The number for a scene."""
+        return max(1, min(self.views, round(self.share * views / blocks)))
+
+
+def plan(sight: Sight, partition: Partition, assign: Assign, fewest: Fewest | None = None) -> Plan:
+    """Cut, find the views of every block, and join blocks with too few of them to their neighbours.
+
+    Raises:
+        BadInput: The scene cannot be cut, or no block has a view.
+    """
+    cells = partition.cells(sight)
+    owner = cells.owner(sight.splats.means)
+    measure = assign.measure(sight, owner, cells.count)
+    inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
+    joins = inside | (measure > assign.least)
+    if not joins.any():
+        raise BadInput("partition: no view shows any block; lower the threshold of the assignment")
+    cells, joins, inside = with_enough_views(
+        cells, joins, inside, (fewest or Fewest()).of(len(sight.views), cells.count)
+    )
+    return Plan(cells, blocks_of(sight, cells, joins, inside))
+
+
+def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:
+    """What there is to say of every block, from (V, B) views that join and that stand inside."""
+    points = torch.bincount(cells.owner(sight.splats.means), minlength=cells.count)
+    work = (joins * sight.pixels[:, None]).sum(0) * points
+    share = (work / work.sum().clamp_min(1)).tolist()
+    names = [view.name for view in sight.views]
+    return tuple(
+        Block(
+            index,
+            tuple(name for name, here in zip(names, joins[:, index].tolist(), strict=True) if here),
+            int(inside[:, index].sum()),
+            int(points[index]),
+            share[index],
+        )
+        for index in range(cells.count)
+    )
+
+
+def with_enough_views(cells: Cells, joins: Tensor, inside: Tensor, fewest: int) -> tuple[Cells, Tensor, Tensor]:
+    """Join each block with fewer than `fewest` views to the touching one that shares the most of them.
+
+    Args:
+        cells: As cut.
+        joins: (V, B) bool, the views of each block.
+        inside: (V, B) bool, the cameras in each.
+        fewest: Views.
+
+    Returns:
+        Cells, joins and inside of the blocks that are left.
+    """
+    groups = [{block} for block in range(cells.count)]
+    while len(groups) > 1:
+        views = [joins[:, sorted(group)].any(1) for group in groups]
+        poor = min(range(len(groups)), key=lambda at: int(views[at].sum()))
+        if int(views[poor].sum()) >= fewest:
+            break
+        touching = [at for at in range(len(groups)) if at != poor and touch(cells, groups[poor], groups[at])]
+        partner = max(touching, key=lambda at: (int((views[at] & views[poor]).sum()), int(views[at].sum()), -at))
+        told = f"a block with {int(views[poor].sum())} views, fewer than {fewest}, is joined to its neighbour"
+        emit(Warned(f"partition: {told}"))
+        groups[partner] |= groups[poor]
+        del groups[poor]
+    groups.sort(key=min)
+    number = {block: at for at, group in enumerate(groups) for block in group}
+    joined = replace(cells, blocks=tuple(number[block] for block in cells.blocks))
+    return joined, *(torch.stack([table[:, sorted(g)].any(1) for g in groups], 1) for table in (joins, inside))
+
+
+def touch(cells: Cells, one: set[int], other: set[int]) -> bool:
+    """Whether cells of two groups of blocks have more than a corner in common."""
+    infinity = float("inf")
+
+    def sides(block: set[int]) -> Sequence[tuple[float, ...]]:
+        found = [box for box, of in zip(cells.boxes, cells.blocks, strict=True) if of in block]
+        return [
+            tuple((-infinity if at < 2 else infinity) if side is None else side for at, side in enumerate(box))
+            for box in found
+        ]
+
+    for a in sides(one):
+        for b in sides(other):
+            x, y = (min(a[axis + 2], b[axis + 2]) - max(a[axis], b[axis]) for axis in (0, 1))
+            if (x == 0 and y > 0) or (y == 0 and x > 0):
+                return True
+    return False
