@@ -46,7 +46,7 @@ class Tetra(Mesher):
     bisections: int = 8
     """Halvings of each edge in search of the surface."""
 
-    agree: float = 0.1
+    agree: float = 0.2
     """Share of the views looking at a place that must see it in the open for it to be so; at 0 one is enough (GOF)."""
 
     min_views: int = 2

@@ -6,6 +6,7 @@ from surfkit.core.registry import Component, hookimpl
 from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
 from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, Partition, Sight
+from surfkit.partition.executor import Executor, Inline, Pool
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
 
 
@@ -18,6 +19,8 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "balanced": Balanced,
         "ssim-difference": SSIMDifference,
         "picture-share": PictureShare,
+        "inline": Inline,
+        "pool": Pool,
     }
 
 
@@ -26,8 +29,11 @@ __all__ = [
     "Balanced",
     "Cells",
     "ContractedGrid",
+    "Executor",
+    "Inline",
     "Partition",
     "PictureShare",
+    "Pool",
     "QuantileGrid",
     "SSIMDifference",
     "Sight",

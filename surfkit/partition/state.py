@@ -1,0 +1,78 @@
+"""Where the work on a block stands, in a small file that whoever looks can read."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from surfkit.core.codec import read_json, write_json
+
+Status = Literal["planned", "running", "done", "failed"]
+Kind = Literal["data", "numbers", "memory", "disk", "crash", "interrupted"]
+
+STALE_S = 120.0
+"""Seconds without a sign of life after which a block of another machine counts as abandoned."""
+
+
+@dataclass(frozen=True)
+class BlockState:
+    """Where one block stands.
+
+    Attributes:
+        status: planned, running, done or failed.
+        step: Steps made, as last heard of.
+        steps: Steps to make.
+        attempts: How often it was begun.
+        kind: Of the failure.
+        error: What went wrong, in one line.
+        host: The machine that works or worked on it.
+        pid: The process.
+        heard: When it last gave a sign of life, seconds since 1970.
+    """
+
+    status: Status = "planned"
+    step: int = 0
+    steps: int = 0
+    attempts: int = 0
+    kind: Kind | None = None
+    error: str | None = None
+    host: str | None = None
+    pid: int | None = None
+    heard: float = 0.0
+
+    def running_now(self) -> bool:
+        """Whether somebody works on it: the process is alive, or on another machine it was heard of lately."""
+        if self.status != "running" or self.pid is None:
+            return False
+        if self.host != platform.node():
+            return time.time() - self.heard < STALE_S
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            return True
+        return True
+
+
+def state_path(folder: Path) -> Path:
+    """Where the state of a block lies in its folder."""
+    return folder / "state.json"
+
+
+def read_state(folder: Path) -> BlockState:
+    """The state of the block in a folder; planned if nothing is there."""
+    path = state_path(folder)
+    return read_json(path, BlockState) if path.exists() else BlockState()
+
+
+def write_state(folder: Path, **changes: object) -> BlockState:
+    """Change some of the state of a block, and sign it."""
+    signed = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
+    state = replace(read_state(folder), **(signed | changes))
+    write_json(state_path(folder), state)
+    return state

@@ -1,0 +1,117 @@
+"""Executors with jobs that take no time, in real processes."""
+
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.partition import executor
+from surfkit.partition.executor import LOG, Inline, Job, Pool
+from surfkit.partition.state import STALE_S, BlockState, read_state, write_state
+
+
+def job(folder: Path, index: int, code: str = "", **more) -> Job:
+    place = folder / f"{index:02}"
+    place.mkdir()
+    words = ("-c", f"import os; os.chdir({str(place)!r}); {code or 'pass'}")
+    return Job(index, place, lambda: index, words, **more)
+
+
+def test_inline_calls_one_after_the_other(tmp_path):
+    assert [(end.job.index, end.status) for end in Inline().run([job(tmp_path, 0), job(tmp_path, 3)])] == [
+        (0, 0),
+        (3, 3),
+    ]
+
+
+def test_pool_tells_how_each_ended_and_keeps_what_it_printed(tmp_path):
+    killed = "import os; os.kill(os.getpid(), 9)"
+    jobs = [job(tmp_path, 0, "print('hello')"), job(tmp_path, 1, "raise SystemExit(1)"), job(tmp_path, 2, killed)]
+    assert {end.job.index: end.status for end in Pool().run(jobs)} == {0: 0, 1: 1, 2: -9}
+    assert (tmp_path / "00" / LOG).read_text() == "hello\n"
+
+
+def test_pool_divides_the_processors(tmp_path):
+    say = "print(os.environ['OMP_NUM_THREADS'])"
+    list(Pool(workers=1, threads=3).run([job(tmp_path, 0, say)]))
+    list(Pool(workers=1000).run([job(tmp_path, 1, say)]))
+    assert [(tmp_path / name / LOG).read_text() for name in ("00", "01")] == ["3\n", "1\n"]
+
+
+def test_the_largest_begin_first(tmp_path):
+    jobs = [job(tmp_path, at, cost=cost) for at, cost in enumerate([1.0, 5.0, 3.0])]
+    assert [end.job.index for end in Pool(workers=1).run(jobs)] == [1, 2, 0]
+
+
+def test_two_at_a_time(tmp_path):
+    """Each waits for the other to begin, which one after the other would never do."""
+    wait = "from pathlib import Path\nPath('began').touch()\nimport time\nend = time.time() + 30\n"
+    wait += "while not Path('../{}/began').exists() and time.time() < end: time.sleep(0.02)\n"
+    jobs = [
+        job(tmp_path, at, "exec({!r})".format(wait.format(f"{1 - at:02}") + "assert time.time() < end"))
+        for at in (0, 1)
+    ]
+    assert [end.status for end in Pool(workers=2).run(jobs)] == [0, 0]
+
+
+def test_memory_keeps_blocks_waiting_but_never_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(executor, "free_bytes", lambda: 1_000)
+    look = "import glob; raise SystemExit(len(glob.glob('../*/here')) and 7)"
+    slow = "from pathlib import Path; import time; Path('here').touch(); time.sleep(0.5); Path('here').unlink()"
+    jobs = [job(tmp_path, 0, slow, cost=2.0, memory_bytes=5_000), job(tmp_path, 1, look, memory_bytes=500)]
+    assert {end.job.index: end.status for end in Pool(workers=2).run(jobs)} == {0: 0, 1: 0}
+
+
+def test_leaving_stops_the_workers(tmp_path):
+    """As Ctrl-C does: they get SIGINT, may save, and are waited for."""
+    code = "import time\nfrom pathlib import Path\nPath('began').touch()\ntry:\n    time.sleep(60)\n"
+    code += "except KeyboardInterrupt:\n    Path('saved').touch()\n    raise SystemExit(130)"
+    running = Pool(workers=1).run([job(tmp_path, 0, f"exec({code!r})")])
+    began = time.monotonic()
+    executor_poll = executor.POLL_S
+
+    class Stop(Exception):
+        pass
+
+    def sleep(seconds):
+        if (tmp_path / "00" / "began").exists():
+            raise Stop
+        assert time.monotonic() - began < 30 and seconds == executor_poll
+        real(seconds)
+
+    real = time.sleep
+    executor.time.sleep = sleep
+    try:
+        with pytest.raises(Stop):
+            next(running)
+    finally:
+        executor.time.sleep = real
+    assert (tmp_path / "00" / "saved").exists() and time.monotonic() - began < 40
+
+
+def test_a_state_is_read_as_it_was_written(tmp_path):
+    assert read_state(tmp_path) == BlockState()
+    write_state(tmp_path, status="running", step=3, steps=10, attempts=1)
+    state = read_state(tmp_path)
+    assert (state.status, state.step, state.steps, state.attempts, state.pid) == ("running", 3, 10, 1, os.getpid())
+    assert state.running_now()
+    assert not write_state(tmp_path, status="done").running_now()
+
+
+def test_who_is_still_at_work(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", "pass"])
+    ended.wait()
+    assert not BlockState("running", pid=ended.pid, host=platform.node()).running_now()
+    assert BlockState("running", pid=1, host="another", heard=time.time()).running_now()
+    assert not BlockState("running", pid=1, host="another", heard=time.time() - STALE_S - 1).running_now()
+
+
+@pytest.mark.parametrize("settings", [{"workers": 0}, {"threads": -1}, {"memory_share": 0.0}])
+def test_bad_settings(settings):
+    with pytest.raises(BadInput, match="pool"):
+        Pool(**settings)
