@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -39,19 +39,20 @@ def read(data: Data) -> Scene:
     return assembled(data, reader.read(data))
 
 
-def assembled(data: Data, capture: Capture, keep: Path | None = None) -> Scene:
+def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
     """The scene of a capture.
 
     Args:
         data: The data set, and how to use it.
         capture: What its reader has found in it.
         keep: Folder of the undistorted photographs; by default one that later runs find again.
+        only: Names of the photographs to make views of; all by default.
     """
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = Frame.around(poses, capture.xyz)
-    views = _views(data, shots, frame, keep)
+    views = _views(data, [shot for shot in shots if only is None or shot.name in only], frame, keep)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
