@@ -169,7 +169,8 @@ def rows(found: Estimate) -> list[tuple[str, str]]:
         ("time", f"{duration(found.seconds)} ({steps} ms a step, from the beginning to the end)"),
         (
             "memory",
-            f"{size(found.memory_bytes)}, {size(found.cache_bytes)} of it photographs; {size(room.memory_bytes)} are free",
+            f"{size(found.memory_bytes)}, of which photographs {size(found.cache_bytes)}; "
+            f"{size(room.memory_bytes)} are free",
         ),
         ("disk", f"{size(found.run_bytes)} for the run folder; {size(room.run_bytes)} are free"),
     ]

@@ -32,7 +32,7 @@ Told = Callable[[str, int, int], None]
 PLACES = 1_000
 """Sparse points at which the brightness of photographs is compared."""
 UNEVEN_STOPS = 1.0
-"""Spread of exposures, from the 5th to the 95th percentile, that a single colour of each point cannot explain."""
+"""Spread of exposures, from the 10th to the 90th percentile, that a single colour of each point cannot explain."""
 INVERTED = 0.2
 """A mask that keeps less is probably inverted, if most masks are so."""
 
@@ -218,19 +218,20 @@ def _split(gathered: Gathered) -> list[Finding]:
 
 def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:
     """Photographs that show the same places differently bright."""
-    names = [name for name, look in known.items() if look.brightness is not None]
+    names = [name for name, look in known.items() if look.brightness is not None and not look.flat]
     if len(names) < 3:
         return []
     stops = exposures(np.stack([known[name].brightness for name in names]))
     if not np.isfinite(stops).any():
         return []
-    low, high = np.nanpercentile(stops, [5, 95])
+    low, high = np.nanpercentile(stops, [10, 90])
     if high - low < UNEVEN_STOPS or recipe.pretrain.appearance is not None:
         return []
     order = np.argsort(np.nan_to_num(stops))
     text = (
         f"the same places differ in brightness by {high - low:.1f} stops between photographs, "
-        f"from {names[order[0]]!r}, the darkest, to {names[order[-1]]!r}: add pretrain.appearance:exposure, which learns an exposure for each"
+        f"from {names[order[0]]!r}, the darkest, to {names[order[-1]]!r}: "
+        "add pretrain.appearance:exposure, which learns an exposure for each"
     )
     return [Finding("warning", "exposure", text)]
 

@@ -22,7 +22,7 @@ BEYOND = 0.3
 FAR_CAMERA = 25.0
 """A camera so many times farther out than the median one is no part of the scene."""
 FEW_POINTS, FEW_IN_VIEW, FEW_VIEWS = 1_000, 10, 3
-THIN = 0.1
+THIN = 0.2
 """Share of the points that may be seen by fewer than FEW_VIEWS photographs; the rim of a survey is."""
 NEARER = 0.01
 """Share of what is in view that may lie before the near plane."""
@@ -162,15 +162,15 @@ def _poses(shots: Sequence[Shot]) -> list[Finding]:
     if far:
         times = distance.max() / usual
         text = (
-            f"{few(far)}: {times:,.0f} times as far out as the median camera; they stretch the scene's extent, by which "
-            "learning rates, near plane and densification are scaled: delete them from the model"
+            f"{few(far)}: {times:,.0f} times as far out as the median camera; they stretch the scene's extent, "
+            "by which learning rates, near plane and densification are scaled: delete them from the model"
         )
         found.append(Finding("warning", "far-cameras", text, tuple(far)))
     poses = np.stack([shot.pose for shot in shots]).reshape(len(shots), -1)
     _, at, back, count = np.unique(poses, axis=0, return_index=True, return_inverse=True, return_counts=True)
     same = [shots[i].name for i in np.flatnonzero(count[back.reshape(-1)] > 1)]
     if same:
-        text = f"{len(same)} photographs have exactly the pose of another, {few(same)}: poses that were filled in, or copies"
+        text = f"{len(same)} photographs have exactly the pose of another, {few(same)}: filled in, or copies"
         found.append(Finding("warning", "equal-poses", f"{text}; delete them from the model", tuple(same)))
     return found
 

@@ -8,12 +8,12 @@ from surfkit.doctor.finding import Finding
 
 MOST = 200_000
 """Points that are looked at."""
-PER_CELL = 12
+PER_CELL = 6
 """Points in a cell of the ground, on average."""
 CELLS = 64
 """Most cells along a side."""
-SMALLEST = 0.01
-"""Share of the covered ground below which a hole does not count."""
+SMALLEST, FEWEST = 0.02, 4
+"""Share of the covered ground, and cells, below which a hole does not count: points lie unevenly."""
 FLAT = 0.5
 """Spread of the points across the ground over that along it, above which there is no ground to speak of."""
 BELOW = 0.05
@@ -23,7 +23,7 @@ NEAREST = 0.9
 
 
 def holes(xyz: np.ndarray, centres: np.ndarray) -> list[Finding]:
-    """Where the ground within the surveyed area has no points, as one finding.
+    """Where the ground below the cameras has no points, as one finding.
 
     The ground is the plane along which the points lie; where cameras are on both sides of it, there is none.
 
@@ -42,7 +42,9 @@ def holes(xyz: np.ndarray, centres: np.ndarray) -> list[Finding]:
     if spread[2] > FLAT * spread[1] or BELOW < above < 1 - BELOW:
         return []
     ground = (points - middle) @ axes[:2].T
+    over = (centres - middle) @ axes[:2].T
     low, high = np.quantile(ground, [0.02, 0.98], axis=0)
+    low, high = np.maximum(low, over.min(0)), np.minimum(high, over.max(0))
     if not (high > low).all():
         return []
     area, largest, where = _enclosed(ground, low, high)
@@ -50,8 +52,8 @@ def holes(xyz: np.ndarray, centres: np.ndarray) -> list[Finding]:
         return []
     spot = ", ".join(f"{value:,.4g}" for value in middle + where @ axes[:2])
     text = (
-        f"coverage holes: {area:.0%} of the ground within the surveyed area has no sparse points, the largest about "
-        f"({spot}): water or bare roofs, or photographs that are missing; nothing can be built where nothing was seen"
+        f"coverage holes: {area:.0%} of the ground below the cameras has no sparse points, most of it about ({spot}): "
+        "water or bare roofs, or photographs that are missing; nothing can be built where nothing was seen"
     )
     return [Finding("warning", "coverage-holes", text)]
 
@@ -64,13 +66,14 @@ def _enclosed(ground: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[fl
     size = np.sqrt(np.prod(high - low) * PER_CELL / inside.sum())
     shape = np.clip(np.ceil((high - low) / size), 3, CELLS).astype(int)
     counts, *edges = np.histogramdd(ground[inside], bins=list(shape), range=list(zip(low, high, strict=True)))
-    covered = np.pad(ndimage.binary_closing(np.pad(counts > 0, 2))[2:-2, 2:-2] | (counts > 0), 1)
+    covered = counts > 0
     filled = ndimage.binary_fill_holes(covered)
-    gaps, number = ndimage.label((filled & ~covered)[1:-1, 1:-1])
-    if not number:
-        return 0.0, 0.0, low
+    gaps, _ = ndimage.label(filled & ~covered)
     sizes = np.bincount(gaps.reshape(-1))[1:]
+    if sizes.max(initial=0) < FEWEST:
+        return 0.0, 0.0, low
     middle = np.array(ndimage.center_of_mass(gaps == sizes.argmax() + 1))
     cells = [(edge[1] - edge[0]) for edge in edges[0]]
     where = low + (middle + 0.5) * cells
-    return float(sizes.sum() / filled.sum()), float(sizes.max() / filled.sum()), where
+    counted = sizes[sizes >= FEWEST].sum()
+    return float(counted / filled.sum()), float(sizes.max() / filled.sum()), where

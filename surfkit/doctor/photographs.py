@@ -103,7 +103,8 @@ def _look(wanted: Wanted, quick: bool) -> Photograph:
 
 
 def _header(image: Image.Image) -> dict:
-    turned = image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT
+    there = "exif" in image.info  # without it, some formats would decode all to search for it
+    turned = there and image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT
     return {"size": image.size, "kind": f"{image.format} {image.mode}", "turned": turned}
 
 

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -99,7 +100,7 @@ class Taken:
 
     Attributes:
         points: How many there were.
-        seconds: Of a step, on average.
+        seconds: Of the median step.
         peak_bytes: Most memory that the process has held by its end.
     """
 
@@ -238,7 +239,7 @@ def _taken(trainer: Trainer, state: StageState, part: Part, job: Job) -> Taken:
     draw = torch.rand(count, generator=state.generator)
     state.points = apply(trainer.primitive, state.points, Edit(clone=draw < EDITED), state.generator)
     state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
-    return Taken(count, sum(counted) / len(counted), peak_memory_bytes())
+    return Taken(count, statistics.median(counted), peak_memory_bytes())
 
 
 def _written(trainer: Trainer, state: StageState) -> Written:
