@@ -6,15 +6,15 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from surfkit.cli.recipes import chosen_recipe, recipes
+from surfkit.cli.recipes import chosen_recipe
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
@@ -27,7 +27,6 @@ from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
 
-DEFAULT = "2dgs"
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
@@ -41,8 +40,10 @@ class Doctor:
     data: Annotated[Path, tyro.conf.Positional]
     """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
-    recipe: Annotated[Recipe, chosen_recipe] = field(default_factory=lambda: recipes()[DEFAULT])
-    """What it is to be used for."""
+    default_recipe: ClassVar[str] = "2dgs"
+
+    recipe: Annotated[Recipe, chosen_recipe]
+    """What it is to be used for; recipe:2dgs if none is named."""
 
     json: bool = False
     """Print JSON instead."""

@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 
 from surfkit.core.memory import peak_memory_bytes
+from surfkit.densify.base import Prune, Step
 from surfkit.evaluate.pictures import panel, write_picture
 from surfkit.primitives.base import Primitive, apply, to_table
 from surfkit.primitives.points import Edit, Points
@@ -38,7 +39,23 @@ from surfkit.train.stage import StageState, Trainer
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""
 EDITED = 0.05
-"""Share of the points that multiply in the edit of each part: an edit holds the old and the new points at once."""
+"""Share of the points that go, and of those that come, in the edit of each part: an edit holds the points several times
+over."""
+
+
+@dataclass(frozen=True)
+class Churn(Prune):
+    """Some points go and as many come, at given steps: memory is at its highest while a step edits its points."""
+
+    at: tuple[int, ...] = ()
+    """Steps."""
+
+    def edit(self, points: Points, step: Step) -> Edit | None:
+        """Drop some, and clone others."""
+        if step.index not in self.at:
+            return None
+        draw = torch.rand(len(points), generator=torch.Generator().manual_seed(step.index))
+        return Edit(drop=draw < EDITED, clone=draw > 1 - EDITED)
 
 
 @dataclass(frozen=True)
@@ -208,7 +225,9 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     generator, start = torch.Generator().manual_seed(recipe.seed), time.perf_counter()
     points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator))
     yield Started(photo_seconds, time.perf_counter() - start, held)
-    trainer = Trainer(recipe.pretrain, recipe.primitive, views, photos, select(job.device)[0], priors, masks)
+    churn = Churn(tuple(part.index + 1 for part in job.parts))
+    stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
+    trainer = Trainer(stage, recipe.primitive, views, photos, select(job.device)[0], priors, masks)
     state = trainer.begin(points, generator)
     del points
     for part in job.parts:
@@ -223,7 +242,7 @@ def _made_up_prior(view: View) -> DepthPrior:
 
 
 def _taken(trainer: Trainer, state: StageState, part: Part, job: Job) -> Taken:
-    """Take the steps of a part, and an edit as large as edits are."""
+    """Take the steps of a part, with an edit in the first."""
     state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
     state.index = part.index
     wanted = max(WARM + 1, job.steps // len(job.parts))
@@ -235,11 +254,7 @@ def _taken(trainer: Trainer, state: StageState, part: Part, job: Job) -> Taken:
         if time.perf_counter() - begun > job.seconds / len(job.parts) and len(times) > WARM:
             break
     counted = times[WARM:] or times
-    count = len(state.points)
-    draw = torch.rand(count, generator=state.generator)
-    state.points = apply(trainer.primitive, state.points, Edit(clone=draw < EDITED), state.generator)
-    state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
-    return Taken(count, statistics.median(counted), peak_memory_bytes())
+    return Taken(len(state.points), statistics.median(counted), peak_memory_bytes())
 
 
 def _written(trainer: Trainer, state: StageState) -> Written:
