@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -36,12 +36,23 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
-    capture = reader.read(data)
+    return assembled(data, reader.read(data))
+
+
+def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
+    """The scene of a capture.
+
+    Args:
+        data: The data set, and how to use it.
+        capture: What its reader has found in it.
+        keep: Folder of the undistorted photographs; by default one that later runs find again.
+        only: Names of the photographs to make views of; all by default.
+    """
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = Frame.around(poses, capture.xyz)
-    views = _views(data, shots, frame)
+    views = _views(data, [shot for shot in shots if only is None or shot.name in only], frame, keep)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
@@ -105,7 +116,7 @@ def _wanted() -> str:
     )
 
 
-def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
+def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -> list[View]:
     """The photographs at the size to use them at, undistorted."""
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
@@ -113,19 +124,18 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
     with ThreadPoolExecutor(4) as pool:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
-            _refuse_size(shot, size)
+            check_size(shot, size)
             if shot.name in masks:
                 check_mask(masks[shot.name], size)
-        pictures = list(pool.map(lambda shot, size: _picture(data, shot, size, masks.get(shot.name)), shots, sizes))
+        given = [
+            Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
+            for shot, size in zip(shots, sizes, strict=True)
+        ]
+        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistorted(p, data.path, keep), given))
     return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
 
 
-def _picture(data: Data, shot: Shot, size: tuple[int, int], mask: Path | None) -> Picture:
-    used = Picture(shot.path, mask, shot.camera, data.size(*size), data.white)
-    return used if is_pinhole(shot.camera) else undistorted(used, data.path)
-
-
-def _refuse_size(shot: Shot, size: tuple[int, int]) -> None:
+def check_size(shot: Shot, size: tuple[int, int]) -> None:
     """BadInput unless the photograph is the camera's picture at some size, within a pixel."""
     full = (shot.camera.width, shot.camera.height)
     long = 0 if full[0] >= full[1] else 1
