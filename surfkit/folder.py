@@ -22,7 +22,7 @@ from surfkit.core.version import own_version
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
-from surfkit.scene.scene import Scene
+from surfkit.scene.scene import Frame, Scene
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,11 @@ class Run:
     def cloud(self) -> Path:
         """The points, in the frame of the input."""
         return self.out / "point_cloud.ply"
+
+    @property
+    def cameras(self) -> Path:
+        """The cameras, in the coordinates of the points."""
+        return self.out / "cameras.json"
 
     @property
     def pictures(self) -> Path:
@@ -148,7 +153,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
     return now
 
 
-def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
+def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
     """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
     before = read_json(this.record, Any) if this.record.exists() else {}
     notes.begin(
@@ -160,6 +165,13 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
             "threads": torch.get_num_threads(),
             "seed": this.recipe.seed,
             "data": this.data,
+            "frame": {
+                "origin": frame.origin.tolist(),
+                "scale": frame.scale,
+                "offset": frame.shift,
+                "crs": frame.crs,
+                "metres_per_unit": frame.metres,
+            },
         },
         before,
     )

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.cli.data import data_of
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
@@ -21,7 +22,6 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.prepare import Preparation, Prepared
 from surfkit.evaluate.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
-from surfkit.scene.data import Data
 from surfkit.scene.depth_files import FOLDER, DepthFile, map_path
 from surfkit.scene.photos import read_photo
 from surfkit.scene.read import read
@@ -77,8 +77,7 @@ class Depth:
 
     def run(self) -> None:
         """Estimate, and show what came out."""
-        split = (self.test_every, self.test_list)
-        data = Data(self.data, self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
+        data = data_of(self.data, self)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
         if notice := self.estimator.notice():

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 import surfkit
+from surfkit.cli.data import data_of
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -19,7 +20,6 @@ from surfkit.pipeline import CHECKPOINT_EVERY, run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
-from surfkit.scene.data import Data
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
@@ -78,6 +78,9 @@ class Train:
     white: bool = False
     """Lay transparent pixels of photographs over white instead of black."""
 
+    metres_per_unit: float | None = None
+    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+
     device: Device = "auto"
     """Where to compute."""
 
@@ -107,8 +110,7 @@ class Train:
 
     def run(self) -> None:
         """Train, and show what came out."""
-        split = (self.test_every, self.test_list)
-        data = Data(self._data(), self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
+        data = data_of(self._data(), self)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():

@@ -49,11 +49,16 @@ class Data:
     white: bool = False
     """Lay transparent pixels of photographs over white instead of black."""
 
+    metres_per_unit: float | None = None
+    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+
     def __post_init__(self) -> None:
         if self.scale is not None and not 1 <= self.scale < float("inf"):
             raise BadInput(f"--scale {self.scale:g}: it divides the size, so it must be 1 or more")
         if self.longest is not None and self.longest < 1:
             raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
+            raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every < 0:
             raise BadInput(f"--test-every {self.test_every}: it must be 0 (keep no photograph from training) or more")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def read(data: Data) -> Scene:
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
-    frame = Frame.around(poses, capture.xyz)
+    frame = _frame(data, capture, poses)
     views = _views(data, shots, frame)
     return Scene(
         name=data.path.resolve().name,
@@ -49,6 +50,24 @@ def read(data: Data) -> Scene:
         cloud=_cloud(capture, poses, frame),
         frame=frame,
     )
+
+
+def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
+    """The frame of the training cameras, with what the data set or the user knows of its place and unit."""
+    frame = Frame.around(poses, capture.xyz)
+    shift = capture.shift or frame.shift
+    given = data.metres_per_unit
+    if given is not None and capture.metres not in (None, given):
+        emit(Warned(f"--metres-per-unit {given:g} is used, though {data.path} is in units of {capture.metres:g} m"))
+    if any(shift):
+        text = " ".join(f"{value:.15g}" for value in shift)
+        emit(
+            Warned(
+                f"coordinates reach {np.abs(frame.origin).max():.0f}, too large for files of float32: these leave out "
+                f"the offset {text}, which their headers and run.json name"
+            )
+        )
+    return replace(frame, metres=given or capture.metres, crs=capture.crs, shift=shift)
 
 
 def reader_of(data: Data) -> Reader:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ ENDS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """What may be missing at the end of a file_path."""
 POINTS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Files of sparse points that a data set need not name."""
+METRES = 100.0
+"""In a unit of MatrixCity's poses."""
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
@@ -68,7 +70,7 @@ class MatrixCity(Reader):
         held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
         if not train:
             raise BadInput(f"{data.path}: no transforms.json in train/ or in a folder below it")
-        return _split(train, held, points(data.path, {}))
+        return replace(_split(train, held, points(data.path, {})), metres=METRES)
 
 
 def _split(train: list[Shot], held: list[Shot], sparse: tuple[np.ndarray, np.ndarray]) -> Capture:

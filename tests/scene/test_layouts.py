@@ -268,3 +268,23 @@ def test_every_layout_trains(tmp_path, truth, layout):
     recipe = evolve(with_steps(recipes()["2dgs"], 100), "primitive.sh_degree", 0)
     metrics = run(recipe, Data(folder, test_every=3), tmp_path / "run")
     assert metrics["images"]["psnr"] > 10 and metrics["steps"] == 100
+
+
+def test_opendronemap_on_the_map(tmp_path, truth):
+    """The topocentric reconstruction is used, not the one that OpenDroneMap put in its place, and moved to UTM."""
+    folder = odm(tmp_path, truth)
+    (folder / "opensfm/reconstruction.json").rename(folder / "opensfm/reconstruction.topocentric.json")
+    (folder / "opensfm/reconstruction.json").write_text("[]")
+    (folder / "opensfm/reference_lla.json").write_text('{"latitude": 47.5, "longitude": 8.9, "altitude": 430.0}')
+    (folder / "odm_georeferencing").mkdir()
+    (folder / "odm_georeferencing/coords.txt").write_text("WGS84 UTM 32N\n492000 5260000\n")
+    scene = read(Data(folder, test_every=3))
+    frame = scene.frame
+    assert (frame.crs, frame.metres, frame.shift) == ("EPSG:32632", 1.0, (492000.0, 5260000.0, 0.0))
+    np.testing.assert_allclose(frame.origin, (492468.65734, 5260734.57871, 444), atol=15)
+    for view, wanted in zip(scene.train, truth.scene.train, strict=True):
+        east = wanted.camera.centre - truth.scene.train[0].camera.centre
+        here = view.camera.centre - scene.train[0].camera.centre
+        assert float(here.norm()) == pytest.approx(float(east.norm()), abs=1e-3), (
+            "the same flight at the same scale of the extent"
+        )
