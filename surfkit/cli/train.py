@@ -66,6 +66,9 @@ class Train:
     test_list: Path | None = None
     """Keep the photographs named in this file from training instead: one name a line, as below images/."""
 
+    model: Path | None = None
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 

@@ -93,7 +93,7 @@ class Tracked(ABC):
     """What a reader also offers when its layout keeps a sparse model with observations."""
 
     @abstractmethod
-    def model_folder(self, root: Path) -> Path:
+    def model_folder(self, data: Data) -> Path:
         """Where the sparse model lies."""
 
     @abstractmethod

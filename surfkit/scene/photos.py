@@ -16,6 +16,8 @@ from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
+ORIENTATION = 0x0112
+"""EXIF tag; 1 is upright."""
 
 
 def photo_cache(views: Sequence[View], budget_bytes: int | None = None, threads: int | None = None) -> Cache[Tensor]:
@@ -36,6 +38,11 @@ def photo_size(path: Path) -> tuple[int, int]:
         BadInput: The file is no picture that Pillow reads.
     """
     return opened(path, lambda image: image.size)
+
+
+def is_turned(path: Path) -> bool:
+    """Whether EXIF says to turn or mirror a picture before it is looked at."""
+    return opened(path, lambda image: image.getexif().get(ORIENTATION, 1) not in (0, 1))
 
 
 def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:

@@ -19,7 +19,7 @@ from surfkit.scene.colmap import COLMAP, MODELS
 from surfkit.scene.data import Data
 from surfkit.scene.masks import check_mask, find_masks
 from surfkit.scene.observations import Observations, Seen
-from surfkit.scene.photos import photo_size
+from surfkit.scene.photos import is_turned, photo_size
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 from surfkit.scene.undistort import Picture, check_camera, is_pinhole, undistorted
 
@@ -37,6 +37,8 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+    if data.model is not None and not isinstance(reader, Tracked):
+        raise BadInput(f"--model {data.model}: only COLMAP data sets have several models; leave it out")
     capture = reader.read(data)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
@@ -113,7 +115,7 @@ def observations(data: Data, scene: Scene) -> Observations:
 def model_folder(data: Data) -> Path:
     """Where the sparse model of a data set lies; the data set itself if its layout has none."""
     reader = reader_of(data)
-    return reader.model_folder(data.path) if isinstance(reader, Tracked) else data.path
+    return reader.model_folder(data) if isinstance(reader, Tracked) else data.path
 
 
 def _wanted() -> str:
@@ -131,11 +133,20 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
     masks = find_masks(data.path, data.masks, shots)
     with ThreadPoolExecutor(4) as pool:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
+        turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
             _refuse_size(shot, size)
             if shot.name in masks:
                 check_mask(masks[shot.name], size)
         pictures = list(pool.map(lambda shot, size: _picture(data, shot, size, masks.get(shot.name)), shots, sizes))
+    if any(turned):
+        first = shots[turned.index(True)].name
+        emit(
+            Warned(
+                f"{sum(turned)} of {len(shots)} photographs have an EXIF tag that turns them, {first} for one: it is "
+                "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
+            )
+        )
     return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
 
 
@@ -151,9 +162,14 @@ def _refuse_size(shot: Shot, size: tuple[int, int]) -> None:
     if abs(full[1 - long] * size[long] / full[long] - size[1 - long]) <= 1:
         return
     turned = " (turned by 90 degrees)" if size[0] * full[0] == size[1] * full[1] else ""
+    advice = "use the photographs that the model was made from, whole and unturned"
+    if turned and is_turned(shot.path):
+        advice = (
+            "the model was made from photographs turned as EXIF says, so save them like that (mogrify -auto-orient)"
+        )
     raise BadInput(
         f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera {shot.camera.camera_id} has "
-        f"{full[0]} x {full[1]}; use the photographs that the model was made from, whole and unturned"
+        f"{full[0]} x {full[1]}; {advice}"
     )
 
 
