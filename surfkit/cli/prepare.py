@@ -49,7 +49,7 @@ class Depth:
     """Estimate what is there already again, also with other settings."""
 
     scale: float | None = None
-    """Divide the size of every photograph by this."""
+    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""

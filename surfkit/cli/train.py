@@ -55,7 +55,7 @@ class Train:
     later, the run goes on under the schedules of the new length."""
 
     scale: float | None = None
-    """Divide the size of every photograph by this."""
+    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""

@@ -234,7 +234,9 @@ def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:
     """File of every photograph."""
     folder = root / (data.images or "images")
     if not folder.is_dir():
-        raise BadInput(f"{folder}: no such folder of photographs; put them there, or name their folder with --images")
+        other = next((path.name for path in sorted(root.glob("images_*")) if path.is_dir()), None)
+        such = f", such as --images {other}" if other else ""
+        raise BadInput(f"{folder}: no such folder of photographs; put them there, or name theirs with --images{such}")
     found = find_files(folder, names)
     if missing := [name for name in names if name not in found]:
         there = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]

@@ -25,7 +25,7 @@ class Data:
     another layout that `surfkit components reader` lists."""
 
     scale: float | None = None
-    """Divide the size of every photograph by this."""
+    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""

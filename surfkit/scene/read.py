@@ -20,6 +20,7 @@ from surfkit.scene.data import Data
 from surfkit.scene.masks import check_mask, find_masks
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
+from surfkit.scene.reduced import reduced
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 from surfkit.scene.undistort import Picture, check_camera, is_pinhole, undistorted
 
@@ -44,7 +45,7 @@ def read(data: Data) -> Scene:
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
-    views = _views(data, shots, frame)
+    views = _views(*reduced(data, shots), frame)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
