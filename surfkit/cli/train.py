@@ -6,7 +6,7 @@ import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -68,6 +68,14 @@ class Train:
 
     model: Path | None = None
     """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
+    the test folder of MatrixCity as CityGaussian prepares it."""
 
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""

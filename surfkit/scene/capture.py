@@ -38,7 +38,7 @@ class Capture:
     """A data set as it is.
 
     Attributes:
-        shots: At least one.
+        shots: At least one, in the data set's own order: COLMAP's is that of its image numbers.
         xyz: (P, 3) float64 sparse points, input frame; none if the data set has none.
         rgb: (P, 3) uint8.
         held_out: Names that the data set itself keeps from training; None leaves it to `Data`.

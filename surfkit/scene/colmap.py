@@ -133,7 +133,7 @@ def _lacking(folder: Path, end: str) -> list[str]:
 
 
 def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
-    """Images in name order, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
+    """Images in the order of their numbers, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
     model = _reconstruction(folder)
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
@@ -227,7 +227,7 @@ def _shots(folder: Path, model: Any) -> list[Image]:
         shots.append(Image(image.name, full, model.cameras[image.camera_id]))
     if not shots:
         raise BadInput(f"{folder}: the model has no image with a pose; run COLMAP's mapper on the photographs")
-    return sorted(shots, key=lambda shot: shot.name)
+    return shots
 
 
 def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -40,6 +41,14 @@ class Data:
     model: Path | None = None
     """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
 
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
+    the test folder of MatrixCity as CityGaussian prepares it."""
+
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
@@ -60,6 +69,8 @@ class Data:
             raise BadInput(f"--scale {self.scale:g}: it divides the size, so it must be 1 or more")
         if self.longest is not None and self.longest < 1:
             raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
+        if sum(given is not None for given in (self.split, self.test_list, self.test_data)) > 1:
+            raise BadInput("--split, --test-list and --test-data each choose what is kept from training; give one")
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every < 0:
@@ -75,12 +86,14 @@ class Data:
         """Which photographs are kept from training.
 
         Args:
-            names: Of all photographs, sorted.
+            names: Of all photographs, in the data set's own order.
             own: Those that the data set itself keeps; None if it keeps none.
         """
-        chosen = set(names[:: self.test_every]) if self.test_every else set()
+        chosen = set(sorted(names)[:: self.test_every]) if self.test_every else set()
         if own is not None:
             chosen = set(own)
+        if self.split is not None:
+            chosen = set(names[:: len(names) // math.ceil(len(names) / 10)])
         if self.test_list is not None:
             chosen = _listed(self.test_list, names)
         if len(chosen) == len(names):

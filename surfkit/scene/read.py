@@ -38,11 +38,14 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
-    if data.model is not None and not isinstance(reader, Tracked):
-        raise BadInput(f"--model {data.model}: only COLMAP data sets have several models; leave it out")
+    for name, value in {"model": data.model, "split": data.split}.items():
+        if value is not None and not isinstance(reader, Tracked):
+            raise BadInput(f"--{name} {value}: is for COLMAP data sets; leave it out")
     capture = reader.read(data)
+    if data.test_data is not None:
+        capture = _with_tests(capture, reader, data)
+    held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
-    held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
     views = _views(*reduced(data, shots), frame)
@@ -53,6 +56,16 @@ def read(data: Data) -> Scene:
         cloud=_cloud(capture, poses, frame),
         frame=frame,
     )
+
+
+def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
+    """The photographs of both data sets, those of the test data held out, under the name of its folder."""
+    root = data.test_data
+    if root is None or not root.is_dir():
+        raise BadInput(f"--test-data {root}: no such folder")
+    own = reader.read(replace(data, path=root, model=None, test_data=None)).shots
+    tests = [replace(shot, name=f"{root.resolve().name}/{shot.name}") for shot in own]
+    return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
 
 
 def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
