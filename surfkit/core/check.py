@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 
@@ -17,6 +20,43 @@ class Fault(RuntimeError):
 
     The message says where, what happened, what is still there and what to do.
     """
+
+
+_KEPT: ContextVar[list[BadInput] | None] = ContextVar("kept", default=None)
+
+
+@contextmanager
+def collecting() -> Iterator[list[BadInput]]:
+    """Within, in this thread, what is rejected is only kept, in the list, and the reader goes on to find more."""
+    kept: list[BadInput] = []
+    token = _KEPT.set(kept)
+    try:
+        yield kept
+    finally:
+        _KEPT.reset(token)
+
+
+def reject(error: BadInput) -> None:
+    """Raise an error that a reader could go on after; where faults are being collected, keep it and go on."""
+    kept = _KEPT.get()
+    if kept is None:
+        raise error
+    kept.append(error)
+
+
+@contextmanager
+def leaving_out() -> Iterator[None]:
+    """BadInput within concerns one item of many: it is rejected, and what follows within is left out."""
+    try:
+        yield
+    except BadInput as error:
+        reject(error)
+
+
+def few(names: Sequence[str], most: int = 3) -> str:
+    """The first of some names, and how many there are beyond them: `'a', 'b', 'c' and 39 more`."""
+    shown = ", ".join(repr(name) for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
 def expect(name: str, array: Any, shape: tuple[int | str, ...], sizes: dict[str, int] | None = None) -> dict[str, int]:

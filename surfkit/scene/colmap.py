@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.scene.capture import Capture, Reader, Shot, Tracked, Tracks, library
 from surfkit.scene.data import Data, nearest
@@ -138,13 +138,13 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
     if not points:
-        raise BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP")
+        reject(BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP"))
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
     finite = np.isfinite(xyz.astype(np.float32)).all(1)
-    if not finite.any():
-        raise BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again")
-    if not finite.all():
+    if points and not finite.any():
+        reject(BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again"))
+    elif not finite.all():
         emit(Warned(f"{folder}: {(~finite).sum()} of {len(xyz)} points without finite coordinates are left out"))
     return shots, xyz[finite], rgb[finite]
 
@@ -172,6 +172,7 @@ def _reconstruction(folder: Path) -> Any:
 
 def _refuse_cut_off(folder: Path) -> None:
     """BadInput where a binary file ends before its entries do: pycolmap would read beyond the end, or for ever."""
+    cut = []
     for part, least in PARTS.items():
         path = folder / f"{part}.bin"
         size = path.stat().st_size
@@ -182,7 +183,9 @@ def _refuse_cut_off(folder: Path) -> None:
                 with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
                     whole = ENTRIES[part](raw, count) <= size
         if not whole:
-            raise _cut_off(path)
+            cut.append(path)
+    if cut:
+        raise _cut_off(*cut)
 
 
 def _end_of_images(raw: mmap.mmap, count: int) -> int:
@@ -210,8 +213,9 @@ ENTRIES = {"images": _end_of_images, "points3D": _end_of_points}
 """Of the files whose entries differ in length; those of cameras are known when they are read."""
 
 
-def _cut_off(path: Path) -> BadInput:
-    return BadInput(f"{path}: the file is cut off or no COLMAP file; copy it whole")
+def _cut_off(path: Path, *others: Path) -> BadInput:
+    also = f" (and so are {', '.join(other.name for other in others)})" if others else ""
+    return BadInput(f"{path}: the file is cut off or no COLMAP file{also}; copy it whole")
 
 
 def _shots(folder: Path, model: Any) -> list[Image]:
@@ -223,7 +227,8 @@ def _shots(folder: Path, model: Any) -> list[Image]:
         full = np.eye(4)
         full[:3] = pose.matrix()
         if not np.isfinite(full).all():
-            raise BadInput(f"{folder}: the pose of {image.name} is not finite; delete the image from the model")
+            reject(BadInput(f"{folder}: the pose of {image.name!r} is not finite; delete the image from the model"))
+            continue
         shots.append(Image(image.name, full, model.cameras[image.camera_id]))
     if not shots:
         raise BadInput(f"{folder}: the model has no image with a pose; run COLMAP's mapper on the photographs")
@@ -231,17 +236,17 @@ def _shots(folder: Path, model: Any) -> list[Image]:
 
 
 def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:
-    """File of every photograph."""
+    """File of every photograph; where one that is missing should be."""
     folder = root / (data.images or "images")
     if not folder.is_dir():
         other = next((path.name for path in sorted(root.glob("images_*")) if path.is_dir()), None)
         such = f", such as --images {other}" if other else ""
-        raise BadInput(f"{folder}: no such folder of photographs; put them there, or name theirs with --images{such}")
+        text = f"{folder}: no such folder of photographs; put them there, or name theirs with --images{such}"
+        reject(BadInput(text))
+        return [folder / name for name in names]
     found = find_files(folder, names)
     if missing := [name for name in names if name not in found]:
         there = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]
-        raise BadInput(
-            f"{folder}: {len(missing)} of {len(names)} photographs of the model are missing, "
-            f"the first is {missing[0]!r}{nearest(missing[0], there)}"
-        )
-    return [found[name] for name in names]
+        text = f"{folder}: {len(missing)} of {len(names)} photographs of the model are missing: {few(missing)}"
+        reject(BadInput(f"{text}{nearest(missing[0], there) or '; put them there, or delete them from the model'}"))
+    return [found.get(name, folder / name) for name in names]

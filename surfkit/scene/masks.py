@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.scene.cache import Cache
 from surfkit.scene.capture import Shot
@@ -41,8 +41,8 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[s
     found = {}
     for shot in shots:
         if shot.mask is not None and not shot.mask.is_file():
-            raise BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}")
-        if mask := shot.mask or _of(shot, known):
+            reject(BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}"))
+        elif mask := shot.mask or _of(shot, known):
             found[shot.name] = mask
     if found:
         emit(Warned(f"what is black in their masks is ignored in {len(found)} of {len(shots)} photographs"))

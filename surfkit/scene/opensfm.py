@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.scene.capture import Capture, Reader, Shot, library
@@ -45,10 +45,14 @@ class ODM(Reader):
         folder = data.path / (data.images or "images")
         found = find_files(folder, names)
         if missing := [name for name in names if name not in found]:
-            raise BadInput(f"{folder}: {len(missing)} of {len(names)} photographs are missing, first {missing[0]!r}")
+            text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}; put them there"
+            reject(BadInput(text))
         try:
             cameras = {name: _camera(f"{path}: camera {name!r}", lens) for name, lens in model["cameras"].items()}
-            shots = [_shot(name, model["shots"][name], cameras, found[name]) for name in names]
+            shots = []
+            for name in names:
+                with leaving_out():
+                    shots.append(_shot(name, model["shots"][name], cameras, found.get(name, folder / name)))
             points = list(model.get("points", {}).values())
             xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
             rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
@@ -111,5 +115,5 @@ def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo:
     pose[:3, :3] = Rotation.from_rotvec(np.array(shot["rotation"], np.float64)).as_matrix()
     pose[:3, 3] = np.array(shot["translation"], np.float64)
     if not np.isfinite(pose).all():
-        raise BadInput(f"the pose of {name} is not finite; delete the shot from reconstruction.json")
+        raise BadInput(f"the pose of {name!r} is not finite; delete the shot from reconstruction.json")
     return Shot(name, pose, cameras[shot["camera"]], photo)

@@ -38,17 +38,31 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+    return assembled(data, captured(data, reader))
+
+
+def captured(data: Data, reader: Reader) -> Capture:
+    """What a reader finds in a data set, and in the one that is for tests."""
     for name, value in {"model": data.model, "split": data.split}.items():
         if value is not None and not isinstance(reader, Tracked):
             raise BadInput(f"--{name} {value}: is for COLMAP data sets; leave it out")
     capture = reader.read(data)
-    if data.test_data is not None:
-        capture = _with_tests(capture, reader, data)
+    return capture if data.test_data is None else _with_tests(capture, reader, data)
+
+
+def assembled(data: Data, capture: Capture, keep: Path | None = None) -> Scene:
+    """The scene of a capture.
+
+    Args:
+        data: The data set, and how to use it.
+        capture: What its reader has found in it.
+        keep: Folder of the undistorted photographs; by default one that later runs find again.
+    """
     held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
-    views = _views(*reduced(data, shots), frame)
+    views = _views(*reduced(data, shots), frame, keep)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
@@ -140,7 +154,7 @@ def _wanted() -> str:
     )
 
 
-def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
+def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -> list[View]:
     """The photographs at the size to use them at, undistorted."""
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
@@ -149,10 +163,14 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
         turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
-            _refuse_size(shot, size)
+            check_size(shot, size)
             if shot.name in masks:
                 check_mask(masks[shot.name], size)
-        pictures = list(pool.map(lambda shot, size: _picture(data, shot, size, masks.get(shot.name)), shots, sizes))
+        given = [
+            Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
+            for shot, size in zip(shots, sizes, strict=True)
+        ]
+        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistorted(p, data.path, keep), given))
     if any(turned):
         first = shots[turned.index(True)].name
         emit(
@@ -164,12 +182,7 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame) -> list[View]:
     return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
 
 
-def _picture(data: Data, shot: Shot, size: tuple[int, int], mask: Path | None) -> Picture:
-    used = Picture(shot.path, mask, shot.camera, data.size(*size), data.white)
-    return used if is_pinhole(shot.camera) else undistorted(used, data.path)
-
-
-def _refuse_size(shot: Shot, size: tuple[int, int]) -> None:
+def check_size(shot: Shot, size: tuple[int, int]) -> None:
     """BadInput unless the photograph is the camera's picture at some size, within a pixel."""
     full = (shot.camera.width, shot.camera.height)
     long = 0 if full[0] >= full[1] else 1

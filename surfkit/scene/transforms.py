@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.scene.capture import Capture, Reader, Shot, library
 from surfkit.scene.data import Data
@@ -101,23 +101,25 @@ def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
     shots = []
     for at, frame in enumerate(listed):
         where = f"{path}: frames.{at}"
-        photo = _photo(where, path.parent, frame, data)
-        camera = _camera(where, {**contents, **frame}, photo)
-        camera = cameras.setdefault(str(camera), camera)  # one for all frames that share it
-        mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-        name = _name(photo, data.path)
-        shots.append(Shot(name, _pose(where, frame), camera, photo, mask))
+        with leaving_out():
+            photo = _photo(where, path.parent, frame, data)
+            pose = _pose(where, frame)
+            camera = _camera(where, {**contents, **frame}, photo)
+            camera = cameras.setdefault(str(camera), camera)  # one for all frames that share it
+            mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
+            shots.append(Shot(_name(photo, data.path), pose, camera, photo, mask))
     if len({shot.name for shot in shots}) < len(shots):
-        raise BadInput(f"{path}: two frames have the same photograph; delete one")
+        reject(BadInput(f"{path}: two frames have the same photograph; delete one"))
     return contents, shots
 
 
 def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """The sparse points of a data set, in the frame of its poses; none if it has none."""
-    if named := contents.get("ply_file_path"):
-        return read_points(root / str(named))
-    path = next((root / name for name in POINTS if (root / name).is_file()), None)
-    return read_points(path) if path else (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    named = contents.get("ply_file_path") or next((name for name in POINTS if (root / name).is_file()), None)
+    with leaving_out():
+        if named:
+            return read_points(root / str(named))
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
 def _metres(contents: Mapping[str, Any]) -> float:

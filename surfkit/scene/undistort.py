@@ -69,19 +69,20 @@ def check_camera(camera: Any, name: str) -> None:
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
 
 
-def undistorted(picture: Picture, root: Path) -> Picture:
+def undistorted(picture: Picture, root: Path, keep: Path | None = None) -> Picture:
     """The picture of a pinhole camera, from the cache of the data set or made now.
 
     Args:
         picture: Of any perspective or fisheye camera.
         root: The data set, in which the cache is kept; where that cannot be written, the user's own cache.
+        keep: Folder of the cache, where it is to be another one.
 
     Raises:
         BadInput: The photograph is damaged, or its camera has no pinhole equivalent.
     """
     lens = _Lens.of(picture.camera, picture.size)
     camera, grid, inside = _warp(lens)
-    path = _cached(picture, lens, root)
+    path = (keep or cache_folder(root)) / _cached(picture, lens, root)
     mask = path.with_name(f"{path.stem}-mask.png") if picture.mask is not None or not inside.all() else None
     if not path.exists():
         if mask is not None:
@@ -139,13 +140,13 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
     return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
 
 
-def _cached(picture: Picture, lens: _Lens, root: Path) -> Path:
-    """Where the undistorted picture lies: a name that tells what went into it."""
+def _cached(picture: Picture, lens: _Lens, root: Path) -> str:
+    """The name of the undistorted picture, which tells what went into it."""
     place = os.path.relpath(picture.path, root)
     key = hashlib.blake2b(f"{RECIPE} {lens} {picture.white} {place}".encode(), digest_size=8)
     for path in filter(None, (picture.path, picture.mask)):
         key.update(_content(path))
-    return _folder(root) / f"{picture.path.stem}-{key.hexdigest()}.png"
+    return f"{picture.path.stem}-{key.hexdigest()}.png"
 
 
 def _content(path: Path) -> bytes:
@@ -157,7 +158,8 @@ def _content(path: Path) -> bytes:
         return size.to_bytes(8, "little") + head + file.read()
 
 
-def _folder(root: Path) -> Path:
+def cache_folder(root: Path) -> Path:
+    """Where the undistorted photographs of a data set are kept."""
     if os.access(root, os.W_OK):
         return root / FOLDER
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

@@ -270,7 +270,7 @@ def no_focal(farm):
         (no_images, "images: no such folder of photographs"),
         (no_model, "no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0"),
         (half_a_model, "the COLMAP model lacks points3D.txt"),
-        (missing, "1 of 5 photographs of the model are missing, the first is 'view_003.png'; did you mean '"),
+        (missing, "1 of 5 photographs of the model are missing: 'view_003.png'; did you mean '"),
         (other_size, "view_002.png: 40 x 20 px, but its camera 1 has 40 x 30"),
         (turned, "view_002.png: 30 x 40 px (turned by 90 degrees), but"),
         (no_picture, "view_002.png: not a whole picture"),
