@@ -21,6 +21,7 @@ from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
+from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
 from surfkit.scene.scene import Frame, Scene
 
@@ -38,6 +39,11 @@ class Run:
     out: Path
     recipe: Recipe
     data: Data
+
+    @property
+    def needs_priors(self) -> bool:
+        """Whether a loss of the recipe looks at depth priors."""
+        return any(loss.needs_prior for loss in self.recipe.pretrain.losses.values())
 
     @property
     def checkpoint(self) -> Path:
@@ -143,7 +149,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
     before = read_json(this.inputs, Fingerprint) if this.inputs.exists() else None
-    now = fingerprint(scene, before)
+    now = fingerprint(scene, before, prior_files(this.data, scene) if this.needs_priors else None)
     if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise BadInput(

@@ -165,10 +165,9 @@ class Material:
 def read_ahead(this: Run, scene: Scene, budget_bytes: int) -> Material:
     """The photographs, masks and depth priors of the training views, within a number of bytes."""
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    needed = any(loss.needs_prior for loss in this.recipe.pretrain.losses.values())
-    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
+    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if this.needs_priors else 0]
     for_photos, for_masks, for_priors = share(budget_bytes, wanted)
-    priors = read_priors(this.data, scene, for_priors) if needed else None
+    priors = read_priors(this.data, scene, for_priors) if this.needs_priors else None
     return Material(photo_cache(scene.train, for_photos), mask_cache(scene.train, for_masks), priors)
 
 

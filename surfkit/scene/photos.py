@@ -42,7 +42,13 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 def is_turned(path: Path) -> bool:
     """Whether EXIF says to turn or mirror a picture before it is looked at."""
-    return opened(path, lambda image: image.getexif().get(ORIENTATION, 1) not in (0, 1))
+
+    def tagged(image: Image.Image) -> bool:
+        if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode all of it, to look behind
+            return False
+        return image.getexif().get(ORIENTATION, 1) not in (0, 1)
+
+    return opened(path, tagged)
 
 
 def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
