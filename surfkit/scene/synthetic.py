@@ -173,6 +173,18 @@ def photograph(flight: Flight | None = None) -> Synthetic:
     return Synthetic(Scene("synthetic", train, tuple(v for v in views if v.name in held_out), cloud, frame), exact)
 
 
+def look(flight: Flight, pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """(R, 3) colours in [0, 1] of what rays of any camera meet in the scene of `flight`; 0 where they meet nothing.
+
+    Args:
+        flight: Of which only the seed counts.
+        pose: (4, 4) world_to_camera, metres.
+        rays: (R, 3) directions in the frame of the camera.
+    """
+    origin, waves = -pose[:3, :3].T @ pose[:3, 3], _waves(np.random.default_rng(flight.seed))
+    return _cast(np.broadcast_to(origin, rays.shape), rays @ pose[:3, :3], waves)[2]
+
+
 def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False, tracks: bool = False) -> None:
     """Save the scene as a COLMAP folder: PNG photographs in images/, the model in sparse/0 in the input frame.
 
