@@ -1,15 +1,12 @@
 """The benchmarks of city scenes in the layouts in which they are handed out: MatrixCity and GauU-Scene."""
 
 import json
-import math
-import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.folder import noted
@@ -18,63 +15,12 @@ from surfkit.scene.depth_prior import read_priors
 from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
-FLIGHT = Flight(views=6, width=40, height=30, points=60, test_every=3)
-GL = np.diag([1.0, -1.0, -1.0, 1.0])
+from .folders import DEPTHS, FLIGHT, city, renumbered, with_tests_apart
 
 
 @pytest.fixture(scope="module")
 def truth():
     return photograph(FLIGHT)
-
-
-def square(truth):
-    """The views with square pixels and a centred principal point, as MatrixCity's, in order."""
-    from dataclasses import replace
-
-    views = sorted([*truth.scene.train, *truth.scene.held_out], key=lambda view: view.name)
-    return [replace(v, camera=replace(v.camera, fy=v.camera.fx, cx=20.0, cy=15.0)) for v in views]
-
-
-def write_exr(path, depth):
-    import OpenEXR
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {"RGB": np.stack([depth] * 3, -1)}).write(str(path))
-
-
-DEPTHS = {
-    "aerial": ("city_depth_float32/aerial/{part}/{block}_depth/{number:04d}.exr", np.float32),
-    "street": ("city_depth/street/{part}/{block}_depth/{block}_depth/{number:04d}.exr", np.float16),
-    "beside": ("city/beside/{part}/{block}/depth/{number:04d}.exr", np.float32),
-}
-
-
-def city(folder, truth, kind):
-    """small_city as MatrixCity hands it out: metres and shrunken rotations, archives unpacked in three ways."""
-    pytest.importorskip("OpenEXR")
-    pattern, dtype = DEPTHS[kind]
-    root, held = folder / "city" / kind, {view.name for view in truth.scene.held_out}
-    inside = {"aerial": "", "street": "{block}/", "beside": "rgb/"}[kind]
-    for part, block in (("train", "block_1"), ("test", "block_1_test")):
-        frames = []
-        for number, view in enumerate(v for v in square(truth) if (v.name in held) == (part == "test")):
-            exact = truth.exact[view.name]
-            path = root / part / block / inside.format(block=block) / f"{number:04d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pixels = (exact.color.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-            Image.fromarray(pixels).save(path)
-            matrix = np.linalg.inv(truth.scene.frame.input_pose(view.camera.world_to_camera)) @ GL
-            matrix[:3, :3] /= 100
-            matrix[3, 3] /= 100
-            frames.append({"frame_index": number, "rot_mat": matrix.tolist()})
-            centimetres = exact.depth.numpy() / truth.scene.frame.scale * 100
-            centimetres[:5, :7] = 65504
-            write_exr(folder / pattern.format(part=part, block=block, number=number), centimetres.astype(dtype))
-        angle = 2 * math.atan(20 / square(truth)[0].camera.fx)
-        text = json.dumps({"camera_angle_x": angle, "frames": frames})
-        (root / part / block / "transforms.json").write_text(text)
-    return root
 
 
 @pytest.mark.parametrize("kind", DEPTHS)
@@ -131,16 +77,6 @@ def test_depth_without_its_package_or_of_another_kind_is_said(tmp_path, truth, m
     assert "needs the package OpenEXR: pip install 'surfkit[exr]'" in notes.texts[0]
 
 
-def renumbered(model):
-    """Numbers of the images of a COLMAP model in the reverse order of their names."""
-    lines = (model / "images.txt").read_text().splitlines()
-    count = len(lines) // 2
-    for at in range(0, len(lines), 2):
-        words = lines[at].split()
-        lines[at] = " ".join([str(count + 1 - int(words[0])), *words[1:]])
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-
-
 def test_the_split_of_gauu_scene(tmp_path):
     """24 images: step 24 // 3 = 8, in the order of COLMAP's numbers, not of the names."""
     write_colmap(tmp_path, photograph(Flight(views=24, width=16, height=12, points=30, test_every=0)))
@@ -157,17 +93,8 @@ def test_the_split_of_gauu_scene(tmp_path):
 
 def test_a_test_folder_with_a_model_of_its_own(tmp_path, truth):
     """MatrixCity as CityGaussian prepares it: two COLMAP folders in the same coordinates."""
-    train, test = tmp_path / "train/block_all", tmp_path / "test/block_all_test"
-    write_colmap(train, truth, tracks=True)
-    shutil.copytree(train, test)
+    train, test = with_tests_apart(tmp_path, truth)
     held = {view.name for view in truth.scene.held_out}
-    for folder, drop in ((train, held), (test, {f"view_{i:03d}.png" for i in range(6)} - held)):
-        model = folder / "sparse/0"
-        lines = (model / "images.txt").read_text().splitlines()
-        kept = [i for i in range(0, len(lines), 2) if lines[i].split()[-1] not in drop]
-        (model / "images.txt").write_text("".join(f"{lines[i]}\n\n" for i in kept))
-        points = [line.split()[:8] for line in (model / "points3D.txt").read_text().splitlines()]
-        (model / "points3D.txt").write_text("".join(" ".join(words) + "\n" for words in points))
     scene = read(Data(train, test_data=test))
     assert [view.name for view in scene.held_out] == [f"block_all_test/{name}" for name in sorted(held)]
     for view, wanted in zip(scene.held_out, truth.scene.held_out, strict=True):

@@ -13,7 +13,9 @@ from surfkit.scene.georeference import placed, utm
 from surfkit.scene.ply import SplatTable, read_splats, read_vertices, write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Frame
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.scene.synthetic import Flight, photograph
+
+from .folders import surveyed
 
 REFERENCE = {"latitude": 47.5, "longitude": 8.9, "altitude": 430.0}
 PROJ_UTM = [  # pyproj 3.7, EPSG:4326 to EPSG:326zz and 327zz
@@ -97,26 +99,6 @@ def test_damaged_georeferences(tmp_path, coords, reference, text):
     with pytest.raises(BadInput) as error:
         project(tmp_path, coords, reference)
     assert text in str(error.value)
-
-
-def surveyed(folder, move):
-    """A COLMAP folder whose coordinates are those of a survey."""
-    write_colmap(folder, photograph(Flight(views=6, width=40, height=30, points=60)))
-    model = folder / "sparse/0"
-    lines = (model / "points3D.txt").read_text().splitlines()
-    words = [line.split() for line in lines]
-    rows = [[w[0], *(repr(float(v) + float(m)) for v, m in zip(w[1:4], move, strict=True)), *w[4:]] for w in words]
-    (model / "points3D.txt").write_text("".join(" ".join(row) + "\n" for row in rows))
-    from scipy.spatial.transform import Rotation
-
-    lines = (model / "images.txt").read_text().splitlines()
-    for at in range(0, len(lines), 2):
-        words = lines[at].split()
-        w, x, y, z, *t = (float(value) for value in words[1:8])
-        t = np.array(t) - Rotation.from_quat([x, y, z, w]).as_matrix() @ move
-        lines[at] = " ".join([*words[:5], *(repr(float(value)) for value in t), *words[8:]])
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
-    return folder
 
 
 def test_survey_coordinates_keep_their_precision(tmp_path):
