@@ -173,16 +173,20 @@ def photograph(flight: Flight | None = None) -> Synthetic:
     return Synthetic(Scene("synthetic", train, tuple(v for v in views if v.name in held_out), cloud, frame), exact)
 
 
-def look(flight: Flight, pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """(R, 3) colours in [0, 1] of what rays of any camera meet in the scene of `flight`; 0 where they meet nothing.
+def look(flight: Flight, pose: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What rays of any camera meet in the scene of `flight`: multiples of the rays, and colours.
 
     Args:
         flight: Of which only the seed counts.
         pose: (4, 4) world_to_camera, metres.
         rays: (R, 3) directions in the frame of the camera.
+
+    Returns:
+        (R,) inf where they meet nothing; (R, 3) in [0, 1], 0 there.
     """
     origin, waves = -pose[:3, :3].T @ pose[:3, 3], _waves(np.random.default_rng(flight.seed))
-    return _cast(np.broadcast_to(origin, rays.shape), rays @ pose[:3, :3], waves)[2]
+    depth, _, color = _cast(np.broadcast_to(origin, rays.shape), rays @ pose[:3, :3], waves)
+    return depth, color
 
 
 def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False, tracks: bool = False) -> None:

@@ -15,6 +15,8 @@ from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.scene.capture import Capture, Reader, Shot, library
 from surfkit.scene.data import Data
+from surfkit.scene.depth_cloud import points_of_depth
+from surfkit.scene.depth_files import find_maps
 from surfkit.scene.photos import photo_size
 from surfkit.scene.sparse_ply import read_points
 
@@ -73,7 +75,10 @@ class MatrixCity(Reader):
             raise BadInput(f"{data.path}: no transforms.json in train/ or in a folder below it")
         train = [shot for _, shots in read for shot in shots]
         held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
-        return replace(_split(train, held, points(data.path, {})), metres=_metres(read[0][0]))
+        metres, sparse = _metres(read[0][0]), points(data.path, {})
+        if not len(sparse[0]):
+            sparse = points_of_depth(train, find_maps(data.path, data.path, [shot.name for shot in train], metres))
+        return replace(_split(train, held, sparse), metres=metres)
 
 
 def _split(train: list[Shot], held: list[Shot], sparse: tuple[np.ndarray, np.ndarray]) -> Capture:

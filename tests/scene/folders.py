@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from surfkit.scene.ply import write_points
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.scene.synthetic import Flight, look, photograph, write_colmap
 
 FLIGHT = Flight(views=6, width=40, height=30, points=60, test_every=3)
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -22,9 +23,8 @@ def views_of(truth):
     return sorted([*truth.scene.train, *truth.scene.held_out], key=lambda view: view.name)
 
 
-def pixels_of(truth, name, alpha=False):
-    pixels = (truth.exact[name].color.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-    return np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 255, np.uint8)], 2) if alpha else pixels
+def pixels_of(truth, name):
+    return (truth.exact[name].color.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
 
 
 def save(path, pixels):
@@ -80,11 +80,12 @@ def odm(folder, truth, kind="brown", **coefficients):
     return folder
 
 
-def square(truth):
-    """The views with square pixels and a centred principal point, as MatrixCity's, in order."""
-
-    views = sorted([*truth.scene.train, *truth.scene.held_out], key=lambda view: view.name)
-    return [replace(v, camera=replace(v.camera, fy=v.camera.fx, cx=20.0, cy=15.0)) for v in views]
+def squarely(truth, view):
+    """Pixels, and depths in metres, of a view with square pixels and its principal point in the middle."""
+    camera = replace(view.camera, fy=view.camera.fx, cx=20.0, cy=15.0)
+    rays = camera.rays(torch.float64).flatten(1).T.numpy()
+    depth, color = look(FLIGHT, truth.scene.frame.input_pose(camera.world_to_camera), rays)
+    return (color.reshape(30, 40, 3) * 255).round().astype(np.uint8), depth.reshape(30, 40)
 
 
 def write_exr(path, depth):
@@ -110,20 +111,17 @@ def city(folder, truth, kind):
     inside = {"aerial": "", "street": "{block}/", "beside": "rgb/"}[kind]
     for part, block in (("train", "block_1"), ("test", "block_1_test")):
         frames = []
-        for number, view in enumerate(v for v in square(truth) if (v.name in held) == (part == "test")):
-            exact = truth.exact[view.name]
-            path = root / part / block / inside.format(block=block) / f"{number:04d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pixels = (exact.color.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-            Image.fromarray(pixels).save(path)
+        for number, view in enumerate(v for v in views_of(truth) if (v.name in held) == (part == "test")):
+            pixels, depth = squarely(truth, view)
+            save(root / part / block / inside.format(block=block) / f"{number:04d}.png", pixels)
             matrix = np.linalg.inv(truth.scene.frame.input_pose(view.camera.world_to_camera)) @ GL
             matrix[:3, :3] /= 100
             matrix[3, 3] /= 100
             frames.append({"frame_index": number, "rot_mat": matrix.tolist()})
-            centimetres = exact.depth.numpy() / truth.scene.frame.scale * 100
+            centimetres = depth * 100
             centimetres[:5, :7] = 65504
             write_exr(folder / pattern.format(part=part, block=block, number=number), centimetres.astype(dtype))
-        angle = 2 * math.atan(20 / square(truth)[0].camera.fx)
+        angle = 2 * math.atan(20 / views_of(truth)[0].camera.fx)
         text = json.dumps({"camera_angle_x": angle, "frames": frames})
         (root / part / block / "transforms.json").write_text(text)
     return root
@@ -163,7 +161,7 @@ def blender(folder, truth):
         frames = []
         for view in views_of(truth):
             if (view.name in held) == chosen:
-                pixels = pixels_of(truth, view.name, alpha=True)
+                pixels = np.concatenate([squarely(truth, view)[0], np.full((30, 40, 1), 255, np.uint8)], 2)
                 pixels[:5, :5, 3] = 0
                 save(folder / part / view.name, pixels)
                 stem = Path(view.name).stem

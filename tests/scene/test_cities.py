@@ -13,9 +13,9 @@ from surfkit.folder import noted
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import read_priors
 from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.scene.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
-from .folders import DEPTHS, FLIGHT, city, renumbered, with_tests_apart
+from .folders import DEPTHS, FLIGHT, city, renumbered, squarely, with_tests_apart
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +29,20 @@ def test_matrixcity_with_depth(tmp_path, truth, kind):
     scene = read(data)
     assert (len(scene.train), len(scene.held_out), scene.frame.metres) == (4, 2, 1.0)
     assert all(view.name.startswith("test/block_1_test/") for view in scene.held_out)
+    xyz = scene.frame.to_input(scene.cloud.xyz.numpy())
+    assert len(xyz) == 4 * (40 * 30 - 5 * 7), "every pixel that is not sky"
+    away = np.min([surface.distance(xyz) for surface in SURFACES], axis=0)
+    assert away.max() < (0.02 if kind == "street" else 1e-4), "metres; half floats keep centimetres"
+    again = read(data).cloud
+    assert torch.equal(again.xyz, scene.cloud.xyz) and torch.equal(again.rgb, scene.cloud.rgb)
+    pose = scene.frame.input_pose(scene.train[0].camera.world_to_camera)  # the points of the first come first
+    _, colors = look(FLIGHT, pose, xyz[:1165] @ pose[:3, :3].T + pose[:3, 3])
+    assert np.abs(scene.cloud.rgb[:1165].numpy() - colors * 255).mean() < 1
     with noted() as notes:
         priors = read_priors(data, scene)
     assert priors is not None and not notes.texts
     for at, view in enumerate(truth.scene.train):
-        wanted = truth.exact[view.name].depth
+        wanted = torch.from_numpy(squarely(truth, view)[1]) * truth.scene.frame.scale
         there = torch.ones(30, 40, dtype=torch.bool)
         there[:5, :7] = False
         assert torch.equal(priors[at].inverse > 0, there), "the sky has no depth"
@@ -58,7 +67,7 @@ def test_poses_in_hundreds_of_metres(tmp_path, truth):
     scene = read(data)
     assert scene.frame.metres == 100 and scene.train[0].name == "train/block_1/0000.png"
     priors = read_priors(data, scene)
-    wanted = truth.exact[truth.scene.train[1].name].depth
+    wanted = torch.from_numpy(squarely(truth, truth.scene.train[1])[1]) * truth.scene.frame.scale
     torch.testing.assert_close(1 / priors[1].inverse[5:].double(), wanted[5:], rtol=1e-3, atol=0)
     assert read(Data(root)).frame.scale * 100 == pytest.approx(scene.frame.scale), "the same extent in other units"
 

@@ -97,7 +97,7 @@ def through(folder, truth, lens):
     pixels = np.stack(np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5), -1).reshape(-1, 2)
     rays = np.concatenate([lens.cam_from_img(pixels), np.ones((len(pixels), 1))], 1)
     for view in views_of(truth):
-        color = look(FLIGHT, truth.scene.frame.input_pose(view.camera.world_to_camera), rays)
+        _, color = look(FLIGHT, truth.scene.frame.input_pose(view.camera.world_to_camera), rays)
         save(folder / "images" / view.name, (color.reshape(*size, 3) * 255).round().astype(np.uint8))
     return folder
 
@@ -259,7 +259,7 @@ def test_the_same_scene_ends_alike(tmp_path, truth, usual, layout):
 @pytest.mark.parametrize("layout", OTHERS)
 def test_others_train_too(tmp_path, truth, layout):
     psnr, record, cameras, _ = trained(tmp_path, truth, layout)
-    assert psnr > 11 and len(cameras) == 6
+    assert psnr > (15 if layout != "blender" else 11) and len(cameras) == 6
     assert sum(camera["held_out"] for camera in cameras) == (1 if layout == "gauu-scene" else 2)
     assert record["frame"]["metres_per_unit"] == (1 if layout.startswith("matrixcity") else None)
 
