@@ -22,7 +22,7 @@ POINTS = 200_000
 def points_of_depth(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) float64 positions in the input frame and (P, 3) uint8 colours of random pixels, the same ones each time.
 
-    None, and a note, where a map cannot be read.
+    Maps that cannot be read are passed over, with a note.
 
     Args:
         shots: Photographs to train with.
@@ -30,27 +30,30 @@ def points_of_depth(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> tup
     """
     having = [shot for shot in shots if shot.name in maps]
     chosen = having[:: max(1, -(-len(having) // SHOTS))]
-    none = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if not chosen:
-        return none
-    most = POINTS // len(chosen)
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            parts = list(pool.map(lambda at: _seen(chosen[at], maps[chosen[at].name], most, at), range(len(chosen))))
-    except BadInput as error:
-        emit(Warned(f"no points are taken from the depth maps: {error}"))
-        return none
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+
+    def seen(at: int) -> tuple[np.ndarray, np.ndarray] | str:
+        file = maps[chosen[at].name]
+        try:
+            return _points(chosen[at], file.read(), POINTS // len(chosen), at)
+        except BadInput as error:
+            return f"{file.path}: {error}"
+
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(seen, range(len(chosen))))
+    parts = [answer for answer in answers if not isinstance(answer, str)]
+    if faults := [answer for answer in answers if isinstance(answer, str)]:
+        emit(Warned(f"{len(faults)} of {len(answers)} depth maps give no points to start from, first {faults[0]}"))
+    if not parts:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     xyz, rgb = (np.concatenate(part) for part in zip(*parts, strict=True))
-    emit(Warned(f"no sparse points: training starts from {len(xyz)} on the depth maps of {len(chosen)} photographs"))
+    emit(Warned(f"no sparse points: training starts from {len(xyz)} on the depth maps of {len(parts)} photographs"))
     return xyz, rgb
 
 
-def _seen(shot: Shot, file: DepthFile, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """At most so many points of one photograph."""
-    try:
-        inverse = file.read()
-    except BadInput as error:
-        raise BadInput(f"{file.path}: {error}") from error
+def _points(shot: Shot, inverse: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """At most so many points of one photograph, whose inverse depth is (h, w)."""
     height, width = inverse.shape
     known = np.flatnonzero(inverse.reshape(-1) > 0)
     picked = np.random.default_rng(seed).permutation(known)[:most]

@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.folder import noted
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import read_priors
-from surfkit.scene.read import read
+from surfkit.scene.read import RANDOM_POINTS, read
 from surfkit.scene.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
 from .folders import DEPTHS, FLIGHT, city, renumbered, squarely, with_tests_apart
@@ -78,12 +78,14 @@ def test_depth_without_its_package_or_of_another_kind_is_said(tmp_path, truth, m
     path = tmp_path / "city_depth_float32/aerial/train/block_1_depth/0002.exr"
     path.write_bytes(path.read_bytes()[:200])
     with noted() as notes:
-        assert read_priors(data, scene)[2] is None
+        assert read_priors(data, scene)[2] is None and len(read(data).cloud.xyz) == 3 * 1165
     assert "1 of 4 photographs train without a depth prior: cannot be read" in notes.texts[0]
+    assert f"1 of 4 depth maps give no points to start from, first {path}: cannot be read" in notes.texts[1]
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with noted() as notes:
         assert read_priors(data, scene) is None
     assert "needs the package OpenEXR: pip install 'surfkit[exr]'" in notes.texts[0]
+    assert len(read(data).cloud.xyz) == RANDOM_POINTS
 
 
 def test_the_split_of_gauu_scene(tmp_path):
