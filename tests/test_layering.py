@@ -17,7 +17,7 @@ FLOORS = (
     "recipe",
     "folder",
     "pipeline",
-    "report",
+    "report doctor",
     "recipes",
     "cli viewer testing",
 )

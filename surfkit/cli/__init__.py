@@ -20,6 +20,7 @@ from surfkit.core.check import BadInput, Fault
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
     "evaluate": "Measure a finished run on the photographs it has not seen.",
+    "doctor": "Examine a data set before training: faults, and what a run takes.",
     "status": "Tell where a run stands.",
     "export": "Write the result of a run for other programs.",
     "prepare": "Make what a data set may need before training: `prepare depth`.",

@@ -44,6 +44,7 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
         BadInput: One line about the words that do not fit, or about the values they give.
         SystemExit: After `--help` was printed.
     """
+    argv = [*argv, *_default(command, argv)]
     token = ARGV.set(tuple(argv))
     said = io.StringIO()
     try:
@@ -58,6 +59,14 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     finally:
         ARGV.reset(token)
         sys.stderr.write(said.getvalue())  # what was not tyro's box: warnings
+
+
+def _default(command: type, argv: Sequence[str]) -> list[str]:
+    """The word for the recipe that a command takes when none is named, if it has one in `default_recipe`."""
+    name = getattr(command, "default_recipe", None)
+    if name is None or any(word.startswith("recipe:") for word in argv) or {"-h", "--help"} & set(argv):
+        return []
+    return [f"recipe:{name}"]
 
 
 def _condensed(text: str, command: type, argv: Sequence[str], prog: str) -> str:

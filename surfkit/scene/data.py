@@ -38,17 +38,6 @@ class Data:
     test_list: Path | None = None
     """Keep the photographs named in this file from training instead: one name a line, as below images/."""
 
-    model: Path | None = None
-    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
-
-    split: Literal["gauu-scene"] | None = None
-    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
-    numbers, k = n // ceil(n / 10)."""
-
-    test_data: Path | None = None
-    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
-    the test folder of MatrixCity as CityGaussian prepares it."""
-
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
@@ -63,6 +52,17 @@ class Data:
 
     metres_per_unit: float | None = None
     """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+
+    model: Path | None = None
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
+    the test folder of MatrixCity as CityGaussian prepares it."""
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 1 <= self.scale < float("inf"):
@@ -98,6 +98,7 @@ class Data:
             chosen = _listed(self.test_list, names)
         if len(chosen) == len(names):
             what = f"--test-every {self.test_every}" if own is None else "the data set's own split"
+            what = f"--split {self.split}" if self.split else what
             what = f"--test-list {self.test_list}" if self.test_list else what
             raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
         return chosen

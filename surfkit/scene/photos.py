@@ -85,6 +85,24 @@ def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor
     return torch.from_numpy(opened(path, decode)).permute(2, 0, 1).contiguous()
 
 
+def read_draft(path: Path, longest: int) -> np.ndarray:
+    """(h, w, 3) uint8 RGB of a picture at a fraction of its size, the longer side `longest` to twice that if it can be.
+
+    All of the file is read, but a JPEG is never held at its full size.
+
+    Raises:
+        BadInput: As for `read_photo`.
+    """
+
+    def decode(image: Image.Image) -> np.ndarray:
+        image.draft(image.mode, (longest, longest))
+        plain = _rgb(image, path, 0)
+        by = max(1, max(plain.size) // longest)
+        return np.array(plain.reduce(by) if by > 1 else plain)
+
+    return opened(path, decode)
+
+
 def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
     image = _as_stored(image)
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255

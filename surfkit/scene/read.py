@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -50,19 +50,21 @@ def captured(data: Data, reader: Reader) -> Capture:
     return capture if data.test_data is None else _with_tests(capture, reader, data)
 
 
-def assembled(data: Data, capture: Capture, keep: Path | None = None) -> Scene:
+def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
     """The scene of a capture.
 
     Args:
         data: The data set, and how to use it.
         capture: What its reader has found in it.
         keep: Folder of the undistorted photographs; by default one that later runs find again.
+        only: Names of the photographs to make views of; all by default.
     """
     held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
-    views = _views(*reduced(data, shots), frame, keep)
+    wanted = [shot for shot in shots if only is None or shot.name in only]
+    views = _views(*reduced(data, wanted), frame, keep)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),

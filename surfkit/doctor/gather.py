@@ -1,0 +1,122 @@
+"""What a reader finds in a data set, with everything that it objects to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput, collecting
+from surfkit.core.events import Warned
+from surfkit.core.registry import components, hookimpl, plugins
+from surfkit.doctor.finding import Finding, from_errors
+from surfkit.scene.capture import Capture, Reader, Shot
+from surfkit.scene.data import Data
+from surfkit.scene.masks import find_masks
+from surfkit.scene.names import PICTURES
+from surfkit.scene.read import captured, reader_of
+
+EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """A data set as far as it can be read.
+
+    Attributes:
+        layout: The name of its reader; None if no reader could be chosen.
+        capture: What could be read; its shots in name order. Photographs need not exist.
+        masks: By name of the photograph.
+        held_out: Names that are kept from training.
+        loose: Pictures beside the photographs that have no pose; all pictures where nothing has one.
+        findings: What the reader, the masks and the split give rise to.
+    """
+
+    layout: str | None
+    capture: Capture
+    masks: dict[str, Path]
+    held_out: frozenset[str]
+    loose: tuple[Path, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def train(self) -> list[Shot]:
+        """The shots to train on."""
+        return [shot for shot in self.capture.shots if shot.name not in self.held_out]
+
+
+def gather(data: Data) -> Gathered:
+    """Read a data set, and go on after every fault that leaves something to be read."""
+    with heard() as warnings, collecting() as faults:
+        layout, capture = _read(data, faults)
+        said = list(warnings)
+        masks: dict[str, Path] = {}
+        try:
+            masks = find_masks(data.path, data.masks, capture.shots) if data.path.is_dir() else {}
+        except BadInput as error:
+            faults.append(error)
+        said = said if masks else list(warnings)  # how many masks there are is told anyway
+        held_out: set[str] = set()
+        try:
+            held_out = (
+                data.held_out([shot.name for shot in capture.shots], capture.held_out) if capture.shots else held_out
+            )
+        except BadInput as error:
+            faults.append(error)
+    findings = from_errors("data-set", faults) + from_errors("data-set", map(BadInput, said), "warning")
+    return Gathered(layout, capture, masks, frozenset(held_out), _loose(data, capture.shots), tuple(findings))
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """Within, warnings are not lost: their texts are in the list."""
+
+    class Listener:
+        texts: list[str] = []
+
+        @hookimpl
+        def surfkit_event(self, event: Any) -> None:
+            """See one event."""
+            if isinstance(event, Warned):
+                self.texts.append(event.text)
+
+    listener = Listener()
+    listener.texts = []
+    plugins().register(listener)
+    try:
+        yield listener.texts
+    finally:
+        plugins().unregister(listener)
+
+
+def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
+    """The name of the layout, and what its reader could read."""
+    layout = None
+    try:
+        reader = reader_of(data)
+        layout = next((name for name, cls in components(Reader).items() if isinstance(reader, cls)), None)
+        capture = captured(data, reader)
+    except BadInput as error:
+        faults.append(error)
+        return layout, EMPTY
+    return layout, capture
+
+
+def _loose(data: Data, shots: Sequence[Shot]) -> tuple[Path, ...]:
+    """Pictures in the folders of the photographs that no shot is of; those in images/ where there are no shots."""
+    if not data.path.is_dir():
+        return ()
+    used = {shot.path for shot in shots}
+    named = data.path / (data.images or "images")
+    folders = [named] if named.is_dir() else sorted({path.parent for path in used})
+    found = (path for folder in folders for path in sorted(folder.rglob("*") if folder == named else folder.glob("*")))
+    masks = ("masks", "_mask.png", ".mask.png")
+    return tuple(
+        path
+        for path in found
+        if path.suffix.lower() in PICTURES and path not in used and not any(mark in str(path) for mark in masks)
+    )

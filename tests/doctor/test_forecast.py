@@ -1,0 +1,201 @@
+"""What a run will take: measured in another process, added up, and what is advised where it does not fit."""
+
+import os
+import shutil
+import signal
+from dataclasses import replace
+from multiprocessing import active_children
+from pathlib import Path
+
+import pytest
+import torch
+
+from surfkit.cli.recipes import recipes
+from surfkit.core.tree import evolve
+from surfkit.densify.adc import ADC
+from surfkit.densify.filters import CountCap
+from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, one_digit, size
+from surfkit.doctor.examine import examine
+from surfkit.doctor.forecast import Plan, forecast, schedule, within
+from surfkit.doctor.growth import Growth, growth
+from surfkit.doctor.probe import Job, Part, Probed, Started, Taken, Written, measure, probe, some, with_count
+from surfkit.pipeline import run, with_steps
+from surfkit.primitives.points import Points
+from surfkit.scene.data import Data
+from surfkit.scene.read import read
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+STARTED = Started(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
+WRITTEN = Written(700.0, 250.0, 10_000, 1.0, 5.0, 2_000_000_000)
+ROOM = Room(10**12, 10**12, 10**12)
+LOAD = Load(
+    steps=1_000,
+    train=100,
+    held_out=10,
+    view_bytes=4_000_000_000,
+    budget_bytes=8_000_000_000,
+    undistort=0,
+    undistort_seconds=0.0,
+    undistort_bytes=0.0,
+    read_seconds=7.0,
+    read_peak_bytes=5,
+    checkpoint_every=500,
+    threads=2,
+)
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    """A data set that is never changed, whose cameras bend straight lines."""
+    folder = tmp_path_factory.mktemp("made") / "farm"
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=64, height=48, points=300)))
+    (folder / "sparse/0/cameras.txt").write_text("1 SIMPLE_RADIAL 64 48 58 33 24 -0.02\n")
+    return folder
+
+
+def probed(points=(1_000_000, 2_000_000), seconds=(1.0, 1.5), peaks=(3_000_000_000, 5_000_000_000)):
+    taken = tuple(map(Taken, points, seconds, peaks))
+    return Probed(STARTED, taken, replace(WRITTEN, peak_bytes=max(peaks)))
+
+
+def parts(*points):
+    return tuple(Part(at, count, 1 / len(points)) for at, count in enumerate(points))
+
+
+def rising(last, known=True):
+    return Growth(1_000_000, last, 0.0, 0.5, 100, known)
+
+
+def test_what_was_measured_is_added_up():
+    found = estimate(LOAD, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), ROOM)
+    assert found.step_seconds == (1.0, 1.5) and found.points == 2_000_000
+    assert found.memory_bytes == 5_000_000_000 - 1_000 + 4_000_000_000 and found.cache_bytes == 4_000_000_000
+    assert found.point_bytes == 2_000
+    assert found.run_bytes == 2_000_000 * (2 * 700 + 250) + 10 * 10_000 + 1_000 * 260
+    assert found.seconds == pytest.approx(1_250 + 7 + 3 + 2 * 5 + 10 * 1.4)
+    assert found.data_bytes == 0 and advice(found) == []
+
+
+def test_points_beyond_the_probe_are_extrapolated_and_a_small_cache_reads_again():
+    load = replace(LOAD, budget_bytes=1_000_000_000, undistort=40, undistort_seconds=0.6, undistort_bytes=9.0)
+    found = estimate(load, parts(1_000_000, 4_000_000), rising(4_000_000), probed(), ROOM)
+    assert found.step_seconds == pytest.approx((1.0, 1.5 + 2 * 0.5))
+    assert found.memory_bytes == 5_000_000_000 - 1_000 + 2_000 * 2_000_000 + 1_000_000_000
+    again = 1_000 * 0.75 * 0.4 / 2
+    assert found.seconds == pytest.approx(1_750 + again + 7 + 40 * 0.6 / 2 + 3 + 2 * 5 * 2 + 10 * 1.4)
+    assert found.data_bytes == 360
+
+
+@pytest.mark.parametrize(
+    "memory, words",
+    [
+        (9_500_000_000, "use --cache 4GB"),
+        (
+            5_000_000_000,
+            "smaller photographs (--scale 2) need less, and so do fewer points: pretrain.densify.filters.0:",
+        ),
+        (1_000_000_000, "smaller photographs (--scale 2) need less with --cache 200MB"),
+    ],
+)
+def test_what_to_lower_where_memory_is_short(memory, words):
+    found = estimate(LOAD, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), replace(ROOM, memory_bytes=memory))
+    (finding,) = advice(found)
+    assert finding.what == "memory" and words in finding.text and "about 9.0 GB of memory, and" in finding.text
+    if "filters" in words:  # 0.9 x 5 GB hold 200 MB of photographs and so many points
+        points = int(finding.text.partition("filters.0.points ")[2].split()[0])
+        assert points == one_digit(2_000_000 - (5_000_000_000 - 1_000 + 200_000_000 - 4_500_000_000) / 2_000)
+
+
+def test_what_to_lower_where_disk_or_time_is_short():
+    load = replace(LOAD, steps=10**6, undistort=10, undistort_bytes=1e6)
+    room = Room(10**12, 10**6, 10**7)
+    found = estimate(load, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), room)
+    assert [finding.what for finding in advice(found)] == ["run-folder-disk", "undistorted-disk", "time"]
+
+
+def test_numbers_in_words():
+    assert [size(1.5e9), size(2.345e12), size(3e6), size(4e3)] == ["1.5 GB", "2.3 TB", "3 MB", "0 MB"]
+    assert [duration(s) for s in (40, 720, 12_000, 270_000)] == ["40 s", "12 min", "3 h 20 min", "3 days 3 h"]
+    assert [one_digit(n) for n in (7, 19.9, 123_456)] == [7, 10, 100_000]
+
+
+def test_how_many_points_are_likely_allowed_or_given():
+    stage = recipes()["2dgs"].pretrain
+    likely = growth(stage, 10_000, 10**9)
+    assert not likely.known and 6 * 10_000 < likely.last < 110 * 10_000
+    assert likely.at(0) == likely.at(0.01) == 10_000 and likely.at(0.5) == likely.at(1) == likely.last
+    counts = [likely.at(share / 10) for share in range(11)]
+    assert counts == sorted(counts)
+    assert growth(stage, 10_000, 100_000).last == 30_000  # no more than the photographs have pixels for
+    assert growth(stage, 10_000, 10**9, given=77_777).last == 77_777
+    capped = replace(stage, densify=ADC(filters=(CountCap(points=50_000),)))
+    assert (growth(capped, 10_000, 10**9).last, growth(capped, 10_000, 10**9).known) == (50_000, True)
+    assert growth(capped, 60_000, 10**9).last == 60_000
+    still = growth(replace(stage, densify=None), 10_000, 10**9)
+    assert still.known and still.at(0.3) == still.last == 10_000
+
+
+def test_parts_of_a_run_avoid_its_edits_and_the_limits_of_a_probe():
+    middles = schedule(30_000, rising(2_000_000))
+    assert [part.index for part in middles] == [3_040, 9_040, 15_040, 21_040, 27_040]
+    assert sum(part.share for part in middles) == pytest.approx(1)
+    assert [part.index for part in schedule(100, rising(9))] == [10, 30, 50, 70, 90]
+    assert all(part.points <= 1_500_000 for part in within(middles, 1_500_000))
+    few = [part.points for part in within(middles, 9_000)]
+    assert few == sorted(set(few)) and few[-1] == 9_000
+
+
+def test_points_become_as_many_as_wanted(farm):
+    primitive, draw = recipes()["2dgs"].primitive, torch.Generator().manual_seed(0)
+    points = Points.fresh(primitive.init(read(Data(farm, test_every=0)).cloud, draw))
+    for count in (1_000, 1_000, 170):
+        points = with_count(primitive, points, count, draw)
+        assert len(points) == count
+
+
+def tiny(farm, tmp_path):
+    scene = read(Data(farm, test_every=0))
+    recipe = with_steps(evolve(recipes()["citygs2-coarse"], "primitive.sh_degree", 1), 400)
+    return Job(recipe, some(scene, scene.train[:3]), parts(300, 900), 8, 60.0, True)
+
+
+def test_what_a_probe_measures(farm, tmp_path):
+    started, *taken, written = measure(tiny(farm, tmp_path))
+    assert started.held_bytes >= 3 * (3 + 8) * 40 * 30 and started.photo_seconds > 0
+    assert [abs(one.points / wanted - 1) < 0.1 for one, wanted in zip(taken, (300, 900), strict=True)] == [True] * 2
+    assert all(one.seconds > 0 for one in taken) and taken[0].peak_bytes <= taken[1].peak_bytes <= written.peak_bytes
+    columns = 3 + 2 + 4 + 1 + 4 * 3  # each with two moments, and a few statistics
+    assert 3 * 4 * columns <= written.checkpoint_bytes < 3 * 4 * columns + 40  # and the header of the file
+
+
+def test_a_probe_that_is_killed_says_so(farm, tmp_path):
+    job = tiny(farm, tmp_path)
+
+    def kill(done, total):
+        os.kill(active_children()[0].pid, signal.SIGKILL)
+
+    found = probe(job, kill)
+    assert found.written is None and "killed" in found.failure
+    broken = probe(replace(job, recipe=evolve(job.recipe, "pretrain.rates", {})))
+    assert "BadInput: rates has" in broken.failure and broken.taken == ()
+
+
+def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path):
+    """Of the disk; memory and time depend on what else the machine does, and are looked at in bench/doctor.py."""
+    farm = Path(shutil.copytree(farm, tmp_path / "farm", ignore=shutil.ignore_patterns("undistorted")))
+    data, out = Data(farm, test_every=4), tmp_path / "run"
+    recipe = with_steps(evolve(recipes()["3dgs"], "pretrain.densify", None), 60)
+    before = {path for path in farm.rglob("*")}
+    heard = []
+    examined = examine(data, recipe)
+    found, findings = forecast(data, recipe, examined, Plan(10, out=out), lambda *words: heard.append(words))
+    assert {path for path in farm.rglob("*")} == before and not out.exists()
+    assert findings == [] and heard[-1][0] == "probe" and heard[-1][1] == heard[-1][2]
+    assert found.points == 300 and found.points_known and found.seconds > 0
+    run(recipe, data, out, pictures_every=0, checkpoint_every=30)
+    real = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    assert 0.75 * real < found.run_bytes < 1.25 * real
+    undistorted = sum(path.stat().st_size for path in (farm / "undistorted").iterdir())
+    assert 0.8 * undistorted < found.data_bytes < 1.2 * undistorted
+    again, _ = forecast(data, recipe, examined, Plan(10, out=out))
+    assert again.data_bytes == 0  # they are there now
