@@ -21,8 +21,9 @@ from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
+from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
-from surfkit.scene.scene import Scene
+from surfkit.scene.scene import Frame, Scene
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ class Run:
     data: Data
 
     @property
+    def needs_priors(self) -> bool:
+        """Whether a loss of the recipe looks at depth priors."""
+        return any(loss.needs_prior for loss in self.recipe.pretrain.losses.values())
+
+    @property
     def checkpoint(self) -> Path:
         """The state of the optimisation."""
         return self.out / "pretrain" / "checkpoint.safetensors"
@@ -53,6 +59,11 @@ class Run:
     def cloud(self) -> Path:
         """The points, in the frame of the input."""
         return self.out / "point_cloud.ply"
+
+    @property
+    def cameras(self) -> Path:
+        """The cameras, in the coordinates of the points."""
+        return self.out / "cameras.json"
 
     @property
     def pictures(self) -> Path:
@@ -138,7 +149,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
     before = read_json(this.inputs, Fingerprint) if this.inputs.exists() else None
-    now = fingerprint(scene, before)
+    now = fingerprint(scene, before, prior_files(this.data, scene) if this.needs_priors else None)
     if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise BadInput(
@@ -148,7 +159,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
     return now
 
 
-def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
+def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
     """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
     before = read_json(this.record, Any) if this.record.exists() else {}
     notes.begin(
@@ -160,6 +171,13 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
             "threads": torch.get_num_threads(),
             "seed": this.recipe.seed,
             "data": this.data,
+            "frame": {
+                "origin": frame.origin.tolist(),
+                "scale": frame.scale,
+                "offset": frame.shift,
+                "crs": frame.crs,
+                "metres_per_unit": frame.metres,
+            },
         },
         before,
     )

@@ -29,6 +29,7 @@ from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.recipe import Recipe
 from surfkit.scene.cache import Cache, share
+from surfkit.scene.cameras import write_cameras
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import Priors, read_priors
 from surfkit.scene.masks import mask_cache, mask_sizes
@@ -106,7 +107,7 @@ def run(
         warn_of_gaps(scene, state)
         unfinished = state is None or state.index < recipe.pretrain.steps
         given = read_ahead(this, scene, budget) if unfinished else None
-        claim(this, backend, prints, notes)
+        claim(this, backend, prints, notes, scene.frame)
         with kept(out):
             if unfinished:
                 discard(this.metrics, this.cloud)
@@ -164,10 +165,9 @@ class Material:
 def read_ahead(this: Run, scene: Scene, budget_bytes: int) -> Material:
     """The photographs, masks and depth priors of the training views, within a number of bytes."""
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    needed = any(loss.needs_prior for loss in this.recipe.pretrain.losses.values())
-    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
+    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if this.needs_priors else 0]
     for_photos, for_masks, for_priors = share(budget_bytes, wanted)
-    priors = read_priors(this.data, scene, for_priors) if needed else None
+    priors = read_priors(this.data, scene, for_priors) if this.needs_priors else None
     return Material(photo_cache(scene.train, for_photos), mask_cache(scene.train, for_masks), priors)
 
 
@@ -252,9 +252,11 @@ def drawing(this: Run, state: StageState, rasterizer: Rasterizer, geometry: bool
 
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
-    """Write the points in the frame of the input."""
+    """Write the points and the cameras in the frame of the input."""
     params = this.recipe.pretrain.finished(state)
-    write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame))
+    write_cameras(this.cameras, scene)
+    emit(FileWritten(this.cameras, "cameras"))
+    write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(this.cloud, "points"))
 
 

@@ -7,8 +7,10 @@ import shutil
 import signal
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from surfkit import pipeline
 from surfkit.cli.recipes import recipes
@@ -18,8 +20,10 @@ from surfkit.core.lock import held
 from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
 from surfkit.evaluate import images
+from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import load_run, run, with_steps
 from surfkit.scene.data import Data
+from surfkit.scene.depth_files import confidence_path, map_path, write_map, write_record
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 
@@ -167,6 +171,48 @@ def test_data_that_changed_are_named(data, recipe, tmp_path, monkeypatch):
         with pytest.raises(BadInput, match=message):
             run(recipe, data, out)
         (model / name).write_text(text)
+    run(recipe, data, out)
+
+
+def test_masks_and_depth_maps_that_changed_are_named(data, recipe, tmp_path, monkeypatch):
+    out, masks, scene = tmp_path / "run", data.path / "masks", photograph(Flight(width=40, height=30, points=150))
+    recipe = evolve(recipe, "pretrain.losses.depth", DepthRegression())
+    masks.mkdir()
+    for name, exact in scene.exact.items():
+        Image.fromarray(np.full((30, 40), 255, np.uint8)).save(masks / name)
+        inverse = scene.scene.frame.scale / exact.depth.numpy()
+        write_map(data.path, name, inverse, np.ones_like(inverse))
+    write_record(data.path, {"aligned": True})
+    interrupted(recipe, data, out, 5, monkeypatch)
+    depth = map_path(data.path, "view_005.png")
+    for path, message in [
+        (masks / "view_003.png", "the mask of view_003.png has changed, come or gone; put"),
+        (depth, "the depth map of view_005.png has changed, come or gone; put"),
+        (confidence_path(depth), "the confidence of depth of view_005.png has changed, come or gone; put"),
+    ]:
+        before = path.read_bytes()
+        touched(path, flip if path != masks / "view_003.png" else lambda content: content.extend(b"more"))
+        with pytest.raises(BadInput, match=f"began with: {message}"):
+            run(recipe, data, out)
+        path.unlink()
+        with pytest.raises(BadInput, match=f"began with: {message}"):
+            run(recipe, data, out)
+        path.write_bytes(before)
+    write_record(data.path, {"aligned": False})
+    with pytest.raises(BadInput, match="the depth map of view_001.png has changed, come or gone and 9 more"):
+        run(recipe, data, out)
+    write_record(data.path, {"aligned": True})
+    run(recipe, data, out)
+
+
+def test_a_run_whose_fingerprint_knew_no_masks_goes_on(data, recipe, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    interrupted(recipe, data, out, 5, monkeypatch)
+    inputs = json.loads((out / "inputs.json").read_text())
+    del inputs["beside"]
+    for photo in inputs["photographs"].values():
+        del photo["beside"]
+    (out / "inputs.json").write_text(json.dumps(inputs))
     run(recipe, data, out)
 
 

@@ -37,7 +37,7 @@ class Export:
             raise BadInput(f"--out {path}: a folder; name a file")
         table = to_table(this.recipe.primitive, this.recipe.pretrain.finished(state)).in_input_frame(scene.frame)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_splats(path, table, strict_2dgs=self.strict_2dgs)
+        write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
         print(f"wrote {len(state.points):,} points to {path}")
 
 

@@ -6,11 +6,12 @@ import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 import surfkit
+from surfkit.cli.data import data_of
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -19,7 +20,6 @@ from surfkit.pipeline import CHECKPOINT_EVERY, run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
-from surfkit.scene.data import Data
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
@@ -55,7 +55,7 @@ class Train:
     later, the run goes on under the schedules of the new length."""
 
     scale: float | None = None
-    """Divide the size of every photograph by this."""
+    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
@@ -65,6 +65,17 @@ class Train:
 
     test_list: Path | None = None
     """Keep the photographs named in this file from training instead: one name a line, as below images/."""
+
+    model: Path | None = None
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
+    the test folder of MatrixCity as CityGaussian prepares it."""
 
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
@@ -77,6 +88,9 @@ class Train:
 
     white: bool = False
     """Lay transparent pixels of photographs over white instead of black."""
+
+    metres_per_unit: float | None = None
+    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
 
     device: Device = "auto"
     """Where to compute."""
@@ -107,8 +121,7 @@ class Train:
 
     def run(self) -> None:
         """Train, and show what came out."""
-        split = (self.test_every, self.test_list)
-        data = Data(self._data(), self.scale, self.longest, *split, self.images, self.masks, self.layout, self.white)
+        data = data_of(self._data(), self)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():

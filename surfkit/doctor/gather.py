@@ -18,7 +18,7 @@ from surfkit.scene.capture import Capture, Reader, Shot
 from surfkit.scene.data import Data
 from surfkit.scene.masks import find_masks
 from surfkit.scene.names import PICTURES
-from surfkit.scene.read import reader_of
+from surfkit.scene.read import captured, reader_of
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
@@ -99,12 +99,11 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
     try:
         reader = reader_of(data)
         layout = next((name for name, cls in components(Reader).items() if isinstance(reader, cls)), None)
-        capture = reader.read(data)
+        capture = captured(data, reader)
     except BadInput as error:
         faults.append(error)
         return layout, EMPTY
-    shots = sorted(capture.shots, key=lambda shot: shot.name)
-    return layout, Capture(shots, capture.xyz, capture.rgb, capture.held_out)
+    return layout, capture
 
 
 def _loose(data: Data, shots: Sequence[Shot]) -> tuple[Path, ...]:

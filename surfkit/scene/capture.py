@@ -38,16 +38,22 @@ class Capture:
     """A data set as it is.
 
     Attributes:
-        shots: At least one.
+        shots: At least one, in the data set's own order: COLMAP's is that of its image numbers.
         xyz: (P, 3) float64 sparse points, input frame; none if the data set has none.
         rgb: (P, 3) uint8.
         held_out: Names that the data set itself keeps from training; None leaves it to `Data`.
+        metres: Metres per unit of the input frame; None where the data set does not say.
+        crs: Coordinate reference system of the input frame; None where there is none.
+        shift: What files of these coordinates are to leave out; None leaves it to `Frame.around`.
     """
 
     shots: Sequence[Shot]
     xyz: np.ndarray
     rgb: np.ndarray
     held_out: frozenset[str] | None = None
+    metres: float | None = None
+    crs: str | None = None
+    shift: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class Tracked(ABC):
     """What a reader also offers when its layout keeps a sparse model with observations."""
 
     @abstractmethod
-    def model_folder(self, root: Path) -> Path:
+    def model_folder(self, data: Data) -> Path:
         """Where the sparse model lies."""
 
     @abstractmethod

@@ -35,19 +35,25 @@ class COLMAP(Reader, Tracked):
         return any(len(_lacking(place, end)) < len(PARTS) for place in _places(root) for end in ENDS)
 
     def read(self, data: Data) -> Capture:
-        folder, others = _largest(data.path)
-        if others:
-            emit(Warned(f"{data.path} has several models; {folder} is used, the largest, and not {', '.join(others)}"))
+        folder = self.model_folder(data)
+        if data.model is None and len(models := _beside(folder)) > 1:
+            counts = ", ".join(f"{place.relative_to(data.path)} of {_images(place)}" for place in models)
+            emit(
+                Warned(
+                    f"{data.path} has several models, each of photographs of its own: {counts}; "
+                    f"{folder.relative_to(data.path)} is used, choose another with --model"
+                )
+            )
         images, xyz, rgb = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
         shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
         return Capture(shots, xyz, rgb)
 
-    def model_folder(self, root: Path) -> Path:
-        return _largest(root)[0]
+    def model_folder(self, data: Data) -> Path:
+        return _largest(data.path) if data.model is None else _named(data.path / data.model)
 
     def tracks(self, data: Data) -> Tracks:
-        model = _reconstruction(self.model_folder(data.path))
+        model = _reconstruction(self.model_folder(data))
         points = sorted(model.points3D.items())
         row = {number: at for at, (number, _) in enumerate(points)}
         seen = {}
@@ -76,18 +82,40 @@ def _places(root: Path) -> list[Path]:
     return list(dict.fromkeys([*(root / place for place in MODELS), *numbered]))
 
 
-def _largest(root: Path) -> tuple[Path, list[str]]:
-    """Where the sparse model of a data set lies, and which others lie beside it, or BadInput."""
-    whole = [place for place in _places(root) if any(not _lacking(place, end) for end in ENDS)]
-    if whole:
-        beside = [place for place in whole if place.parent == whole[0].parent and place.name.isdigit()]
-        best = max(beside, key=_images, default=whole[0]) if whole[0] in beside else whole[0]
-        return best, [place.name for place in beside if place != best]
+def _largest(root: Path) -> Path:
+    """Where the sparse model of a data set lies, that of most photographs if there are several, or BadInput."""
+    whole = next((place for place in _places(root) if _is_whole(place)), None)
+    if whole is not None:
+        return max(_beside(whole), key=_images)
     for place in _places(root):
-        lacking = min((_lacking(place, end) for end in ENDS), key=len)
-        if len(lacking) < len(PARTS):
-            raise BadInput(f"{place}: the COLMAP model lacks {', '.join(lacking)}; copy it whole")
+        _refuse_torn(place)
     raise BadInput(f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}")
+
+
+def _named(place: Path) -> Path:
+    """The folder of the model that the user names, or BadInput."""
+    if not _is_whole(place):
+        _refuse_torn(place)
+        raise BadInput(f"--model {place}: no COLMAP model (cameras, images, points3D as .bin or .txt) there")
+    return place
+
+
+def _beside(place: Path) -> list[Path]:
+    """A model and the other numbered ones beside it."""
+    if not place.name.isdigit():
+        return [place]
+    return [path for path in sorted(place.parent.iterdir()) if path.name.isdigit() and _is_whole(path)]
+
+
+def _is_whole(place: Path) -> bool:
+    return any(not _lacking(place, end) for end in ENDS)
+
+
+def _refuse_torn(place: Path) -> None:
+    """BadInput if a folder has some of the files of a model."""
+    lacking = min((_lacking(place, end) for end in ENDS), key=len)
+    if len(lacking) < len(PARTS):
+        raise BadInput(f"{place}: the COLMAP model lacks {', '.join(lacking)}; copy it whole")
 
 
 def _images(folder: Path) -> int:
@@ -105,7 +133,7 @@ def _lacking(folder: Path, end: str) -> list[str]:
 
 
 def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
-    """Images in name order, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
+    """Images in the order of their numbers, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
     model = _reconstruction(folder)
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
@@ -204,14 +232,16 @@ def _shots(folder: Path, model: Any) -> list[Image]:
         shots.append(Image(image.name, full, model.cameras[image.camera_id]))
     if not shots:
         raise BadInput(f"{folder}: the model has no image with a pose; run COLMAP's mapper on the photographs")
-    return sorted(shots, key=lambda shot: shot.name)
+    return shots
 
 
 def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:
     """File of every photograph; where one that is missing should be."""
     folder = root / (data.images or "images")
     if not folder.is_dir():
-        text = f"{folder}: no such folder of photographs; put them there, or name their folder with --images"
+        other = next((path.name for path in sorted(root.glob("images_*")) if path.is_dir()), None)
+        such = f", such as --images {other}" if other else ""
+        text = f"{folder}: no such folder of photographs; put them there, or name theirs with --images{such}"
         reject(BadInput(text))
         return [folder / name for name in names]
     found = find_files(folder, names)

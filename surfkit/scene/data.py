@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -25,7 +26,7 @@ class Data:
     another layout that `surfkit components reader` lists."""
 
     scale: float | None = None
-    """Divide the size of every photograph by this."""
+    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
@@ -49,11 +50,29 @@ class Data:
     white: bool = False
     """Lay transparent pixels of photographs over white instead of black."""
 
+    metres_per_unit: float | None = None
+    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+
+    model: Path | None = None
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
+    the test folder of MatrixCity as CityGaussian prepares it."""
+
     def __post_init__(self) -> None:
         if self.scale is not None and not 1 <= self.scale < float("inf"):
             raise BadInput(f"--scale {self.scale:g}: it divides the size, so it must be 1 or more")
         if self.longest is not None and self.longest < 1:
             raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
+        if sum(given is not None for given in (self.split, self.test_list, self.test_data)) > 1:
+            raise BadInput("--split, --test-list and --test-data each choose what is kept from training; give one")
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
+            raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every < 0:
             raise BadInput(f"--test-every {self.test_every}: it must be 0 (keep no photograph from training) or more")
 
@@ -67,16 +86,19 @@ class Data:
         """Which photographs are kept from training.
 
         Args:
-            names: Of all photographs, sorted.
+            names: Of all photographs, in the data set's own order.
             own: Those that the data set itself keeps; None if it keeps none.
         """
-        chosen = set(names[:: self.test_every]) if self.test_every else set()
+        chosen = set(sorted(names)[:: self.test_every]) if self.test_every else set()
         if own is not None:
             chosen = set(own)
+        if self.split is not None:
+            chosen = set(names[:: len(names) // math.ceil(len(names) / 10)])
         if self.test_list is not None:
             chosen = _listed(self.test_list, names)
         if len(chosen) == len(names):
             what = f"--test-every {self.test_every}" if own is None else "the data set's own split"
+            what = f"--split {self.split}" if self.split else what
             what = f"--test-list {self.test_list}" if self.test_list else what
             raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
         return chosen

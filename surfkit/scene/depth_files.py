@@ -13,6 +13,12 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 
+EXR = ".exr"
+NO_DEPTH = 65504.0
+"""The largest half float: the sky in MatrixCity's depth maps."""
+CENTIMETRE = 0.01
+PHOTOS = ("rgb", "images", "input")
+"""Folders of photographs inside a block of MatrixCity, which has none or one of them."""
 FOLDER = "estimated_depths"
 RECORD = "depth.json"
 MILLIMETRE = 1e-3
@@ -67,13 +73,14 @@ class DepthFile:
         return np.nan_to_num(values).clip(0, 1)
 
 
-def find_maps(root: Path, model: Path, names: Sequence[str]) -> dict[str, DepthFile]:
+def find_maps(root: Path, model: Path, names: Sequence[str], metres: float | None = None) -> dict[str, DepthFile]:
     """The depth map of each photograph that has one; the first convention of which the data set has any files.
 
     Args:
         root: The data set.
         model: Its sparse model, beside which hierarchical 3DGS keeps depth_params.json.
         names: Of the photographs, as in the sparse model.
+        metres: Metres per unit of the data set; without it, maps in centimetres are of no use.
 
     Raises:
         BadInput: A file that describes the maps is damaged.
@@ -83,7 +90,7 @@ def find_maps(root: Path, model: Path, names: Sequence[str]) -> dict[str, DepthF
         if found is not None:
             maps = {name: found(name.replace("\\", "/")) for name in names}
             return {name: depth for name, depth in maps.items() if depth is not None and depth.path.is_file()}
-    return {}
+    return _matrixcity(root, names, metres) if metres else {}
 
 
 def map_path(root: Path, name: str) -> Path:
@@ -137,6 +144,8 @@ def _stored(path: Path) -> np.ndarray:
     """The numbers in a .npy file or in a picture of one channel."""
     from PIL import Image
 
+    if path.suffix.lower() == EXR:
+        return _exr(path)
     try:
         if path.suffix.lower() == ".npy":
             return np.load(path, allow_pickle=False)
@@ -144,6 +153,24 @@ def _stored(path: Path) -> np.ndarray:
             return np.asarray(picture)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
         raise BadInput(f"cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _exr(path: Path) -> np.ndarray:
+    """(h, w) float32, the red or only channel of an OpenEXR file; 0 where that is the largest half float."""
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise BadInput("needs the package OpenEXR: pip install 'surfkit[exr]'") from error
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except (RuntimeError, ValueError, OSError) as error:
+        raise BadInput(f"cannot be read: {' '.join(str(error).split())}") from error
+    first = next((channels[name] for name in ("R", "Y", "Z", "V") if name in channels), None)
+    if first is None:
+        raise BadInput(f"has channels {', '.join(channels)}, none of R, Y, Z, V")
+    values = first.pixels.astype(np.float32)
+    none = values >= NO_DEPTH if first.pixels.dtype == np.float16 else values == NO_DEPTH
+    return np.where(none, 0, values)
 
 
 Finder = Callable[[str], DepthFile | None]
@@ -197,3 +224,29 @@ def _nerfstudio(root: Path, model: Path) -> Finder | None:
         return None if depth is None else DepthFile(root / depth, True, unit, metric=True)
 
     return find
+
+
+def _matrixcity(root: Path, names: Sequence[str], metres: float) -> dict[str, DepthFile]:
+    """MatrixCity: centimetres in BLOCK/depth/0000.exr or BLOCK_depth/0000.exr, below the data set or CITY_depth/."""
+    found = {}
+    for name in names:
+        block = PurePosixPath(name).parent
+        if block.name in PHOTOS or block.name == block.parent.name:
+            block = block.parent
+        stem = f"{PurePosixPath(name).stem}{EXR}"
+        depth = f"{block.name}_depth"
+        below = (block / "depth" / stem, block.parent / depth / stem, block.parent / depth / depth / stem)
+        places = (tree / place for tree in _trees(root.resolve()) for place in below)
+        if path := next((place for place in places if place.is_file()), None):
+            found[name] = DepthFile(path, True, CENTIMETRE / metres, metric=True)
+    return found
+
+
+def _trees(root: Path) -> list[Path]:
+    """Where blocks with depth may lie for CITY/aerial or CITY/aerial/pose/BLOCK; whole floats first."""
+    base = root.parents[1] if root.parent.name == "pose" else root
+    city = base.parent
+    return [
+        base,
+        *(city.with_name(f"{city.name}{end}") / base.name for end in ("_depth_float32", "_depth") if city.name),
+    ]

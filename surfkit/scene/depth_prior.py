@@ -82,12 +82,17 @@ def _read(view: View, fit: Fit, typical: float) -> DepthPrior:
     return DepthPrior(inverse, grown * there, typical)
 
 
+def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
+    """The depth map of each training photograph that has one, by name."""
+    return find_maps(data.path, model_folder(data), [view.name for view in scene.train], scene.frame.metres)
+
+
 def read_priors(data: Data, scene: Scene, budget_bytes: int | None = None) -> Priors | None:
     """The depth priors of a data set, aligned to its sparse points; None, and a warning, where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning.
     """
-    maps = find_maps(data.path, model_folder(data), [view.name for view in scene.train])
+    maps = prior_files(data, scene)
     if not maps:
         emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
         return None
@@ -127,7 +132,8 @@ def typical_inverse_depth(views: Sequence[View], observations: Observations, sce
     if medians:
         return float(np.median(medians))
     xyz = scene.cloud.xyz.to(torch.float64)  # a model without tracks: every point that is before a camera
-    depths = torch.cat([xyz @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3] for view in views])
+    some = views[:: max(1, len(views) // 100)]
+    depths = torch.cat([xyz @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3] for view in some])
     return float((1 / depths[depths > 0]).median())
 
 

@@ -1,9 +1,9 @@
-"""OpenDroneMap projects: photographs in images/, and OpenSfM's reconstruction of them."""
+"""OpenDroneMap projects: photographs in images/, and OpenSfM's reconstruction of them, on the map if it was."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,12 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.scene.capture import Capture, Reader, Shot, library
 from surfkit.scene.data import Data
+from surfkit.scene.georeference import placed
 from surfkit.scene.names import find_files
 
-PLACES = ("opensfm/reconstruction.json", "reconstruction.json")
+PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
+"""Where the reconstruction may lie, the first that is there wins. OpenDroneMap puts one on the map in the place of the
+second, by an affine map that no pose can follow: cameras and points no longer fit. So the topocentric one is moved."""
 LENSES = {
     "perspective": ("RADIAL", ("k1", "k2")),
     "simple_radial": ("SIMPLE_RADIAL", ("k1",)),
@@ -30,13 +33,13 @@ LENSES = {
 
 @dataclass(frozen=True)
 class ODM(Reader):
-    """OpenDroneMap: images/ and opensfm/reconstruction.json, in OpenSfM's topocentric frame (metres, z up)."""
+    """OpenDroneMap: images/ and opensfm/reconstruction.json; with GPS in UTM and metres if it chose a zone, z up."""
 
     def recognises(self, root: Path) -> bool:
         return any((root / place).is_file() for place in PLACES)
 
     def read(self, data: Data) -> Capture:
-        path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[0])
+        path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[1])
         model = _largest(path, read_json(path, Any))
         names = sorted(model["shots"])
         folder = data.path / (data.images or "images")
@@ -58,7 +61,20 @@ class ODM(Reader):
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
         good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
-        return Capture(shots, xyz[good], rgb[good].astype(np.uint8))
+        return _on_earth(Capture(shots, xyz[good], rgb[good].astype(np.uint8)), data.path, path.parent, model)
+
+
+def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, Any]) -> Capture:
+    """A topocentric capture where it lies on Earth; the same one if the photographs had no GPS."""
+    height = float(np.median(capture.xyz[:, 2])) if len(capture.xyz) else 0.0
+    place = placed(root, folder, model, height)
+    if place is None:
+        return capture
+    capture = replace(capture, metres=1.0, crs=place.crs, shift=place.shift)
+    if (move := place.moved) is None:
+        return capture
+    shots = [replace(shot, pose=move.pose(shot.pose)) for shot in capture.shots]
+    return replace(capture, shots=shots, xyz=move.points(capture.xyz))
 
 
 def _largest(path: Path, models: Any) -> Mapping[str, Any]:

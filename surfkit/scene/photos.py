@@ -16,6 +16,21 @@ from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
+ORIENTATION = 0x0112
+"""EXIF tag; 1 is upright."""
+WIDTH, HEIGHT = 0x0100, 0x0101
+"""Tags of TIFF: the size as stored."""
+TURN = Image.Transpose
+UNDONE = {
+    2: TURN.FLIP_LEFT_RIGHT,
+    3: TURN.ROTATE_180,
+    4: TURN.FLIP_TOP_BOTTOM,
+    5: TURN.TRANSPOSE,
+    6: TURN.ROTATE_90,
+    7: TURN.TRANSVERSE,
+    8: TURN.ROTATE_270,
+}
+"""What brings a picture back that was turned as its EXIF says."""
 
 
 def photo_cache(views: Sequence[View], budget_bytes: int | None = None, threads: int | None = None) -> Cache[Tensor]:
@@ -35,7 +50,18 @@ def photo_size(path: Path) -> tuple[int, int]:
     Raises:
         BadInput: The file is no picture that Pillow reads.
     """
-    return opened(path, lambda image: image.size)
+    return opened(path, _stored_size)
+
+
+def is_turned(path: Path) -> bool:
+    """Whether EXIF says to turn or mirror a picture before it is looked at."""
+
+    def tagged(image: Image.Image) -> bool:
+        if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode all of it, to look behind
+            return False
+        return image.getexif().get(ORIENTATION, 1) not in (0, 1)
+
+    return opened(path, tagged)
 
 
 def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
@@ -78,6 +104,7 @@ def read_draft(path: Path, longest: int) -> np.ndarray:
 
 
 def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
+    image = _as_stored(image)
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
         grey = np.asarray(image).astype(np.int64).clip(0, 65535)
         return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
@@ -87,6 +114,19 @@ def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
         image = image.convert("RGBA")
         return Image.alpha_composite(Image.new("RGBA", image.size, (under, under, under, 255)), image).convert("RGB")
     return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    return (image.tag_v2[WIDTH], image.tag_v2[HEIGHT]) if image.format == "TIFF" else image.size
+
+
+def _as_stored(image: Image.Image) -> Image.Image:
+    """A picture before Pillow turns it: it does so, unasked, with the TIFF files among those that EXIF says to turn."""
+    if image.format != "TIFF":
+        return image
+    turn = image.getexif().get(ORIENTATION, 1)
+    image.load()
+    return image.transpose(UNDONE[turn]) if turn in UNDONE and ORIENTATION not in image.getexif() else image
 
 
 def opened(path: Path, use: Callable[[Image.Image], T]) -> T:

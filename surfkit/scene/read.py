@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from surfkit.scene.colmap import COLMAP, MODELS
 from surfkit.scene.data import Data
 from surfkit.scene.masks import check_mask, find_masks
 from surfkit.scene.observations import Observations, Seen
-from surfkit.scene.photos import photo_size
+from surfkit.scene.photos import is_turned, photo_size
+from surfkit.scene.reduced import reduced
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 from surfkit.scene.undistort import Picture, check_camera, is_pinhole, undistorted
 
@@ -36,7 +38,16 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
-    return assembled(data, reader.read(data))
+    return assembled(data, captured(data, reader))
+
+
+def captured(data: Data, reader: Reader) -> Capture:
+    """What a reader finds in a data set, and in the one that is for tests."""
+    for name, value in {"model": data.model, "split": data.split}.items():
+        if value is not None and not isinstance(reader, Tracked):
+            raise BadInput(f"--{name} {value}: is for COLMAP data sets; leave it out")
+    capture = reader.read(data)
+    return capture if data.test_data is None else _with_tests(capture, reader, data)
 
 
 def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
@@ -48,11 +59,12 @@ def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Coll
         keep: Folder of the undistorted photographs; by default one that later runs find again.
         only: Names of the photographs to make views of; all by default.
     """
+    held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
-    held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
-    frame = Frame.around(poses, capture.xyz)
-    views = _views(data, [shot for shot in shots if only is None or shot.name in only], frame, keep)
+    frame = _frame(data, capture, poses)
+    wanted = [shot for shot in shots if only is None or shot.name in only]
+    views = _views(*reduced(data, wanted), frame, keep)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
@@ -60,6 +72,34 @@ def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Coll
         cloud=_cloud(capture, poses, frame),
         frame=frame,
     )
+
+
+def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
+    """The photographs of both data sets, those of the test data held out, under the name of its folder."""
+    root = data.test_data
+    if root is None or not root.is_dir():
+        raise BadInput(f"--test-data {root}: no such folder")
+    own = reader.read(replace(data, path=root, model=None, test_data=None)).shots
+    tests = [replace(shot, name=f"{root.resolve().name}/{shot.name}") for shot in own]
+    return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
+
+
+def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
+    """The frame of the training cameras, with what the data set or the user knows of its place and unit."""
+    frame = Frame.around(poses, capture.xyz)
+    shift = capture.shift or frame.shift
+    given = data.metres_per_unit
+    if given is not None and capture.metres not in (None, given):
+        emit(Warned(f"--metres-per-unit {given:g} is used, though {data.path} is in units of {capture.metres:g} m"))
+    if any(shift):
+        text = " ".join(f"{value:.15g}" for value in shift)
+        emit(
+            Warned(
+                f"coordinates reach {np.abs(frame.origin).max():.0f}, too large for files of float32: these leave out "
+                f"the offset {text}, which their headers and run.json name"
+            )
+        )
+    return replace(frame, metres=given or capture.metres, crs=capture.crs, shift=shift)
 
 
 def reader_of(data: Data) -> Reader:
@@ -105,7 +145,7 @@ def observations(data: Data, scene: Scene) -> Observations:
 def model_folder(data: Data) -> Path:
     """Where the sparse model of a data set lies; the data set itself if its layout has none."""
     reader = reader_of(data)
-    return reader.model_folder(data.path) if isinstance(reader, Tracked) else data.path
+    return reader.model_folder(data) if isinstance(reader, Tracked) else data.path
 
 
 def _wanted() -> str:
@@ -123,6 +163,7 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -
     masks = find_masks(data.path, data.masks, shots)
     with ThreadPoolExecutor(4) as pool:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
+        turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
             check_size(shot, size)
             if shot.name in masks:
@@ -132,6 +173,14 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -
             for shot, size in zip(shots, sizes, strict=True)
         ]
         pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistorted(p, data.path, keep), given))
+    if any(turned):
+        first = shots[turned.index(True)].name
+        emit(
+            Warned(
+                f"{sum(turned)} of {len(shots)} photographs have an EXIF tag that turns them, {first} for one: it is "
+                "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
+            )
+        )
     return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
 
 
@@ -142,9 +191,14 @@ def check_size(shot: Shot, size: tuple[int, int]) -> None:
     if abs(full[1 - long] * size[long] / full[long] - size[1 - long]) <= 1:
         return
     turned = " (turned by 90 degrees)" if size[0] * full[0] == size[1] * full[1] else ""
+    advice = "use the photographs that the model was made from, whole and unturned"
+    if turned and is_turned(shot.path):
+        advice = (
+            "the model was made from photographs turned as EXIF says, so save them like that (mogrify -auto-orient)"
+        )
     raise BadInput(
         f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera {shot.camera.camera_id} has "
-        f"{full[0]} x {full[1]}; use the photographs that the model was made from, whole and unturned"
+        f"{full[0]} x {full[1]}; {advice}"
     )
 
 

@@ -14,6 +14,8 @@ from surfkit.scene.camera import Camera
 
 MARGIN = 1.1
 """The scene extent is this times the largest distance of a training camera to their mean centre."""
+FAR = 16
+"""Beyond this many extents from 0, float32 coordinates would lose what is a millionth of the extent."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,15 @@ class Frame:
         scale: Local units per input unit.
         metres: Metres per input unit; None where the data set does not say.
         crs: Coordinate reference system of the input frame, such as "EPSG:32632"; None where there is none.
+        shift: What coordinates in files of float32 leave out, input units: file = input - shift. Survey coordinates
+            of millions of metres would be half a metre apart otherwise.
     """
 
     origin: np.ndarray
     scale: float
     metres: float | None = None
     crs: str | None = None
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @classmethod
     def around(cls, poses: np.ndarray, points: np.ndarray) -> Frame:
@@ -84,12 +89,22 @@ class Frame:
         extent = reach if reach > 1e-6 * spread else spread
         if not 0 < extent < np.inf:
             raise BadInput("all training cameras and points lie in one place; a scene needs views from several places")
-        return cls(origin, float(1 / extent))
+        return cls(origin, float(1 / extent), shift=_shift(origin, extent))
 
     @property
     def local_metres(self) -> float | None:
         """Metres per local unit, or None where the data set does not say."""
         return None if self.metres is None else self.metres / self.scale
+
+    @property
+    def comments(self) -> list[str]:
+        """What the header of a file in this frame says of it; no line where there is nothing to say."""
+        east, north, up = (f"{value:.15g}" for value in self.shift)
+        return [
+            *([f"offset: {east} {north} {up}"] if any(self.shift) else []),
+            *([f"crs: {self.crs}"] if self.crs else []),
+            *([f"metres per unit: {self.metres:.15g}"] if self.metres else []),
+        ]
 
     def to_local(self, xyz: np.ndarray) -> np.ndarray:
         """(..., 3) float64 local positions of positions in the input frame."""
@@ -98,6 +113,10 @@ class Frame:
     def to_input(self, xyz: np.ndarray) -> np.ndarray:
         """(..., 3) float64 positions in the input frame of local positions."""
         return np.asarray(xyz, np.float64) / self.scale + self.origin
+
+    def to_file(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 coordinates, of local positions, that a file of float32 keeps: without the shift."""
+        return np.asarray(xyz, np.float64) / self.scale + (self.origin - self.shift)
 
     def local_pose(self, pose: np.ndarray) -> Tensor:
         """(4, 4) float64 world_to_camera for `Camera`, of one in the input frame; camera units become local too."""
@@ -129,3 +148,10 @@ class Scene:
     held_out: tuple[View, ...]
     cloud: Cloud
     frame: Frame
+
+
+def _shift(origin: np.ndarray, extent: float) -> tuple[float, float, float]:
+    """A round number near the coordinates of the scene along each axis on which they are far from 0."""
+    grain = 10.0 ** np.floor(np.log10(extent))
+    east, north, up = (float(np.round(at / grain) * grain) if abs(at) > FAR * extent else 0.0 for at in origin)
+    return east, north, up

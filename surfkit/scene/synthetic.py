@@ -173,6 +173,22 @@ def photograph(flight: Flight | None = None) -> Synthetic:
     return Synthetic(Scene("synthetic", train, tuple(v for v in views if v.name in held_out), cloud, frame), exact)
 
 
+def look(flight: Flight, pose: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What rays of any camera meet in the scene of `flight`: multiples of the rays, and colours.
+
+    Args:
+        flight: Of which only the seed counts.
+        pose: (4, 4) world_to_camera, metres.
+        rays: (R, 3) directions in the frame of the camera.
+
+    Returns:
+        (R,) inf where they meet nothing; (R, 3) in [0, 1], 0 there.
+    """
+    origin, waves = -pose[:3, :3].T @ pose[:3, 3], _waves(np.random.default_rng(flight.seed))
+    depth, _, color = _cast(np.broadcast_to(origin, rays.shape), rays @ pose[:3, :3], waves)
+    return depth, color
+
+
 def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False, tracks: bool = False) -> None:
     """Save the scene as a COLMAP folder: PNG photographs in images/, the model in sparse/0 in the input frame.
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,15 @@ from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.scene.capture import Capture, Reader, Shot, library
 from surfkit.scene.data import Data
+from surfkit.scene.depth_cloud import points_of_depth
+from surfkit.scene.depth_files import find_maps
 from surfkit.scene.photos import photo_size
 from surfkit.scene.sparse_ply import read_points
 
 ENDS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """What may be missing at the end of a file_path."""
+NUMBERED = ("", "rgb", "images", "input")
+"""Where MatrixCity's numbered photographs may lie, below their poses; or in a folder of the block's own name."""
 POINTS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Files of sparse points that a data set need not name."""
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
@@ -53,7 +58,8 @@ class Blender(Reader):
         for part in ("test", "val"):
             if not held and (data.path / f"transforms_{part}.json").is_file():
                 held = frames(data.path / f"transforms_{part}.json", data)[1]
-        return _split(train, held, points(data.path, contents))
+        matrix_city = data.path.resolve().parent.name == "pose"  # its pose/BLOCK is in hundreds of metres
+        return replace(_split(train, held, points(data.path, contents)), metres=100.0 if matrix_city else None)
 
 
 @dataclass(frozen=True)
@@ -64,11 +70,15 @@ class MatrixCity(Reader):
         return bool(_blocks(root / "train"))
 
     def read(self, data: Data) -> Capture:
-        train = [shot for path in _blocks(data.path / "train") for shot in frames(path, data)[1]]
-        held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
-        if not train:
+        read = [frames(path, data) for path in _blocks(data.path / "train")]
+        if not read:
             raise BadInput(f"{data.path}: no transforms.json in train/ or in a folder below it")
-        return _split(train, held, points(data.path, {}))
+        train = [shot for _, shots in read for shot in shots]
+        held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
+        metres, sparse = _metres(read[0][0]), points(data.path, {})
+        if not len(sparse[0]):
+            sparse = points_of_depth(train, find_maps(data.path, data.path, [shot.name for shot in train], metres))
+        return replace(_split(train, held, sparse), metres=metres)
 
 
 def _split(train: list[Shot], held: list[Shot], sparse: tuple[np.ndarray, np.ndarray]) -> Capture:
@@ -117,11 +127,17 @@ def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndar
     return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
+def _metres(contents: Mapping[str, Any]) -> float:
+    """Metres per unit of MatrixCity's poses: rotations of length 1/100 mean metres, whole ones hundreds of metres."""
+    frame = contents["frames"][0]
+    length = np.linalg.norm(np.array(frame.get("transform_matrix", frame.get("rot_mat")), np.float64)[:3, 0])
+    return 1.0 if length < 0.1 else 100.0
+
+
 def _name(photo: Path, root: Path) -> str:
-    try:
-        return photo.relative_to(root).as_posix()
-    except ValueError:
-        return photo.name
+    """What lies beside the data set, as in ../../train/0000.png, is named from there on."""
+    parts = Path(os.path.relpath(photo, root)).parts
+    return "/".join(part for part in parts if part != "..")
 
 
 def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Path:
@@ -133,7 +149,7 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
     places: Sequence[str] = [said, Path(said).name] if said else []
     if isinstance(index, int):
         numbered = f"{index:04d}.png"
-        places = [*places, numbered, f"rgb/{numbered}", f"images/{numbered}", f"input/{numbered}"]
+        places = [*places, *(f"{below}/{numbered}".lstrip("/") for below in (*NUMBERED, folder.name))]
     bases = [folder, *([data.path / data.images] if data.images else [])]
     for place in places:
         for base in reversed(bases):  # --images first

@@ -57,11 +57,40 @@ def test_the_largest_of_several_models_is_used(farm):
     model.rename(farm / "sparse" / "1")
     shutil.copytree(farm / "sparse" / "1", model)
     (model / "images.txt").write_text("".join(lines[:4]))  # two of the five
+    points = (model / "points3D.txt").read_text().splitlines()
+    (model / "points3D.txt").write_text("".join(" ".join(line.split()[:8]) + "\n" for line in points))
     scene, notes = noticed(Data(farm))
     assert len(scene.train) + len(scene.held_out) == 5
-    assert len(notes) == 1 and "several models" in notes[0] and "sparse/1 is used" in notes[0]
+    assert (
+        len(notes) == 1 and "several models, each of photographs of its own: sparse/0 of 2, sparse/1 of 5" in notes[0]
+    )
+    assert "sparse/1 is used, choose another with --model" in notes[0]
+    small, notes = noticed(Data(farm, model=Path("sparse/0"), test_every=0))
+    assert [view.name for view in small.train] == ["view_000.png", "view_001.png"] and not notes
+    with pytest.raises(BadInput, match="--model .*sparse/2: no COLMAP model"):
+        read(Data(farm, model=Path("sparse/2")))
+    (model / "cameras.txt").unlink()
+    with pytest.raises(BadInput, match="sparse/0: the COLMAP model lacks cameras.txt"):
+        read(Data(farm, model=Path("sparse/0")))
     shutil.rmtree(model)
     assert len(read(Data(farm)).train) == 4, "a lone sparse/1 does too"
+
+
+def test_exif_that_turns_photographs_is_ignored_and_said(farm):
+    """As COLMAP does, so that sizes and pixels are those stored."""
+    turn = Image.Exif()
+    turn[0x0112] = 6
+    for path in (farm / "images").iterdir():
+        Image.open(path).save(path.with_suffix(".jpg"), quality=95, exif=turn)
+        path.unlink()
+    seen = np.asarray(library().Bitmap.read(str(farm / "images/view_001.jpg"), True).to_array())
+    scene, notes = noticed(Data(farm))
+    assert "5 of 5 photographs have an EXIF tag that turns them, view_000.png for one: it is ignored" in notes[-1]
+    photo = view_photo(scene.train[0]).permute(1, 2, 0).numpy()
+    assert photo.shape == (48, 64, 3) and np.abs(photo.astype(int) - seen).max() <= 2
+    (farm / "sparse/0/cameras.txt").write_text("1 PINHOLE 48 64 58 57 24 31\n")
+    with pytest.raises(BadInput, match=r"\(turned by 90 degrees\).* turned as EXIF says, so save them like that"):
+        read(Data(farm))
 
 
 def test_names_in_another_spelling_are_matched_with_one_note(farm):

@@ -1,72 +1,25 @@
 """One small scene in the layouts of several programs is the same scene."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.folder import noted
 from surfkit.scene.data import Data
 from surfkit.scene.photos import view_photo
-from surfkit.scene.ply import write_points
 from surfkit.scene.read import RANDOM_POINTS, observations, read
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.scene.synthetic import photograph
 
-FLIGHT = Flight(views=6, width=40, height=30, points=60, test_every=3)
-GL = np.diag([1.0, -1.0, -1.0, 1.0])
+from .folders import FLIGHT, blender, lens, nerfstudio, odm, pixels_of, save, sparse, to_world, views_of
 
 
 @pytest.fixture(scope="module")
 def truth():
     return photograph(FLIGHT)
-
-
-def views_of(truth):
-    return sorted([*truth.scene.train, *truth.scene.held_out], key=lambda view: view.name)
-
-
-def pixels_of(truth, name, alpha=False):
-    pixels = (truth.exact[name].color.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-    return np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 255, np.uint8)], 2) if alpha else pixels
-
-
-def save(path, pixels):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path)
-
-
-def to_world(truth, view):
-    """OpenGL camera_to_world, as a list."""
-    return (np.linalg.inv(truth.scene.frame.input_pose(view.camera.world_to_camera)) @ GL).tolist()
-
-
-def lens(truth):
-    c = views_of(truth)[0].camera
-    return {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy}
-
-
-def sparse(truth):
-    cloud = truth.scene.cloud
-    return truth.scene.frame.to_input(cloud.xyz.numpy()), cloud.rgb.numpy()
-
-
-def nerfstudio(folder, truth, change=None):
-    frames = []
-    for view in views_of(truth):
-        save(folder / "images" / view.name, pixels_of(truth, view.name))
-        frames.append({"file_path": f"./images/{view.name}", "transform_matrix": to_world(truth, view)})
-    write_points(folder / "sparse_pc.ply", *sparse(truth))
-    contents = {**lens(truth), "camera_model": "OPENCV", "ply_file_path": "sparse_pc.ply", "frames": frames}
-    if change:
-        change(contents)
-    (folder / "transforms.json").write_text(json.dumps(contents))
-    return folder
 
 
 def same(scene, truth, atol=1e-6):
@@ -128,19 +81,7 @@ def test_distorted_nerfstudio(tmp_path, truth):
 
 @pytest.mark.parametrize("white", [False, True])
 def test_blender(tmp_path, truth, white):
-    angle = 2 * math.atan(20 / views_of(truth)[0].camera.fx)
-    held = {view.name for view in truth.scene.held_out}
-    for part, chosen in {"train": False, "test": True}.items():
-        frames = []
-        for view in views_of(truth):
-            if (view.name in held) == chosen:
-                pixels = pixels_of(truth, view.name, alpha=True)
-                pixels[:5, :5, 3] = 0
-                save(tmp_path / part / view.name, pixels)
-                stem = Path(view.name).stem
-                frames.append({"file_path": f"./{part}/{stem}", "transform_matrix": to_world(truth, view)})
-        contents = {"camera_angle_x": angle, "frames": frames}
-        (tmp_path / f"transforms_{part}.json").write_text(json.dumps(contents))
+    blender(tmp_path, truth)
     with noted() as kept:
         notes = kept.texts
         scene = read(Data(tmp_path, white=white))
@@ -172,26 +113,6 @@ def test_matrixcity(tmp_path, truth):
     for view, wanted in zip(scene.train, truth.scene.train, strict=True):
         pose = truth.scene.frame.input_pose(wanted.camera.world_to_camera)
         np.testing.assert_allclose(scene.frame.input_pose(view.camera.world_to_camera), pose, atol=1e-6)
-
-
-def odm(folder, truth, kind="brown", **coefficients):
-    c = views_of(truth)[0].camera
-    normal = {"c_x": (c.cx - 20) / 40, "c_y": (c.cy - 15) / 40, "focal_x": c.fx / 40, "focal_y": c.fy / 40}
-    camera = {"projection_type": kind, "width": 40, "height": 30, **normal, **coefficients}
-    shots = {}
-    for view in views_of(truth):
-        save(folder / "images" / view.name, pixels_of(truth, view.name))
-        pose = truth.scene.frame.input_pose(view.camera.world_to_camera)
-        turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
-        shots[view.name] = {"rotation": turn, "translation": pose[:3, 3].tolist(), "camera": "v2 made"}
-    xyz, rgb = sparse(truth)
-    pairs = enumerate(zip(xyz.tolist(), rgb.tolist(), strict=True))
-    points = {str(i): {"coordinates": place, "color": color} for i, (place, color) in pairs}
-    small = {"cameras": {}, "shots": {"a.png": {}}, "points": {}}
-    model = {"cameras": {"v2 made": camera}, "shots": shots, "points": points}
-    (folder / "opensfm").mkdir(exist_ok=True)
-    (folder / "opensfm/reconstruction.json").write_text(json.dumps([small, model]))
-    return folder
 
 
 def test_opendronemap(tmp_path, truth):
@@ -253,18 +174,21 @@ def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, t
     assert len(notes) == 1 and "read as COLMAP; it could also be read with --layout nerfstudio, odm" in notes[0]
 
 
-@pytest.mark.parametrize("layout", ["nerfstudio", "distorted", "odm"])
-def test_every_layout_trains(tmp_path, truth, layout):
-    from surfkit.cli.recipes import recipes
-    from surfkit.core.tree import evolve
-    from surfkit.pipeline import run, with_steps
-
-    folder = tmp_path / "data"
-    folder.mkdir()
-    if layout == "odm":
-        odm(folder, truth)
-    else:
-        nerfstudio(folder, truth, None if layout == "nerfstudio" else lambda contents: contents.update(k1=-0.02))
-    recipe = evolve(with_steps(recipes()["2dgs"], 100), "primitive.sh_degree", 0)
-    metrics = run(recipe, Data(folder, test_every=3), tmp_path / "run")
-    assert metrics["images"]["psnr"] > 10 and metrics["steps"] == 100
+def test_opendronemap_on_the_map(tmp_path, truth):
+    """The topocentric reconstruction is used, not the one that OpenDroneMap put in its place, and moved to UTM."""
+    folder = odm(tmp_path, truth)
+    (folder / "opensfm/reconstruction.json").rename(folder / "opensfm/reconstruction.topocentric.json")
+    (folder / "opensfm/reconstruction.json").write_text("[]")
+    (folder / "opensfm/reference_lla.json").write_text('{"latitude": 47.5, "longitude": 8.9, "altitude": 430.0}')
+    (folder / "odm_georeferencing").mkdir()
+    (folder / "odm_georeferencing/coords.txt").write_text("WGS84 UTM 32N\n492000 5260000\n")
+    scene = read(Data(folder, test_every=3))
+    frame = scene.frame
+    assert (frame.crs, frame.metres, frame.shift) == ("EPSG:32632", 1.0, (492000.0, 5260000.0, 0.0))
+    np.testing.assert_allclose(frame.origin, (492468.65734, 5260734.57871, 444), atol=15)
+    for view, wanted in zip(scene.train, truth.scene.train, strict=True):
+        east = wanted.camera.centre - truth.scene.train[0].camera.centre
+        here = view.camera.centre - scene.train[0].camera.centre
+        assert float(here.norm()) == pytest.approx(float(east.norm()), abs=1e-3), (
+            "the same flight at the same scale of the extent"
+        )

@@ -9,7 +9,8 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.scene.photos import photo_cache, photo_size, read_photo
+from surfkit.scene.capture import library
+from surfkit.scene.photos import is_turned, photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 
 
@@ -70,12 +71,17 @@ def test_alpha_lies_over_black(tmp_path):
     assert got == [[0, 200], [100, 100]]
 
 
-def test_the_rotation_in_exif_is_not_applied(tmp_path):
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("end", ["png", "tif"])
+def test_the_rotation_in_exif_is_not_applied(tmp_path, end, turn):
+    """Neither by us nor by Pillow, which turns TIFF files when it reads them; COLMAP does not."""
     exif = Image.Exif()
-    exif[0x0112] = 6
-    path = save(tmp_path / "a.jpg", stripes(), exif=exif)
-    assert photo_size(path) == (8, 6)
-    assert read_photo(path, (8, 6)).shape == (3, 6, 8)
+    exif[0x0112] = turn
+    pixels = np.arange(144, dtype=np.uint8).reshape(6, 8, 3)
+    path = save(tmp_path / f"a.{end}", pixels, exif=exif)
+    assert photo_size(path) == (8, 6) and is_turned(path) == (turn > 1)
+    assert np.array_equal(read_photo(path, (8, 6)).permute(1, 2, 0), pixels)
+    assert np.array_equal(library().Bitmap.read(str(path), True).to_array(), pixels)
 
 
 def test_by_position_in_the_size_of_the_camera(tmp_path):

@@ -1,0 +1,172 @@
+"""Where on Earth a topocentric reconstruction lies: to UTM by a similarity, as OpenDroneMap does by an affine map."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.events import Warned, emit
+
+AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
+"""WGS 84: semi-major axis, metres, and flattening."""
+FOLDER = "odm_georeferencing"
+ZONES = (r"WGS ?84 / UTM zone (\d+)([NS])", r"WGS84 UTM (\d+)([NS])", r"\+proj=utm.*\+zone=(\d+)(.*\+south)?")
+"""How OpenDroneMap writes a zone of UTM, in coords.txt and in proj.txt."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """new = scale * turn @ old + move, float64."""
+
+    turn: np.ndarray
+    scale: float
+    move: np.ndarray
+
+    def points(self, xyz: np.ndarray) -> np.ndarray:
+        """(P, 3) new positions."""
+        return self.scale * xyz @ self.turn.T + self.move
+
+    def pose(self, pose: np.ndarray) -> np.ndarray:
+        """(4, 4) world_to_camera of the new world; camera units become new units too."""
+        new = pose.copy()
+        new[:3, :3] = pose[:3, :3] @ self.turn.T
+        new[:3, 3] = self.scale * pose[:3, 3] - new[:3, :3] @ self.move
+        return new
+
+
+@dataclass(frozen=True)
+class Place:
+    """A reconstruction on Earth.
+
+    Attributes:
+        crs: Coordinate reference system of its coordinates, after `moved`.
+        moved: From the coordinates of the file; None if they stay.
+        shift: What files of these coordinates leave out.
+    """
+
+    crs: str
+    moved: Similarity | None = None
+    shift: tuple[float, float, float] | None = None
+
+
+def placed(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> Place | None:
+    """Where a reconstruction of OpenSfM lies, in UTM if OpenDroneMap chose a zone; None if it has no GPS.
+
+    Args:
+        root: The project, with odm_georeferencing/.
+        folder: That of the reconstruction, with reference_lla.json.
+        model: The reconstruction, topocentric.
+        height: z that keeps its altitude while all lengths are scaled as the map is, some 0.04 %.
+    """
+    reference = _reference(folder, model)
+    if reference is None:
+        return None
+    latitude, longitude, altitude = reference
+    local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
+    lines = _lines(root / FOLDER / "coords.txt")
+    texts = [*lines[:1], *_lines(root / FOLDER / "proj.txt")[:1]]
+    zone = next((found for text in texts for found in [_zone(text)] if found), None)
+    if zone is None:
+        if texts:
+            emit(
+                Warned(
+                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM, so coordinates are metres east, north and up of "
+                    f"{latitude:.6f}, {longitude:.6f}"
+                )
+            )
+        return Place(local)
+    number, south = zone
+    shift = _offset(root / FOLDER / "coords.txt", lines)
+    return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift)
+
+
+def utm(latitude: float, longitude: float, zone: int, south: bool) -> tuple[float, float]:
+    """Easting and northing in metres, of degrees on WGS 84, by Krueger's series to the fourth order: within 0.1 mm."""
+    n = FLATTENING / (2 - FLATTENING)
+    e = 2 * math.sqrt(n) / (1 + n)
+    radius = AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    series = (
+        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16 + 41 * n**4 / 180,
+        13 * n**2 / 48 - 3 * n**3 / 5 + 557 * n**4 / 1440,
+        61 * n**3 / 240 - 103 * n**4 / 140,
+        49561 * n**4 / 161280,
+    )
+    sine, away = math.sin(math.radians(latitude)), math.radians(longitude - (6 * zone - 183))
+    t = math.sinh(math.atanh(sine) - e * math.atanh(e * sine))
+    xi, eta = math.atan2(t, math.cos(away)), math.asinh(math.sin(away) / math.hypot(t, math.cos(away)))
+    along = xi + sum(a * math.sin(2 * j * xi) * math.cosh(2 * j * eta) for j, a in enumerate(series, 1))
+    across = eta + sum(a * math.cos(2 * j * xi) * math.sinh(2 * j * eta) for j, a in enumerate(series, 1))
+    return 500_000 + 0.9996 * radius * across, (10_000_000 if south else 0) + 0.9996 * radius * along
+
+
+def _onto_map(reference: tuple[float, float, float], zone: tuple[int, bool], height: float) -> Similarity:
+    """From metres east, north and up of a reference to UTM and altitude."""
+    latitude, longitude, altitude = reference
+    squared = FLATTENING * (2 - FLATTENING)
+    w = 1 - squared * math.sin(math.radians(latitude)) ** 2
+    north_m = AXIS * (1 - squared) / w**1.5 + altitude  # radius of the meridian
+    a_metre = math.degrees(1 / north_m)
+    step = 100.0
+    upper = utm(latitude + step * a_metre, longitude, *zone)
+    lower = utm(latitude - step * a_metre, longitude, *zone)
+    east, north = ((u - v) / (2 * step) for u, v in zip(upper, lower, strict=True))
+    scale = math.hypot(east, north)
+    cosine, sine = north / scale, east / scale
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return Similarity(turn, scale, np.array([*utm(latitude, longitude, *zone), altitude + height * (1 - scale)]))
+
+
+def _reference(folder: Path, model: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """Latitude and longitude, degrees, and altitude, metres, of the origin; None where the photographs had no GPS."""
+    path = folder / "reference_lla.json"
+    given = model.get("reference_lla") or (read_json(path, Any) if path.is_file() else None)
+    if given is None:
+        return None
+    try:
+        values = tuple(float(given[name]) for name in ("latitude", "longitude", "altitude"))
+    except (TypeError, KeyError, ValueError) as error:
+        raise BadInput(f"{path}: lacks latitude, longitude or altitude; run OpenSfM again") from error
+    if not all(map(math.isfinite, values)) or abs(values[0]) > 90 or abs(values[1]) > 180:
+        raise BadInput(f"{path}: {values[0]:g}, {values[1]:g} is no latitude and longitude; run OpenSfM again")
+    return None if values[:2] == (0, 0) else values  # type: ignore[return-value]
+
+
+def _lines(path: Path) -> list[str]:
+    """Lines of a text file that are not empty; none where there is no such file."""
+    try:
+        return [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path}: cannot be read as text; run OpenDroneMap again, or delete it") from error
+
+
+def _zone(text: str) -> tuple[int, bool] | None:
+    """Number of a zone of UTM, and whether it is south of the equator."""
+    for pattern in ZONES:
+        if (found := re.match(pattern, text)) and 1 <= int(found[1]) <= 60:
+            return int(found[1]), (found[2] or "").endswith(("S", "+south"))
+    if (found := re.fullmatch(r"EPSG:32([67])(\d\d)", text)) and 1 <= int(found[2]) <= 60:
+        return int(found[2]), found[1] == "7"
+    return None
+
+
+def _offset(path: Path, lines: list[str]) -> tuple[float, float, float] | None:
+    """What OpenDroneMap leaves out of the coordinates in its files."""
+    if len(lines) < 2:
+        return None
+    try:
+        east, north = (float(word) for word in lines[1].split()[:2])
+    except ValueError as error:
+        raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two numbers; run OpenDroneMap again") from error
+    if not (math.isfinite(east) and math.isfinite(north)):
+        raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two finite numbers; run OpenDroneMap again")
+    return east, north, 0.0
