@@ -24,6 +24,10 @@ from surfkit.scene.data import Data
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
 from surfkit.scene.scene import Scene
 
+FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
+"""In a run folder."""
+FOLDERS = ("pretrain", "pictures", "progress")
+
 
 @dataclass(frozen=True)
 class Run:
@@ -71,9 +75,41 @@ class Run:
 
 
 def refuse_file(out: Path) -> None:
-    """BadInput if a file is in the place of a run folder."""
+    """BadInput if a file is in the place of a run folder, or a folder in the place of one of its files."""
     if out.exists() and not out.is_dir():
         raise BadInput(f"--out {out}: a file, not a folder; name another one")
+    for name in FILES:
+        if (out / name).is_dir():
+            raise BadInput(f"{out / name}: a folder, where the run keeps a file; delete it")
+    for name in FOLDERS:
+        if (out / name).is_file():
+            raise BadInput(f"{out / name}: a file, where the run keeps a folder; delete it")
+
+
+def read_record(out: Path) -> dict[str, Any]:
+    """What run.json of a run folder says; empty where there is none.
+
+    Raises:
+        BadInput: It is damaged.
+    """
+    path = out / "run.json"
+    record = read_json(path, dict[str, Any]) if path.exists() else {}
+    for name in ("notes", "skipped"):
+        _require_texts(path, name, record.get(name, []))
+    return record
+
+
+def read_data(out: Path) -> Data:
+    """The data that a run was made from."""
+    try:
+        return load(Data, read_record(out).get("data"), "data")
+    except BadInput as error:
+        raise BadInput(f"{out / 'run.json'}: {error}") from error
+
+
+def _require_texts(path: Path, name: str, value: Any) -> None:
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise BadInput(f"{path}: {name} is not a list of texts; {path.parent} is damaged, begin in another folder")
 
 
 def refuse_other(this: Run) -> None:
@@ -89,7 +125,7 @@ def refuse_other(this: Run) -> None:
             )
         )
     if not found and this.record.exists():
-        before = dump(load(Data, read_json(this.record, Any).get("data"), "data"))  # with defaults of newer settings
+        before = dump(read_data(this.out))  # with defaults of newer settings
         found = difference(before, dump(this.data), "data")
     if found:
         at, old, new = found
@@ -106,7 +142,8 @@ def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
     """
     plain = difference(there, dump(this.recipe))
     now = this.recipe.pretrain.steps
-    before = there.get("pretrain", {}).get("steps") if isinstance(there, dict) else None
+    stage = there.get("pretrain") if isinstance(there, dict) else None
+    before = stage.get("steps") if isinstance(stage, dict) else None
     if not isinstance(before, int) or not 0 < before < now:
         return plain
     old = read_json(this.out / "recipe.json", Recipe)
@@ -150,7 +187,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
 
 def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
     """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
-    before = read_json(this.record, Any) if this.record.exists() else {}
+    before = read_record(this.out)
     notes.begin(
         this.record,
         {

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
@@ -21,8 +21,19 @@ from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
+from surfkit.evaluate.metrics import read_metrics
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
-from surfkit.folder import Run, claim, discard, noted, refuse_changed, refuse_file, refuse_other, say
+from surfkit.folder import (
+    Run,
+    claim,
+    discard,
+    noted,
+    read_data,
+    refuse_changed,
+    refuse_file,
+    refuse_other,
+    say,
+)
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
@@ -114,7 +125,7 @@ def run(
                 state = optimise(this, scene, rasterizer, state, every, given)
             elif this.metrics.exists() and this.cloud.exists():
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
-                return read_json(this.metrics, Any)
+                return read_metrics(out)
             if not this.cloud.exists():
                 export(this, state, scene)
             return evaluate(this, state, scene, rasterizer, budget)
@@ -298,8 +309,7 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     """
     if not (out / "recipe.json").exists() or not (out / "run.json").exists():
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
-    record = read_json(out / "run.json", Any)
-    this = Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
+    this = Run(out, read_json(out / "recipe.json", Recipe), read_data(out))
     scene = read(this.data)
     state = saved(this, scene)
     steps = this.recipe.pretrain.steps

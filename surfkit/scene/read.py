@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,8 @@ def read(data: Data) -> Scene:
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
     capture = reader.read(data)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
+    if twice := next((a.name for a, b in pairwise(shots) if a.name == b.name), None):
+        raise BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out")
     held_out = data.held_out([shot.name for shot in shots], capture.held_out)
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = Frame.around(poses, capture.xyz)
