@@ -19,12 +19,13 @@ from surfkit.pipeline import run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.read import read
+from surfkit.train.material import Store
 
 
 def measure(data: Data, steps: int, budget: str) -> dict[str, object]:
     """Time and result of one run."""
     with tempfile.TemporaryDirectory() as folder:
-        metrics = run(with_steps(recipes()["2dgs"], steps), data, Path(folder), "cpu", cache=budget)
+        metrics = run(with_steps(recipes()["2dgs"], steps), data, Path(folder), "cpu", store=Store(budget))
         points = (Path(folder) / "point_cloud.ply").read_bytes()
     return {
         "budget": budget,

@@ -15,7 +15,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import PhotoSkipped, Warned, emit
+from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, emit
 from surfkit.core.registry import hookimpl, plugins, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
@@ -86,6 +86,12 @@ def refuse_file(out: Path) -> None:
             raise BadInput(f"{out / name}: a file, where the run keeps a folder; delete it")
 
 
+def refuse_no_run(out: Path) -> None:
+    """BadInput if a folder holds no run."""
+    if not (out / "recipe.json").exists() or not (out / "run.json").exists():
+        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
+
+
 def read_record(out: Path) -> dict[str, Any]:
     """What run.json of a run folder says; empty where there is none.
 
@@ -96,6 +102,8 @@ def read_record(out: Path) -> dict[str, Any]:
     record = read_json(path, dict[str, Any]) if path.exists() else {}
     for name in ("notes", "skipped"):
         _require_texts(path, name, record.get(name, []))
+    if (memory := record.get("memory_bytes")) is not None:
+        load(dict[str, int], memory, f"{path}: memory_bytes")
     return record
 
 
@@ -205,11 +213,12 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes) -> None:
 
 
 class Notes:
-    """Prints the warnings of a run, and keeps them and the photographs it passed over in run.json."""
+    """Prints the warnings of a run, and keeps them, the photographs it passed over and its memory in run.json."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
         self.skipped: list[str] = []
+        self.memory: dict[str, int] = {}
         self.path: Path | None = None
         self.facts: dict[str, Any] = {}
 
@@ -218,12 +227,14 @@ class Notes:
         self.path, self.facts = path, facts
         self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
         self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
+        self.memory = before.get("memory_bytes") or {}
         self.write()
 
     def write(self) -> None:
         """Save what there is."""
         if self.path is not None:
-            write_json(self.path, self.facts | {"notes": self.texts, "skipped": self.skipped})
+            found = {"notes": self.texts, "skipped": self.skipped, "memory_bytes": self.memory}
+            write_json(self.path, self.facts | found)
 
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
@@ -231,6 +242,10 @@ class Notes:
         if isinstance(event, Warned):
             say(f"note: {event.text}")
             self.keep(self.texts, event.text)
+        elif isinstance(event, MemoryTaken):
+            if event.parts["peak"] >= self.memory.get("peak", 0):
+                self.memory = dict(event.parts)
+                self.write()
         elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
             say(f"note: {event.reason}; the run goes on without this photograph")
 

@@ -14,11 +14,12 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
-from surfkit.pipeline import load_run, run, with_steps
+from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
 from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train.material import Store
 
 STEPS = 60
 
@@ -154,7 +155,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
 def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(pipeline.checkpoint, "save", lambda path, state: written.append(state.index))
-    run(with_steps(recipe, 10), data, tmp_path, checkpoint_every=4)
+    run(with_steps(recipe, 10), data, tmp_path, every=Every(4))
     assert written == [4, 8, 10]
 
 
@@ -200,11 +201,11 @@ def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
 
 
 def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path, cache="20KB")  # two photographs of 64 x 48
+    metrics = run(recipe, data, tmp_path, store=Store("20KB"))  # two photographs of 64 x 48
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
     assert metrics["images"] == finished[1]["images"]
     with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
-        run(recipe, data, tmp_path, cache="lots")
+        run(recipe, data, tmp_path, store=Store("lots"))
 
 
 def test_masks_train_end_to_end(data, recipe, tmp_path):

@@ -18,7 +18,7 @@ from surfkit.core.lock import held
 from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
 from surfkit.evaluate import images
-from surfkit.pipeline import load_run, run, with_steps
+from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -75,7 +75,7 @@ def interrupted(recipe, data, out, at, monkeypatch, **settings):
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_path, monkeypatch, capsys):
     whole, out = tmp_path / "whole", tmp_path / "run"
     run(recipe, data, whole)
-    interrupted(recipe, data, out, 17, monkeypatch, checkpoint_every=8)
+    interrupted(recipe, data, out, 17, monkeypatch, every=Every(8))
     path = out / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-40])
     run(recipe, data, out)
@@ -86,7 +86,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_pat
 
 
 def test_a_damaged_checkpoint_does_not_push_out_the_good_one(data, recipe, tmp_path, monkeypatch):
-    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, checkpoint_every=8)
+    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, every=Every(8))
     path = tmp_path / "run" / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(b"")
     interrupted(recipe, data, tmp_path / "run", 18, monkeypatch)
@@ -235,7 +235,7 @@ def spoilt(recipe, at, above, monkeypatch):
 def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data, recipe, tmp_path, monkeypatch):
     out = tmp_path / "run"
     rate = recipe.pretrain.rates["scales"].start
-    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, checkpoint_every=10)
+    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, every=Every(10))
     assert metrics["steps"] == STEPS and checkpoint.load(out / "pretrain" / "checkpoint.safetensors").halvings == 2
     assert [("(1 of 2" in text, "(2 of 2" in text) for text in notes(out)] == [(True, False), (False, True)]
     for text in notes(out):
@@ -250,7 +250,7 @@ def test_a_third_time_is_the_last(data, recipe, tmp_path, monkeypatch, at):
         with pytest.raises(
             Fault, match=rf"step {at}, view view_0\d\d.png: the scales are not finite, also after .* 2 t"
         ):
-            run(bad, data, out, checkpoint_every=10)
+            run(bad, data, out, every=Every(10))
     state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
     assert state.halvings == 2 and state.index == (10 if at == 13 else 0) and len(notes(out)) == 2
     assert all(torch.isfinite(value).all() for value in state.points.params.values())
@@ -264,7 +264,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size // 2, limits[1]))
     try:
         with pytest.raises(Fault, match=r"the disk is full .* last checkpoint in .*run is whole: free some space"):
-            run(recipe, data, out, checkpoint_every=5)
+            run(recipe, data, out, every=Every(5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert checkpoint.load(path).index == 9 and not list(out.rglob(".*"))
@@ -282,14 +282,14 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.Trainer, "step", short)
         with pytest.raises(Fault, match="out of memory.*--longest"):
-            run(recipe, data, tmp_path / "run", checkpoint_every=10)
+            run(recipe, data, tmp_path / "run", every=Every(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
     run(recipe, data, tmp_path / "run")
 
 
 def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
-    a = run(recipe, data, tmp_path / "a", pictures_every=0)
-    b = run(recipe, data, tmp_path / "b", pictures_every=10)
+    a = run(recipe, data, tmp_path / "a", every=Every(pictures=0))
+    b = run(recipe, data, tmp_path / "b", every=Every(pictures=10))
     assert a["images"] == b["images"] and not (tmp_path / "a" / "progress").exists()
     found = sorted(p.relative_to(tmp_path / "b" / "progress").as_posix() for p in (tmp_path / "b").rglob("0000*/*.png"))
     assert found == [f"0000{step}/view_00{view}.png.png" for step in (10, 20) for view in (0, 8)]
@@ -299,6 +299,6 @@ def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
 
 
 def test_the_psnr_along_the_way_is_that_of_the_end(data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path / "run", pictures_every=STEPS - 1)
+    metrics = run(recipe, data, tmp_path / "run", every=Every(pictures=STEPS - 1))
     line = next(line for line in journal.read(tmp_path / "run" / "events.jsonl") if line["event"] == "Measured")
     assert images.statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)

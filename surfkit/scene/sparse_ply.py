@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -63,14 +63,16 @@ def _text(path: Path) -> dict[str, np.ndarray]:
     if not all(len(row) == 3 for row in properties):
         raise BadInput(f"{path}: a property of the vertices that is no single number; write the file again")
     kinds = ["i8" if "char" in row[1] or "int" in row[1] else "f8" for row in properties]
-    with path.open("rb") as file:
-        if not any(line.strip() for line in islice(file, len(head), None)):
-            raise BadInput(f"{path}: cut off after its header; write or copy it again")
-    try:
-        rows = np.loadtxt(path, np.float64, skiprows=len(head), max_rows=int(elements[0][2]), ndmin=2)
-    except ValueError as error:
-        raise BadInput(f"{path}: not whole: {' '.join(str(error).split())}") from error
-    if rows.shape != (int(elements[0][2]), len(properties)):
+    count = int(elements[0][2]) if len(elements[0][2]) < 19 else 0
+    with path.open(encoding="latin-1", newline="\n") as file:
+        lines = (line for line in islice(file, len(head), None) if line.strip())
+        if not (first := list(islice(lines, 1))) or not count:
+            raise BadInput(f"{path}: no points after its header; write or copy it again")
+        try:
+            rows = np.loadtxt(islice(chain(first, lines), count), np.float64, comments=None, ndmin=2)
+        except ValueError as error:
+            raise BadInput(f"{path}: not whole: {' '.join(str(error).split())}") from error
+    if rows.shape != (count, len(properties)):
         raise BadInput(f"{path}: {rows.shape[0]} rows of {rows.shape[1]} numbers, not what its header says")
     with np.errstate(invalid="ignore"):  # a colour that is not finite
         columns = [rows[:, at].astype(kind) for at, kind in enumerate(kinds)]

@@ -137,6 +137,9 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
         said = SYSTEM.search(str(error))
         code = int(said[1]) if said else errno.EIO
         raise OSError(code, os.strerror(code), str(part)) from error
+    mask = os.umask(0o077)  # it can only be read by being set
+    os.umask(mask)
+    os.chmod(part, 0o666 & ~mask)  # safetensors lets nobody else read its files
     with open(part, "rb+") as file:
         os.fsync(file.fileno())
 
