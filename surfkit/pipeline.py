@@ -253,7 +253,7 @@ def lower(given: Material, why: str) -> bool:
     """Make the caches smaller, and say so; False if they are as small as can be."""
     found = given.lower()
     if found is not None:
-        before, after = (f"{count / 1e6:.0f} MB" for count in found)
+        before, after = (f"{count / 1e6:.3g} MB" for count in found)
         emit(Warned(f"{why}; photographs, masks and depth priors in memory are lowered from {before} to {after}"))
     return found is not None
 
@@ -317,6 +317,7 @@ def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer)
         correct_color=this.recipe.pretrain.appearance is not None,
         masks=mask_cache(scene.held_out, ahead),
     )
+    memory = read_record(this.out).get("memory_bytes") or {}
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
@@ -324,8 +325,8 @@ def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer)
         "steps": state.index,
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
-        "peak_memory_bytes": state.peak_memory_bytes or None,
-        "memory_bytes": read_record(this.out).get("memory_bytes"),
+        "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,
+        "memory_bytes": memory,
     }
     write_json(this.metrics, metrics)
     emit(FileWritten(this.metrics, "metrics"))

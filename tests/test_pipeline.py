@@ -60,6 +60,18 @@ def test_a_run_leaves_everything_behind(finished, data, recipe):
     assert not list(out.rglob(".*")), "nothing half-written stays"
 
 
+def test_memory_is_told_by_part(finished):
+    out, metrics = finished
+    parts = dict(metrics["memory_bytes"])
+    assert json.loads((out / "run.json").read_text())["memory_bytes"] == parts
+    peak = parts.pop("peak")
+    assert peak <= metrics["peak_memory_bytes"] and sum(parts.values()) == peak and min(parts.values()) >= 0
+    assert parts["photographs"] == 10 * 64 * 48 * 3
+    state = load_run(out)[1]
+    end = sum(value.nbytes for group in vars(state.points).values() for value in group.values())
+    assert end / 2 <= parts["points"] <= 2 * end and parts["program"] > 50e6
+
+
 def test_points_are_in_the_frame_of_the_input(finished, data):
     out, metrics = finished
     table, scene = read_splats(out / "point_cloud.ply"), read(data)
@@ -200,8 +212,10 @@ def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
         load_run(tmp_path)
 
 
-def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path, store=Store("20KB"))  # two photographs of 64 x 48
+@pytest.mark.parametrize("copies", [False, True])
+def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path, copies):
+    metrics = run(recipe, data, tmp_path, store=Store("20KB", copies))  # two photographs of 64 x 48
+    assert (data.path / "resized").exists() == copies
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
     assert metrics["images"] == finished[1]["images"]
     with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):

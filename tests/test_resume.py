@@ -1,5 +1,6 @@
 """Runs that are interrupted, made longer, damaged, or met by what gives out."""
 
+import errno
 import json
 import os
 import resource
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from surfkit import pipeline
+from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core import journal, lock
 from surfkit.core.check import BadInput, Fault
@@ -21,7 +23,7 @@ from surfkit.evaluate import images
 from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint
+from surfkit.train import checkpoint, stage
 
 STEPS = 24
 
@@ -281,10 +283,89 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
 
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.Trainer, "step", short)
-        with pytest.raises(Fault, match="out of memory.*--longest"):
+        with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
             run(recipe, data, tmp_path / "run", every=Every(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
     run(recipe, data, tmp_path / "run")
+
+
+@pytest.mark.parametrize("photographs", [3, 1])
+def test_out_of_memory_lowers_the_cache_first(data, recipe, tmp_path, monkeypatch, photographs):
+    """As long as more photographs than some are kept, memory is short, in the middle of a step; nothing is lost."""
+    whole, out, update = tmp_path / "whole", tmp_path / "run", stage.adam_step
+    run(recipe, data, whole)
+    kept = []
+
+    def short(points, grads, rates, index):
+        update(points, grads, rates, index)
+        kept.append(given[0].photos.bytes)
+        if index == 13 and kept[-1] > photographs * 40 * 30 * 3:
+            raise MemoryError
+
+    given, read_ahead = [], pipeline.read_ahead
+    monkeypatch.setattr(pipeline, "read_ahead", lambda *args: given.append(read_ahead(*args)) or given[-1])
+    monkeypatch.setattr(stage, "adam_step", short)
+    run(recipe, data, out, every=Every(10))
+    times = {3: 1, 1: 2}[photographs]
+    assert len(notes(out)) == times and kept[-1] <= photographs * 40 * 30 * 3 < kept[11]
+    assert all(text.startswith("step 13: out of memory; photographs, masks and depth priors in") for text in notes(out))
+    assert (out / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    assert steps(out) == list(range(1, STEPS + 1))
+
+
+def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkeypatch):
+    free = iter([1 << 30, 100 << 20])  # looked at every ten steps
+    monkeypatch.setattr(pipeline, "free_bytes", lambda: next(free))
+    assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
+    assert len(notes(tmp_path / "run")) == 1
+    assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")
+
+
+@pytest.mark.parametrize("name", ["point_cloud.ply", "metrics.json", "view_000.png.png", "run.json"])
+def test_a_disk_that_is_full_at_the_end(data, recipe, tmp_path, monkeypatch, name):
+    out, replace = tmp_path / "run", os.replace
+    run(recipe, data, out)
+    wanted = {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()}
+    (out / "metrics.json").unlink()
+    (out / "point_cloud.ply").unlink()
+
+    def full(old, new):
+        if os.path.basename(new) == name:
+            raise OSError(errno.ENOSPC, "No space left on device", str(new))
+        replace(old, new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        with pytest.raises(Fault, match=rf"{name}: the disk is full .* last checkpoint in .*run is whole: free some"):
+            run(recipe, data, out)
+    assert not list(out.rglob(".*")) and not (out / "metrics.json").exists()
+    assert checkpoint.load(out / "pretrain" / "checkpoint.safetensors").index == STEPS
+    run(recipe, data, out)
+    assert {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()} == wanted
+
+
+def test_commands_on_a_run_folder_take_its_lock(data, recipe, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    out = tmp_path / "run"
+    run(recipe, data, out)
+    with held(out):
+        for words in (["evaluate", str(out)], ["export", str(out)]):
+            assert main(words) == 2 and f"process {os.getpid()} on" in capsys.readouterr().err
+        assert main(["export", str(out), "--out", str(tmp_path / "a.ply")]) == 0
+    assert main(["evaluate", str(out)]) == main(["export", str(out)]) == 0
+    assert main(["evaluate", str(tmp_path / "nowhere")]) == 2 and not (tmp_path / "nowhere").exists()
+
+
+def test_checkpoints_can_be_read_by_whom_the_umask_lets(data, recipe, tmp_path):
+    for mask, mode in ((0o022, 0o644), (0o027, 0o640)):
+        before = os.umask(mask)
+        try:
+            run(with_steps(recipe, 1), data, tmp_path / f"run-{mode}")
+            assert os.umask(mask) == mask
+        finally:
+            os.umask(before)
+        path = tmp_path / f"run-{mode}" / "pretrain" / "checkpoint.safetensors"
+        assert path.stat().st_mode & 0o777 == mode
 
 
 def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):

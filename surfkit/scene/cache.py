@@ -65,6 +65,11 @@ class Cache(Sequence, Generic[T]):
         self._fetch()
         try:
             return future.result()
+        except BaseException:
+            if self._kept.get(at) is future:  # what went wrong may not go wrong again
+                del self._kept[at]
+                self._bytes -= self._sizes[at]
+            raise
         finally:
             del self._needed[at]
 

@@ -51,7 +51,8 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Whether memory gave out, of the processor or of the device."""
     if isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError)):
         return True
-    return isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
+    known = isinstance(error, RuntimeError) and not isinstance(error, Fault)
+    return known and any(words in str(error).lower() for words in NO_MEMORY)
 
 
 @contextmanager
