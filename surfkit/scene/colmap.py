@@ -111,7 +111,8 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
         raise BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP")
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    finite = np.isfinite(xyz.astype(np.float32)).all(1)
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(xyz.astype(np.float32)).all(1)
     if not finite.any():
         raise BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again")
     if not finite.all():
@@ -126,6 +127,12 @@ def _reconstruction(folder: Path) -> Any:
         refuse_cut_off(folder)
     try:
         model = library().Reconstruction(str(folder))
+        for image in model.images.values():
+            image.name  # noqa: B018 (is decoded here)
+    except UnicodeDecodeError as error:
+        raise BadInput(
+            f"{folder}: the name of an image is not UTF-8 ({error.object!r}); rename the photograph, also in the model"
+        ) from error
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         if "model does not exist" in str(error):
             raise BadInput(
