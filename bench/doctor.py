@@ -1,6 +1,6 @@
 """How near the estimate of `surfkit doctor` is to what a run takes, once its number of points is known.
 
-Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, and not that
+Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, not that
 of the rule of thumb for points. On a machine that does other things, compare times by their processor time only.
 
 Usage: python bench/doctor.py [--data examples/boruszyn] [--steps 1000] [--scale 4]
@@ -20,7 +20,7 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, forecast
-from surfkit.pipeline import run, with_steps
+from surfkit.pipeline import Every, run, with_steps
 from surfkit.scene.data import Data
 
 
@@ -28,7 +28,7 @@ def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:
     """One run, in a process of its own, so that its peak of memory is its own too."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, "cpu", pictures_every=0)
+        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, "cpu", Every(pictures=0))
         disk = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     answer.put({**{key: metrics[key] for key in ("points", "seconds")}, "memory": peak_memory_bytes(), "disk": disk})
 
