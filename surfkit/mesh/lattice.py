@@ -48,8 +48,8 @@ class Lattice:
     def offsets(self, camera: Camera) -> np.ndarray:
         """(3, 512) float32 camera coordinates of the voxels of a block, x fastest, less those of the first."""
         z, y, x = np.indices((SIDE, SIDE, SIDE)).reshape(3, -1)
-        turn = camera.world_to_camera[:3, :3].numpy().astype(np.float64)
-        return (turn @ (np.stack([x, y, z]) * self.voxel)).astype(np.float32)
+        turn = camera.world_to_camera[:3, :3].numpy()[:, :, None] * self.voxel
+        return (turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z).astype(np.float32)
 
     @property
     def lengths(self) -> list[float]:

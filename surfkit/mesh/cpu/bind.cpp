@@ -30,12 +30,12 @@ nb::ndarray<nb::numpy, T> given(std::vector<T>&& values, std::vector<size_t> sha
     return nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner);
 }
 
-FuseBlock kernel(const std::string& name) {
+const FuseKernels& named(const std::string& name) {
 #if defined(SURFKIT_X86)
-    if (name == "avx512") return fuse_block_avx512;
-    if (name == "avx2") return fuse_block_avx2;
+    if (name == "avx512") return fuse_kernels_avx512();
+    if (name == "avx2") return fuse_kernels_avx2();
 #endif
-    return fuse_block_baseline;
+    return fuse_kernels_baseline();
 }
 
 Pose pose_of(const std::vector<double>& m) {  // 4 x 4 by rows
@@ -68,7 +68,7 @@ void add_mesh(nb::module_& m) {
                  job.fade = (float)lengths.at(2);
                  const Pose p = pose_of(pose);
                  nb::gil_scoped_release free;
-                 return self.fuse(job, p, carve, kernel(kernels), threads);
+                 return self.fuse(job, p, carve, named(kernels), threads);
              })
         .def("surface",
              [](const Grid& self, Table triangles, Whole edges, int least_weight, std::vector<int64_t> end,

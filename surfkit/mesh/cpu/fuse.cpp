@@ -1,11 +1,11 @@
-// Compiled for AVX-512, AVX2 and the baseline with SURFKIT_KERNELS naming the function. Plain loops over one layer of a
+// Compiled for AVX-512, AVX2 and the baseline with SURFKIT_KERNELS naming the table. Plain loops over one layer of a
 // block, which compilers turn into vectors; without contraction, so that all three give the same bits.
 #include "fuse.h"
 
-#include <cmath>
+#include <algorithm>
 
 #define SURFKIT_PASTE(a, b) a##b
-#define SURFKIT_FUSE(name) SURFKIT_PASTE(fuse_block_, name)
+#define SURFKIT_TABLE(name) SURFKIT_PASTE(fuse_kernels_, name)
 
 namespace surfkit {
 namespace {
@@ -83,11 +83,9 @@ inline void interpolate(const FuseJob& job, Samples& s) {
     }
 }
 
-}  // namespace
-
-void SURFKIT_FUSE(SURFKIT_KERNELS)(const FuseJob& job, const float* first, uint32_t seed, Block& block) {
+void fuse_block(const FuseJob& job, const float* first, uint32_t seed, Block& block) {
     Samples s;
-    alignas(64) float share[kLayer], color_share[kLayer], distance[kLayer];
+    alignas(64) float share[kLayer], color_share[kLayer], distance[kLayer], weight[kLayer];
     alignas(64) uint32_t noise[kLayer];
     alignas(64) int32_t changed[kLayer];
     const float far = -job.truncation, per_truncation = 1.0f / job.truncation;
@@ -98,7 +96,6 @@ void SURFKIT_FUSE(SURFKIT_KERNELS)(const FuseJob& job, const float* first, uint3
         interpolate(job, s);
         int16_t* const d = block.distance + layer * kLayer;
         uint16_t* const w = block.weight + layer * kLayer;
-        int32_t some = 0;
         for (int i = 0; i < kLayer; i++) {
             const float sdf = s.depth[i] - s.z[i];
             const float fall = (job.truncation + sdf) * per_fade;
@@ -108,15 +105,17 @@ void SURFKIT_FUSE(SURFKIT_KERNELS)(const FuseJob& job, const float* first, uint3
             const float before = (float)w[i], sum = before + added;
             const float scaled = sdf * per_truncation;
             const float sure = sum > 0 ? sum : 1.0f;
-            changed[i] = added > 0;
-            some |= changed[i];
+            changed[i] = added > 0 ? 1 : 0;
             distance[i] = (scaled < 1.0f ? scaled : 1.0f) * kSteps;
             share[i] = added / sure;
             color_share[i] = added / (sure < kMostColorWeight ? sure : kMostColorWeight);
             noise[i] = scrambled(seed + (uint32_t)(layer * kLayer + i) * 0x9e3779b9u + (uint32_t)before * 0x85ebca6bu);
-            w[i] = changed[i] ? (uint16_t)(sum < kMostWeight ? sum : kMostWeight) : w[i];
+            weight[i] = sum < kMostWeight ? sum : kMostWeight;
         }
+        int32_t some = 0;
+        for (int i = 0; i < kLayer; i++) some |= changed[i];
         if (!some) continue;
+        for (int i = 0; i < kLayer; i++) w[i] = changed[i] ? (uint16_t)(int32_t)weight[i] : w[i];
         for (int i = 0; i < kLayer; i++) {
             const float old = (float)d[i];
             const float mean = old + (distance[i] - old) * share[i];
@@ -135,6 +134,59 @@ void SURFKIT_FUSE(SURFKIT_KERNELS)(const FuseJob& job, const float* first, uint3
             }
         }
     }
+}
+
+constexpr int kPiece = 64;  // pixels
+
+void reach_piece(const RowJob& job, int from, int count, uint64_t* low_key, uint64_t* high_key) {
+    int32_t low[3][kPiece], high[3][kPiece], there[kPiece];
+    const float* depth = job.depth + from;
+    const uint32_t* shade = job.shade + from;
+    double u[kPiece], v[kPiece], w[kPiece];
+    for (int i = 0; i < count; i++) {
+        const double d = depth[i];
+        there[i] = (d > 0 ? 1 : 0) & (shade[i] >> 24 ? 1 : 0);
+        w[i] = d * job.per_block;
+        u[i] = ((double)(from + i) + 0.5 - job.cx) / job.fx * w[i];
+        v[i] = job.row * w[i];
+    }
+    const double most = kBlockBias - 1;
+    for (int axis = 0; axis < 3; axis++) {
+        const double* r = job.turn[axis];
+        for (int i = 0; i < count; i++) {
+            const double at = r[0] * u[i] + r[1] * v[i] + r[2] * w[i] + job.eye[axis];
+            const double a = at - job.reach, b = at + job.reach;
+            const double from_block = a < -most ? -most : a > most ? most : a;
+            const double to_block = b < -most ? -most : b > most ? most : b;
+            const int32_t first = (int32_t)(from_block + kBlockBias) - kBlockBias;  // rounded down
+            const int32_t last = (int32_t)(to_block + kBlockBias) - kBlockBias;
+            low[axis][i] = first > job.low[axis] ? first : job.low[axis];
+            high[axis][i] = last < job.high[axis] ? last : job.high[axis];
+            there[i] &= low[axis][i] <= high[axis][i] ? 1 : 0;
+        }
+    }
+    for (int i = 0; i < count; i++) {
+        const uint64_t z = (uint32_t)(low[2][i] + kBlockBias), y = (uint32_t)(low[1][i] + kBlockBias),
+                       x = (uint32_t)(low[0][i] + kBlockBias);
+        low_key[i] = there[i] ? z << 2 * kBlockBits | y << kBlockBits | x : kNoKey;
+    }
+    for (int i = 0; i < count; i++) {
+        const uint64_t z = (uint32_t)(high[2][i] + kBlockBias), y = (uint32_t)(high[1][i] + kBlockBias),
+                       x = (uint32_t)(high[0][i] + kBlockBias);
+        high_key[i] = there[i] ? z << 2 * kBlockBits | y << kBlockBits | x : kNoKey;
+    }
+}
+
+void reach_row(const RowJob& job, uint64_t* low, uint64_t* high) {
+    for (int at = 0; at < job.width; at += kPiece)
+        reach_piece(job, at, std::min(kPiece, job.width - at), low + at, high + at);
+}
+
+}  // namespace
+
+const FuseKernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
+    static const FuseKernels table{fuse_block, reach_row};
+    return table;
 }
 
 }  // namespace surfkit

@@ -25,12 +25,31 @@ struct FuseJob {
     float truncation, jump, fade;  // fade: depth behind the surface at which the weight begins to fall
 };
 
-using FuseBlock = void (*)(const FuseJob& job, const float* first, uint32_t seed, Block& block);
+constexpr int kBlockBits = 17;
+constexpr int kBlockBias = 1 << (kBlockBits - 1);  // blocks along each axis, to either side of the origin
+constexpr uint64_t kNoKey = ~uint64_t{0};
 
-void fuse_block_baseline(const FuseJob& job, const float* first, uint32_t seed, Block& block);
+// A row of pixels, and how it lies among the blocks. Lengths are in blocks.
+struct RowJob {
+    const float* depth;
+    const uint32_t* shade;
+    int width;
+    double row, fx, cx, per_block;    // row: y of the ray at z = 1
+    double turn[3][3], eye[3], reach;  // turn: axis of the world, then of the camera
+    int32_t low[3], high[3];           // blocks that may be made, both ends included
+};
+
+struct FuseKernels {
+    // Fuse a view into a block whose first voxel lies at `first` in the camera's frame.
+    void (*block)(const FuseJob& job, const float* first, uint32_t seed, Block& block);
+    // Keys of the first and the last block within reach of what each pixel shows; kNoKey for none.
+    void (*row)(const RowJob& job, uint64_t* low, uint64_t* high);
+};
+
+const FuseKernels& fuse_kernels_baseline();
 #if defined(SURFKIT_X86)
-void fuse_block_avx2(const FuseJob& job, const float* first, uint32_t seed, Block& block);
-void fuse_block_avx512(const FuseJob& job, const float* first, uint32_t seed, Block& block);
+const FuseKernels& fuse_kernels_avx2();
+const FuseKernels& fuse_kernels_avx512();
 #endif
 
 }  // namespace surfkit

@@ -123,78 +123,80 @@ void Grid::insert(uint64_t key) {
 }
 
 // Keys of the blocks within reach of what the pixels show, some of them several times.
-std::vector<uint64_t> Grid::seen_by(const FuseJob& job, const Pose& pose, int threads) const {
+std::vector<uint64_t> Grid::seen_by(const FuseJob& job, const Pose& pose, const FuseKernels& kernels,
+                                    int threads) const {
+    RowJob all{};
+    all.width = job.width;
+    all.fx = job.fx;
+    all.cx = job.cx;
+    all.per_block = 1 / (voxel_ * kSide);
+    all.reach = reach_ * all.per_block;
+    for (int axis = 0; axis < 3; axis++) {
+        for (int row = 0; row < 3; row++) {
+            all.turn[axis][row] = pose.turn[row][axis];
+            all.eye[axis] -= pose.turn[row][axis] * pose.shift[row] * all.per_block;
+        }
+        all.low[axis] = (int32_t)low_[axis];
+        all.high[axis] = (int32_t)high_[axis] - 1;
+    }
     const int pieces = (job.height + kRows - 1) / kRows;
     std::vector<std::vector<uint64_t>> found(pieces);
-    const double per_block = 1 / (voxel_ * kSide), reach = reach_ * per_block;
-    const auto& r = pose.turn;
-    double eye[3];
-    for (int axis = 0; axis < 3; axis++)
-        eye[axis] = -(r[0][axis] * pose.shift[0] + r[1][axis] * pose.shift[1] + r[2][axis] * pose.shift[2]) * per_block;
     parallel(pieces, threads, [&](int64_t piece) {
-        struct Span {
-            uint64_t low, high;
-        };
-        std::vector<Span> above(job.width, Span{~0ull, ~0ull});
+        const size_t width = (size_t)job.width;
+        std::vector<uint64_t> low(2 * width, kNoKey), high(2 * width, kNoKey);  // this row and the one above, in turns
         std::vector<uint64_t>& keys = found[piece];
+        RowJob row = all;
         const int end = std::min(job.height, (int)(piece + 1) * kRows);
         for (int y = (int)piece * kRows; y < end; y++) {
-            Span left{~0ull, ~0ull};
-            const float* depth = job.depth + (int64_t)y * job.width;
-            const uint32_t* shade = job.shade + (int64_t)y * job.width;
-            for (int x = 0; x < job.width; x++) {
-                const double d = depth[x];
-                if (!(d > 0) || !(shade[x] >> 24)) continue;
-                const double u = (x + 0.5 - job.cx) / job.fx * d * per_block;
-                const double v = (y + 0.5 - job.cy) / job.fy * d * per_block, w = d * per_block;
-                int64_t low[3], high[3];
-                bool there = true;
-                for (int axis = 0; axis < 3; axis++) {
-                    const double at = r[0][axis] * u + r[1][axis] * v + r[2][axis] * w + eye[axis];
-                    low[axis] = std::max((int64_t)std::floor(at - reach), low_[axis]);
-                    high[axis] = std::min((int64_t)std::floor(at + reach), high_[axis] - 1);
-                    there &= low[axis] <= high[axis];
-                }
-                if (!there) continue;
-                const Span here{pack(low[0], low[1], low[2]), pack(high[0], high[1], high[2])};
-                const bool known = (here.low == left.low && here.high == left.high) ||
-                                   (here.low == above[x].low && here.high == above[x].high);
-                left = above[x] = here;
-                if (known) continue;
-                for (int64_t k = low[2]; k <= high[2]; k++)
-                    for (int64_t j = low[1]; j <= high[1]; j++)
-                        for (int64_t i = low[0]; i <= high[0]; i++) keys.push_back(pack(i, j, k));
+            row.depth = job.depth + (int64_t)y * job.width;
+            row.shade = job.shade + (int64_t)y * job.width;
+            row.row = (y + 0.5 - job.cy) / job.fy;
+            const size_t here = y % 2 * width, above = (y + 1) % 2 * width;
+            kernels.row(row, &low[here], &high[here]);
+            uint64_t left_low = kNoKey, left_high = kNoKey;
+            for (size_t x = 0; x < width; x++) {
+                const uint64_t a = low[here + x], b = high[here + x];
+                const bool known = (a == left_low && b == left_high) || (a == low[above + x] && b == high[above + x]);
+                left_low = a, left_high = b;
+                if (known || a == kNoKey) continue;
+                for (int64_t k = part(a, 2); k <= part(b, 2); k++)
+                    for (int64_t j = part(a, 1); j <= part(b, 1); j++)
+                        for (int64_t i = part(a, 0); i <= part(b, 0); i++) keys.push_back(pack(i, j, k));
             }
         }
     });
-    std::vector<uint64_t> all;
-    for (const auto& keys : found) all.insert(all.end(), keys.begin(), keys.end());
-    return all;
+    std::vector<uint64_t> joined;
+    for (const auto& keys : found) joined.insert(joined.end(), keys.begin(), keys.end());
+    return joined;
 }
 
 // Blocks that the view may see, and that are not wholly behind what it sees.
-std::vector<int64_t> Grid::in_sight(const FuseJob& job, const Pose& pose) const {
-    const Coarse coarse(job, 1);
+std::vector<int64_t> Grid::in_sight(const FuseJob& job, const Pose& pose, int threads) const {
+    const Coarse coarse(job, threads);
     const double side = voxel_ * kSide, radius = side * 0.8661, middle = (kSide - 1) * 0.5 * voxel_;
-    std::vector<int64_t> found;
-    for (size_t index = 0; index < keys_.size(); index++) {
-        double world[3], at[3];
-        for (int axis = 0; axis < 3; axis++) world[axis] = part(keys_[index], axis) * side + middle;
-        for (int row = 0; row < 3; row++) {
-            const double* r = pose.turn[row];
-            at[row] = r[0] * world[0] + r[1] * world[1] + r[2] * world[2] + pose.shift[row];
+    const int64_t piece = 1024, count = blocks();
+    std::vector<std::vector<int64_t>> found((count + piece - 1) / piece);
+    parallel((int64_t)found.size(), threads, [&](int64_t at_piece) {
+        for (int64_t index = at_piece * piece; index < std::min(count, (at_piece + 1) * piece); index++) {
+            double world[3], at[3];
+            for (int axis = 0; axis < 3; axis++) world[axis] = part(keys_[index], axis) * side + middle;
+            for (int row = 0; row < 3; row++) {
+                const double* r = pose.turn[row];
+                at[row] = r[0] * world[0] + r[1] * world[1] + r[2] * world[2] + pose.shift[row];
+            }
+            const float most = coarse.under(job, at, radius);
+            if (most > 0 && at[2] - radius < most + job.truncation) found[at_piece].push_back(index);
         }
-        if (at[2] - radius < coarse.under(job, at, radius) + job.truncation && at[2] + radius > 0 &&
-            coarse.under(job, at, radius) > 0)
-            found.push_back((int64_t)index);
-    }
-    return found;
+    });
+    std::vector<int64_t> joined;
+    for (const auto& some : found) joined.insert(joined.end(), some.begin(), some.end());
+    return joined;
 }
 
-bool Grid::fuse(const FuseJob& job, const Pose& pose, bool carve, FuseBlock kernel, int threads) {
+bool Grid::fuse(const FuseJob& job, const Pose& pose, bool carve, const FuseKernels& kernels, int threads) {
     std::vector<int64_t> touched;
     std::vector<uint64_t> fresh;
-    for (const uint64_t key : seen_by(job, pose, threads)) {
+    for (const uint64_t key : seen_by(job, pose, kernels, threads)) {
         const int64_t index = find(key);
         if (index < 0)
             fresh.push_back(key);
@@ -208,7 +210,7 @@ bool Grid::fuse(const FuseJob& job, const Pose& pose, bool carve, FuseBlock kern
         if (!carve) touched.push_back(blocks());
         insert(key);
     }
-    if (carve) touched = in_sight(job, pose);
+    if (carve) touched = in_sight(job, pose, threads);
     std::sort(touched.begin(), touched.end());
     touched.erase(std::unique(touched.begin(), touched.end()), touched.end());
     const int64_t piece = 16, count = (int64_t)touched.size();
@@ -222,7 +224,7 @@ bool Grid::fuse(const FuseJob& job, const Pose& pose, bool carve, FuseBlock kern
                 first[row] = (float)(r[0] * (part(key, 0) * side) + r[1] * (part(key, 1) * side) +
                                      r[2] * (part(key, 2) * side) + pose.shift[row]);
             }
-            kernel(job, first, (uint32_t)mixed(key), block(touched[i]));
+            kernels.block(job, first, (uint32_t)mixed(key), block(touched[i]));
         }
     });
     return true;

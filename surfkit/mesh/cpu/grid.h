@@ -9,9 +9,6 @@
 
 namespace surfkit {
 
-constexpr int kBlockBits = 17;
-constexpr int64_t kBlockBias = int64_t{1} << (kBlockBits - 1);  // blocks along each axis, to either side of the origin
-
 struct Triangles {
     std::vector<float> vertices;   // 3 each
     std::vector<uint8_t> colors;   // 3 each
@@ -38,7 +35,7 @@ class Grid {
 
     // Make the blocks that a view needs and fuse it into them, or with `carve` into all that it sees. False, and
     // nothing is done, if there would be more than `most_blocks`.
-    bool fuse(const FuseJob& job, const Pose& pose, bool carve, FuseBlock kernel, int threads);
+    bool fuse(const FuseJob& job, const Pose& pose, bool carve, const FuseKernels& kernels, int threads);
 
     // The surface where the weight of all voxels around is at least `least_weight`; of cells below `end` alone.
     Triangles surface(const CubeTable& table, int least_weight, const int64_t end[3], bool with_edges,
@@ -62,8 +59,8 @@ class Grid {
     int64_t find(uint64_t key) const;
     void insert(uint64_t key);
     void rehash(size_t size);
-    std::vector<uint64_t> seen_by(const FuseJob& job, const Pose& pose, int threads) const;
-    std::vector<int64_t> in_sight(const FuseJob& job, const Pose& pose) const;
+    std::vector<uint64_t> seen_by(const FuseJob& job, const Pose& pose, const FuseKernels& kernels, int threads) const;
+    std::vector<int64_t> in_sight(const FuseJob& job, const Pose& pose, int threads) const;
 
     double voxel_, reach_;
     int64_t low_[3], high_[3], most_blocks_;

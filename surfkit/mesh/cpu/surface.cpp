@@ -128,7 +128,7 @@ Triangles Grid::surface(const CubeTable& table, int least_weight, const int64_t 
                 }
                 if (with_edges) {
                     int64_t name = axis;
-                    for (int i = 2; i >= 0; i--) name = name << 20 | (base[i] + p[i] + (kBlockBias << 3));
+                    for (int i = 2; i >= 0; i--) name = name << 20 | (base[i] + p[i] + (int64_t)kBlockBias * kSide);
                     out.edges[vertex] = name;
                 }
                 vertex++;
