@@ -15,8 +15,8 @@ from surfkit.scene.scene import Frame
 Length = float | Literal["auto"]
 SAMPLED = 16
 """Views that automatic lengths are taken from."""
-PIXELS = 2.0
-"""Automatic voxels are this many pixels wide, at the median depth of the median view."""
+PIXELS = 1.0
+"""Automatic voxels are this many pixels wide, at the median depth of the median view, or larger: see tsdf.py."""
 VOXELS = 4.0
 """Automatic truncation."""
 DEPTHS = 2.0

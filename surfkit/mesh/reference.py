@@ -77,7 +77,8 @@ class ReferenceGrid(Grid):
         pose = camera.world_to_camera.numpy()
         start = unpack(self.keys[rows]) * (self.lattice.voxel * SIDE)
         x0, y0, z0 = (
-            (((r[0] * start[:, 0] + r[1] * start[:, 1]) + r[2] * start[:, 2]) + r[3]).astype(F)[:, None] for r in pose[:3]
+            (((r[0] * start[:, 0] + r[1] * start[:, 1]) + r[2] * start[:, 2]) + r[3]).astype(F)[:, None]
+            for r in pose[:3]
         )
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             z = z0 + offsets[2]

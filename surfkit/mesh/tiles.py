@@ -12,13 +12,15 @@ from surfkit.raster.api import Splats
 
 GRID_BYTES = 1.05 * BLOCK_BYTES
 """Of a block, its place in the table included."""
+BLOCK_TRIANGLES = 60
+"""Of a block, about; and half as many vertices."""
 MESH_BYTES = 5_000
-"""Most that the triangles of a block take while they are joined: 40 vertices and 80 faces, twice, and their names."""
+"""Most that these take while tiles are joined: everything twice, and the names of the vertices."""
 SHARE = 0.5
 """Of the memory budget that a grid may take; the rest is for the triangles."""
 DENSE = 4
 """Splats in a cell from which it is taken for covered."""
-THICK = 1.6
+THICK = 3.0
 """Blocks for each that a surface passes through."""
 
 

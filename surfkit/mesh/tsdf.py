@@ -13,9 +13,12 @@ from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, told
+from surfkit.mesh.lengths import VOXELS, Length, Lengths, check_length, resolve, told
 from surfkit.mesh.picture import Which, depth_of, picture
-from surfkit.mesh.tiles import GRID_BYTES, MESH_BYTES, SHARE, estimate, plan
+from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
+
+AUTO_TRIANGLES = 10_000_000
+"""About as many as an automatic voxel gives at most."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,8 @@ class TSDF(Mesher):
     """Fuse the depth of every training view into a grid of signed distances (Curless and Levoy 1996; KinectFusion)."""
 
     voxel: Length = "auto"
-    """Side of a voxel, metres; auto is two pixels at the median depth."""
+    """Side of a voxel, metres; auto is one pixel at the median depth, or as large as it takes to get no more than about
+    ten million triangles."""
 
     truncation: Length = "auto"
     """Distance from a surface over which it is averaged, metres; auto is four voxels. Walls thinner than this may get
@@ -51,17 +55,10 @@ class TSDF(Mesher):
         """See `Mesher.mesh`."""
         if not len(subject.splats) or not subject.views:
             raise BadInput("nothing to mesh: there are no splats or no views")
-        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth)
-        if "auto" in (self.voxel, self.truncation, self.depth_limit):
-            emit(Warned(f"meshing with {words(lengths, subject)}"))
+        lengths, found = self._lengths(subject)
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)
-        centres = torch.stack([camera.centre for camera in cameras]).numpy()
-        within = centres.min(0) - 2 * lengths.limit, centres.max(0) + 2 * lengths.limit
-        refuse_too_fine(lengths, subject, np.abs(within).max())
-        found = estimate(subject.splats, lengths.voxel, within)
-        refuse_too_large(lengths, subject, found.total)
 
         def see(at: int) -> Picture:
             maps = subject.draw(subject.views[at])
@@ -80,6 +77,24 @@ class TSDF(Mesher):
                 "lower --mesh.least-views, or train for more steps"
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | {"tiles": tiles})
+
+    def _lengths(self, subject: Subject) -> tuple[Lengths, Estimate]:
+        """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
+        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth)
+        centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
+        within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
+        found = estimate(subject.splats, lengths.voxel, within)
+        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, int(subject.budget_bytes / MESH_BYTES))
+        while self.voxel == "auto" and found.total > most:
+            coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
+            cut = VOXELS * coarser if self.truncation == "auto" else max(lengths.truncation, 2 * coarser)
+            lengths = Lengths(coarser, cut, lengths.limit)
+            found = estimate(subject.splats, coarser, within)
+        refuse_too_fine(lengths, subject, np.abs(within).max())
+        refuse_too_large(lengths, subject, found.total)
+        if "auto" in (self.voxel, self.truncation, self.depth_limit):
+            emit(Warned(f"meshing with {words(lengths, subject)}"))
+        return lengths, found
 
 
 def words(lengths: Lengths, subject: Subject) -> str:
@@ -114,7 +129,7 @@ def refuse_too_large(lengths: Lengths, subject: Subject, blocks: int) -> None:
     if needed > subject.budget_bytes:
         least = lengths.voxel * (needed / subject.budget_bytes) ** 0.5
         raise BadInput(
-            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * 80 / 1e6:.0f} million triangles, which "
+            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million triangles, which "
             f"take {needed / 1e9:.1f} GB, and {subject.budget_bytes / 1e9:.1f} GB may be used; give "
             f"--mesh.voxel {told(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more --memory"
         )
