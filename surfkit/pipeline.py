@@ -23,6 +23,7 @@ from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
 from surfkit.folder import Run, claim, discard, noted, refuse_changed, refuse_file, refuse_other, say
+from surfkit.mesh.base import Subject
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
@@ -37,7 +38,9 @@ from surfkit.scene.photos import photo_cache
 from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
+from surfkit.surface import Delivery, deliver, meshed
 from surfkit.train import checkpoint
+from surfkit.train.bars import bars
 from surfkit.train.faults import MOST_HALVINGS, Diverged, in_one_line
 from surfkit.train.interrupt import graceful
 from surfkit.train.progress import Display
@@ -96,7 +99,7 @@ def run(
     pictures_every = max(1, recipe.pretrain.steps // 5) if pictures_every is None else pictures_every
     refuse_file(out)
     budget = cache_bytes(cache)
-    with noted() as notes, held(out), in_one_line(out):
+    with noted() as notes, held(out), in_one_line(out), bars():
         sweep(out)
         refuse_other(this)
         scene = read(this.data)
@@ -109,14 +112,16 @@ def run(
         claim(this, backend, prints, notes)
         with kept(out):
             if unfinished:
-                discard(this.metrics, this.cloud)
+                discard(this.metrics, this.cloud, this.mesh_record)
                 every = Every(checkpoint_every, pictures_every)
                 state = optimise(this, scene, rasterizer, state, every, given)
-            elif this.metrics.exists() and this.cloud.exists():
+            elif this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
                 return read_json(this.metrics, Any)
             if not this.cloud.exists():
                 export(this, state, scene)
+            if not meshed(this, state.index):
+                mesh(this, state, subject(this, state, scene, rasterizer, budget))
             return evaluate(this, state, scene, rasterizer, budget)
 
 
@@ -256,6 +261,33 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     params = this.recipe.pretrain.finished(state)
     write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame))
     emit(FileWritten(this.cloud, "points"))
+
+
+def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int) -> Subject:
+    """The splats of a state, to be meshed."""
+    stage = this.recipe.pretrain
+    splats = this.recipe.primitive.shape(stage.finished(state), state.sh_degree)
+    masks = mask_cache(scene.train, budget_bytes // 4)
+    return Subject(
+        splats=splats,
+        views=scene.train,
+        draw=lambda view: rasterizer.render(splats, view.camera, stage.near, distortion=False).maps,
+        rasterizer=rasterizer,
+        near=stage.near,
+        frame=scene.frame,
+        budget_bytes=budget_bytes,
+        generator=torch.Generator().manual_seed(this.recipe.seed),
+        scratch=this.out,
+        keep=lambda at: None if masks is None else masks[at],
+    )
+
+
+def mesh(this: Run, state: StageState, what: Subject) -> None:
+    """Make the mesh that the recipe wants; a surface that cannot be had is told, and costs no measurements."""
+    try:
+        deliver(this, this.recipe.mesh, Delivery(), what, state.index)
+    except BadInput as error:
+        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {this.out}` tries again with other settings"))
 
 
 def evaluate(

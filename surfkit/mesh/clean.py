@@ -12,22 +12,6 @@ from surfkit.mesh.base import Mesh
 
 
 @dataclass(frozen=True)
-class Cleaning:
-    """Which clusters of triangles stay."""
-
-    clusters: int = 50
-    """Keep no clusters smaller than this many larger ones; with fewer clusters, all that have enough triangles."""
-
-    least_triangles: int = 50
-    """Triangles that a cluster must have to stay."""
-
-    def __post_init__(self) -> None:
-        for name in ("clusters", "least_triangles"):
-            if getattr(self, name) < 1:
-                raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
-
-
-@dataclass(frozen=True)
 class Report:
     """What cleaning did, and what is left.
 
@@ -41,7 +25,7 @@ class Report:
         triangles: Left.
         vertices: Left.
         boundaries: Closed runs of edges with one triangle: holes, and the rim of the mesh.
-        longest_boundary: Length of the longest of them, units of the input; of open ground it is mostly the rim.
+        longest_boundary: Length of the longest of them, local units; of open ground it is mostly the rim.
         boundary_share: Share of all edges that have one triangle only.
     """
 
@@ -58,48 +42,47 @@ class Report:
     boundary_share: float
 
 
-def clean(
-    mesh: Mesh, settings: Cleaning, inside: Callable[[np.ndarray], np.ndarray] | None = None
-) -> tuple[Mesh, Report]:
+Inside = Callable[[np.ndarray], np.ndarray]
+"""Which of (M, 3) local positions lie in a crop."""
+
+
+def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None) -> tuple[Mesh, Report]:
     """The mesh without what is no surface, and what was left out.
 
     Args:
         mesh: Any.
-        settings: Which clusters stay.
-        inside: Which of (M, 3) local positions lie in the crop; a triangle stays if its middle does.
+        most: Clusters that are larger than one which is dropped; with fewer clusters, none is dropped for its rank.
+        least: Triangles that a cluster must have to stay; if none has, the largest stays.
+        inside: The crop; a triangle stays if its middle does.
 
     Raises:
         BadInput: Nothing is left.
     """
     if not len(mesh.faces):
         raise BadInput("the mesh has no triangles")
-    counts = {}
     finite = np.isfinite(mesh.vertices).all(1)
-    mesh, counts["not_finite"] = _keep(mesh, finite[mesh.faces].all(1))
-    mesh, counts["degenerate"] = _keep(_welded(mesh), None)
-    counts["cropped"] = 0
+    mesh, not_finite = _keep(mesh, finite[mesh.faces].all(1))
+    mesh = _welded(mesh)
+    mesh, degenerate = _keep(mesh, _areas(mesh) > 0)
+    cropped = 0
     if inside is not None:
-        middles = mesh.vertices[mesh.faces].mean(1, dtype=np.float64)
-        mesh, counts["cropped"] = _keep(mesh, inside(middles))
+        mesh, cropped = _keep(mesh, inside(mesh.vertices[mesh.faces].mean(1, dtype=np.float64)))
     if not len(mesh.faces):
-        what = "all lie outside the crop: is it in the frame of the input?" if counts["cropped"] else "none is whole"
+        what = "all lie outside the crop: is it in the frame of the input?" if cropped else "none is whole"
         raise BadInput(f"no triangle of the mesh is left: {what}")
     labels, sizes = clusters(mesh)
-    kept = sizes >= max(np.sort(sizes)[::-1][settings.clusters - 1] if len(sizes) >= settings.clusters else 0, 1)
-    kept &= (sizes >= settings.least_triangles) | (sizes == max(sizes.max(), 1)) * (
-        sizes.max() < settings.least_triangles
-    )
-    mesh, counts["clustered"] = _keep(mesh, kept[labels])
-    used = np.zeros(len(mesh.vertices), bool)
-    used[mesh.faces] = True
-    place = (np.cumsum(used) - 1).astype(np.int32)
-    colors = None if mesh.colors is None else mesh.colors[used]
-    mesh = replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], colors=colors)
-    loops, longest, share = boundaries(mesh)
-    sums = {"clusters": len(sizes), "clusters_kept": int(kept.sum())}
-    left = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
-    rims = {"boundaries": loops, "longest_boundary": longest, "boundary_share": share}
-    return mesh, Report(**counts, **sums, **left, **rims)
+    large = _large(sizes, most, least)
+    mesh, clustered = _keep(mesh, large[labels])
+    mesh = _referenced(mesh)
+    dropped = (not_finite, degenerate, cropped, len(sizes), int(large.sum()), clustered)
+    return mesh, Report(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh))
+
+
+def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:
+    """(C,) which clusters stay."""
+    ranked = np.sort(sizes)[::-1]
+    bound = max(least, ranked[most - 1] if len(sizes) >= most else 0)
+    return sizes >= min(bound, ranked[0])
 
 
 def clusters(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +99,7 @@ def clusters(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def boundaries(mesh: Mesh) -> tuple[int, float, float]:
-    """How many connected runs of edges have one triangle only, the length of the longest, and their share of all edges."""
+    """Connected runs of edges that have one triangle only, the length of the longest, and their share of all edges."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -135,12 +118,24 @@ def boundaries(mesh: Mesh) -> tuple[int, float, float]:
     return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), len(rim) / len(names)
 
 
-def _keep(mesh: Mesh, faces: np.ndarray | None) -> tuple[Mesh, int]:
-    """The mesh with some of its faces, and how many went; None is for those with an area."""
-    if faces is None:
-        a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-        faces = (np.cross(b - a, c - a) != 0).any(1)
+def _keep(mesh: Mesh, faces: np.ndarray) -> tuple[Mesh, int]:
+    """The mesh with some of its faces, and how many went."""
     return replace(mesh, faces=mesh.faces[faces]), int((~faces).sum())
+
+
+def _areas(mesh: Mesh) -> np.ndarray:
+    """(F,) twice the areas."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _referenced(mesh: Mesh) -> Mesh:
+    """The mesh without vertices that no face has."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    place = (np.cumsum(used) - 1).astype(np.int32)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], colors=colors)
 
 
 def _welded(mesh: Mesh) -> Mesh:

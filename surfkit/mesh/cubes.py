@@ -103,7 +103,7 @@ def _flat_diagonals(loop: list[int], triangles: list[tuple[int, int, int]]) -> i
 
 @cache
 def triangles() -> np.ndarray:
-    """(256, L) int8 edges of the triangles of each case, three by three, ended by -1; counter-clockwise from outside."""
+    """(256, L) int8 edges of the triangles of each case, by threes, ended by -1; counter-clockwise from outside."""
     cases = []
     for case in range(256):
         found: list[int] = []

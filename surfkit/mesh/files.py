@@ -67,11 +67,11 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
         file.write("".join([line % tuple(row) for row in rows.tolist()]).encode())
     for at in range(0, len(mesh.faces), CHUNK):
         rows = (mesh.faces[at : at + CHUNK] + 1).tolist()
-        file.write("".join(["f %d %d %d\n" % tuple(row) for row in rows]).encode())
+        file.write("".join([f"f {a} {b} {c}\n" for a, b, c in rows]).encode())
 
 
 def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
-    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input's frame."""
+    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input."""
     corners = frame.to_input(mesh.vertices.min(0)), frame.to_input(mesh.vertices.max(0))
     offset = np.round((corners[0] + corners[1]) / 2)
     places = (frame.to_input(mesh.vertices) - offset).astype("<f4")

@@ -116,7 +116,7 @@ def cut(box: Box, task: Task) -> list[Box]:
     halves = box.halves(seen)
     if halves is None:
         raise BadInput(
-            f"{task.lattice.most_blocks} blocks of voxels do not hold a single tile; give more --memory, or larger voxels"
+            f"{task.lattice.most_blocks} blocks of voxels do not hold one tile; give more --memory, or larger voxels"
         )
     return list(halves)
 
@@ -145,8 +145,8 @@ def spooled(task: Task) -> Iterator[Task]:
         folder = Path(name)
         if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
             raise BadInput(
-                f"{folder.parent}: {needed / 1e9:.1f} GB of disk are needed to mesh in tiles and {free / 1e9:.1f} GB are "
-                "free; make room, give more --memory, or larger voxels"
+                f"{folder.parent}: {needed / 1e9:.1f} GB of disk are needed to mesh in tiles and {free / 1e9:.1f} GB "
+                "are free; make room, give more --memory, or larger voxels"
             )
         for at in range(len(task.cameras)):
             seen = task.see(at)

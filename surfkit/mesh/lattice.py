@@ -1,4 +1,4 @@
-"""What the compiled grid of signed distances and its reference share: the lattice, one view of it, and what comes out."""
+"""What the compiled grid of signed distances and its reference share: the lattice, one view, and what comes out."""
 
 from __future__ import annotations
 

@@ -76,10 +76,8 @@ class ReferenceGrid(Grid):
         height, width = picture.depth.shape
         pose = camera.world_to_camera.numpy()
         start = unpack(self.keys[rows]) * (self.lattice.voxel * SIDE)
-        x0, y0, z0 = (
-            (((r[0] * start[:, 0] + r[1] * start[:, 1]) + r[2] * start[:, 2]) + r[3]).astype(F)[:, None]
-            for r in pose[:3]
-        )
+        first = [r[0] * start[:, 0] + r[1] * start[:, 1] + r[2] * start[:, 2] + r[3] for r in pose[:3]]
+        x0, y0, z0 = (row.astype(F)[:, None] for row in first)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             z = z0 + offsets[2]
             turn = F(1) / z

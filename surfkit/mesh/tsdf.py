@@ -73,8 +73,8 @@ class TSDF(Mesher):
         (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
-                f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} views; "
-                "lower --mesh.least-views, or train for more steps"
+                f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} "
+                "views; lower --mesh.least-views, or train for more steps"
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | {"tiles": tiles})
 
@@ -129,7 +129,7 @@ def refuse_too_large(lengths: Lengths, subject: Subject, blocks: int) -> None:
     if needed > subject.budget_bytes:
         least = lengths.voxel * (needed / subject.budget_bytes) ** 0.5
         raise BadInput(
-            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million triangles, which "
-            f"take {needed / 1e9:.1f} GB, and {subject.budget_bytes / 1e9:.1f} GB may be used; give "
+            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million "
+            f"triangles, which take {needed / 1e9:.1f} GB, and {subject.budget_bytes / 1e9:.1f} GB may be used; give "
             f"--mesh.voxel {told(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more --memory"
         )
