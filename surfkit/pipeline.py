@@ -121,7 +121,7 @@ def run(
             if not this.cloud.exists():
                 export(this, state, scene)
             if not meshed(this, state.index):
-                mesh(this, state, subject(this, state, scene, rasterizer, budget))
+                mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto")))
             return evaluate(this, state, scene, rasterizer, budget)
 
 

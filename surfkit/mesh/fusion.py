@@ -34,6 +34,7 @@ class Task:
         carve: Let each view clear all that it sees through.
         least_weight: From which a voxel counts.
         scratch: Folder for what the views see, if there are tiles.
+        label: Of the progress.
     """
 
     lattice: Lattice
@@ -43,6 +44,7 @@ class Task:
     carve: bool
     least_weight: int
     scratch: Path | None
+    label: str = "fusing views"
 
 
 def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
@@ -54,7 +56,7 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np
     """
     if len(boxes) == 1:
         whole = grid(task.lattice)
-        if all(step(task, whole, at, "fusing views") for at in range(len(task.cameras))):
+        if all(step(task, whole, at) for at in range(len(task.cameras))):
             piece = whole.surface(task.least_weight)
             return (piece.vertices, piece.faces, piece.colors), 1
         del whole
@@ -64,10 +66,10 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np
         return in_tiles(stored, boxes)
 
 
-def step(task: Task, into: Grid, at: int, what: str) -> bool:
+def step(task: Task, into: Grid, at: int) -> bool:
     """Fuse one view; False if there would be too many blocks."""
     fits = into.fuse(task.see(at), task.carve)
-    emit(Progress(what, at + 1, len(task.cameras)))
+    emit(Progress(task.label, at + 1, len(task.cameras)))
     return fits
 
 

@@ -17,6 +17,8 @@ from surfkit.mesh.lengths import VOXELS, Length, Lengths, check_length, resolve,
 from surfkit.mesh.picture import Which, depth_of, picture
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 
+LEAST_BYTES = 50_000_000
+"""With less memory, tiles would be smaller than what a view sees of a wall."""
 AUTO_TRIANGLES = 10_000_000
 """About as many as an automatic voxel gives at most."""
 
@@ -55,6 +57,11 @@ class TSDF(Mesher):
         """See `Mesher.mesh`."""
         if not len(subject.splats) or not subject.views:
             raise BadInput("nothing to mesh: there are no splats or no views")
+        if subject.budget_bytes < LEAST_BYTES:
+            raise BadInput(
+                f"{subject.budget_bytes / 1e6:.0f} MB are too little to mesh in; give --memory "
+                f"{LEAST_BYTES // 10**6}MB or more"
+            )
         lengths, found = self._lengths(subject)
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
@@ -69,7 +76,8 @@ class TSDF(Mesher):
             return picture(depth, maps, cameras[at], lengths.voxel)
 
         least = max(1, round(FULL * self.least_views))
-        task = Task(lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch)
+        label = f"fusing views, {words(lengths, subject)}"
+        task = Task(lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label)
         (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
@@ -84,7 +92,14 @@ class TSDF(Mesher):
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
         found = estimate(subject.splats, lengths.voxel, within)
-        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, int(subject.budget_bytes / MESH_BYTES))
+        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, subject.budget_bytes // MESH_BYTES)
+        if self.voxel == "auto" and found.total > most:
+            emit(
+                Warned(
+                    f"voxels of a pixel, {told(lengths.voxel, subject.frame)}, would give about "
+                    f"{found.total * BLOCK_TRIANGLES / 1e6:.0f} million triangles: they are made larger"
+                )
+            )
         while self.voxel == "auto" and found.total > most:
             coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
             cut = VOXELS * coarser if self.truncation == "auto" else max(lengths.truncation, 2 * coarser)
@@ -92,8 +107,6 @@ class TSDF(Mesher):
             found = estimate(subject.splats, coarser, within)
         refuse_too_fine(lengths, subject, np.abs(within).max())
         refuse_too_large(lengths, subject, found.total)
-        if "auto" in (self.voxel, self.truncation, self.depth_limit):
-            emit(Warned(f"meshing with {words(lengths, subject)}"))
         return lengths, found
 
 
