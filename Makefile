@@ -22,7 +22,7 @@ bench: $(VENV)/.installed
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/survey.py
 
 # Reinstalled when what is compiled or declared changes; the Python files are used in place.
-$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/raster/*.h surfkit/raster/cpu/*.h surfkit/raster/cpu/*.cpp)
+$(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/raster/*.h surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
 	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev]"

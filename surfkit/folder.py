@@ -70,6 +70,16 @@ class Run:
         return self.out / "cameras.json"
 
     @property
+    def mesh_record(self) -> Path:
+        """How the mesh was made and what it is; written when its files are."""
+        return self.out / "mesh.json"
+
+    @property
+    def mesh_pictures(self) -> Path:
+        """Pictures of the mesh."""
+        return self.out / "mesh_pictures"
+
+    @property
     def pictures(self) -> Path:
         """Renders beside the photographs."""
         return self.out / "pictures"
@@ -134,6 +144,9 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
     there = read_json(this.out / "recipe.json", Any) if (this.out / "recipe.json").exists() else None
+    if isinstance(there, dict) and there.get("mesh") != (mesh := dump(this.recipe.mesh)):
+        this.mesh_record.unlink(missing_ok=True)  # training is the same; the mesh is to be made again
+        there |= {"mesh": mesh}
     found = None if there is None else difference(there, dump(this.recipe))
     if found and not (found := longer(this, there)):
         emit(
@@ -166,7 +179,8 @@ def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
     if not isinstance(before, int) or not 0 < before < now:
         return plain
     old = read_json(this.out / "recipe.json", Recipe)
-    if dump(replace(old, about=this.recipe.about, pretrain=replace(old.pretrain, steps=now))) == dump(this.recipe):
+    old = replace(old, about=this.recipe.about, mesh=this.recipe.mesh)
+    if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(this.recipe):
         return None
     return difference(dump(rescale_like(old, now / before, this.recipe)), dump(this.recipe))
 

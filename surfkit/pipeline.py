@@ -36,6 +36,7 @@ from surfkit.folder import (
     refuse_other,
     say,
 )
+from surfkit.mesh.base import Subject
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
@@ -44,12 +45,14 @@ from surfkit.recipe import Recipe
 from surfkit.scene.cameras import write_cameras
 from surfkit.scene.data import Data
 from surfkit.scene.masks import mask_cache
-from surfkit.scene.memory import free_bytes
+from surfkit.scene.memory import cache_bytes, free_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
+from surfkit.surface import Delivery, deliver, meshed, subject
 from surfkit.train import checkpoint
+from surfkit.train.bars import bars
 from surfkit.train.faults import MOST_HALVINGS, Diverged, in_one_line, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
 from surfkit.train.material import Material, Store, read_ahead
@@ -137,7 +140,7 @@ def run(
         every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_file(out)
     store.bytes()  # or BadInput, before anything is done
-    with noted() as notes, held(out), in_one_line(out):
+    with noted() as notes, held(out), in_one_line(out), bars():
         sweep(out)
         refuse_other(this)
         scene = read(this.data)
@@ -151,14 +154,16 @@ def run(
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
             if given is not None:
-                discard(this.metrics, this.cloud)
+                discard(this.metrics, this.cloud, this.mesh_record)
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
-            elif this.metrics.exists() and this.cloud.exists():
+            elif this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
                 return read_metrics(out)
             if not this.cloud.exists():
                 export(this, state, scene)
+            if not meshed(this, state.index):
+                mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto")))
             return evaluate(this, state, scene, rasterizer)
 
 
@@ -301,6 +306,14 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     emit(FileWritten(this.cameras, "cameras"))
     write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(this.cloud, "points"))
+
+
+def mesh(this: Run, state: StageState, what: Subject) -> None:
+    """Make the mesh that the recipe wants; a surface that cannot be had is told, and costs no measurements."""
+    try:
+        deliver(this, this.recipe.mesh, Delivery(), what, state.index)
+    except BadInput as error:
+        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {this.out}` tries again with other settings"))
 
 
 def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer) -> dict[str, Any]:

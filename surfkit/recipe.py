@@ -9,6 +9,7 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
+from surfkit.mesh.base import Mesher
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.train.stage import Stage
@@ -26,6 +27,9 @@ class Recipe:
 
     pretrain: Stage = field(default_factory=Stage)
     """Optimisation of the whole scene."""
+
+    mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
+    """How the splats become triangles when they are trained; none for splats alone."""
 
     seed: int = 0
     """Of every random draw."""

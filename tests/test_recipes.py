@@ -58,7 +58,7 @@ def test_citygs2_coarse_is_the_last_row_of_the_upper_half_of_the_ablation_table(
     from surfkit.report.ablation import build
 
     *_, last = build(MODEL).values()
-    assert replace(recipes()["citygs2-coarse"], about=last.about) == last
+    assert replace(recipes()["citygs2-coarse"], about=last.about, mesh=last.mesh) == last
     assert last.pretrain.signal.boost == 0.9 and last.pretrain.signal.terms == ("ssim",)
 
 

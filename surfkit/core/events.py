@@ -84,7 +84,7 @@ class FileWritten:
 
 @dataclass(frozen=True)
 class Progress:
-    """Part of a piece of work with a known end is done.
+    """Part of a piece of work with a known end is done. Told as often as there is something to tell.
 
     Attributes:
         what: The work, in a few words, such as "fusing views".
@@ -162,7 +162,18 @@ class StageEnded:
     seconds: float
 
 
-Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | PhotoSkipped | Measured | MemoryTaken | StageEnded
+Event = (
+    StageBegan
+    | StepDone
+    | PointsEdited
+    | FileWritten
+    | Progress
+    | Warned
+    | PhotoSkipped
+    | Measured
+    | MemoryTaken
+    | StageEnded
+)
 
 _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.codec import dump
-from surfkit.core.events import FileWritten, StageBegan, StageEnded
+from surfkit.core.events import FileWritten, Progress, StageBegan, StageEnded
 from surfkit.core.files import replacing
 from surfkit.core.registry import hookimpl, plugins
 
@@ -36,7 +36,9 @@ class Journal:
 
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
-        """See one event."""
+        """See one event. Of other progress than steps only the end is written down: the way there is many lines."""
+        if isinstance(event, Progress) and event.done < event.total:
+            return
         if isinstance(event, StageBegan):
             self.close()
         if self.file is None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,11 +24,13 @@ class Mesh:
         vertices: (V, 3) float32 local positions.
         faces: (F, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
         colors: (V, 3) uint8, or None.
+        facts: How it was made, for mesh.json: what automatic settings became, how many tiles there were. Plain values.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colors: np.ndarray | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Subject:
         frame: From the local frame back to the input's; knows metres if the data set does.
         budget_bytes: Memory to stay within; work is split into tiles when it would be exceeded.
         generator: Of every random draw.
+        scratch: Folder for large temporary files, which the mesher deletes; None for the system's own.
         keep: (H, W) bool mask of a view by its position, or None for all of it; false where nothing is to be fused.
     """
 
@@ -53,6 +58,7 @@ class Subject:
     frame: Frame
     budget_bytes: int
     generator: torch.Generator = field(default_factory=torch.Generator)
+    scratch: Path | None = None
     keep: Callable[[int], torch.Tensor | None] = lambda at: None
 
 

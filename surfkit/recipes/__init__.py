@@ -11,6 +11,7 @@ from surfkit.densify.trim import Trim
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
@@ -34,6 +35,7 @@ SURFELS = Recipe(
         },
         densify=ADC(cull_opacity=0.05),
     ),
+    mesh=TSDF(),
 )
 
 
@@ -41,6 +43,7 @@ FLAT = Recipe(
     about="3D Gaussians with one axis pinned to almost nothing: between 3dgs and 2dgs",
     primitive=Flat3D(),
     pretrain=Stage(losses={"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency()}),
+    mesh=TSDF(),
 )
 
 ABSOLUTE = Recipe(
@@ -63,6 +66,7 @@ TRIMMED = Recipe(
         densify=ADC(cull_opacity=0.05),
         prune=(Trim(ratio=0.1, start=31_000, until=37_000),),
     ),
+    mesh=TSDF(),
 )
 
 LIGHT = Recipe(
@@ -86,6 +90,7 @@ COARSE = Recipe(
         signal=LossGradient(terms=("ssim",), boost=0.9),
         densify=ADC(cull_opacity=0.005, filters=(Elongation(min_ratio=0.01),)),
     ),
+    mesh=TSDF(),
 )
 
 

@@ -17,13 +17,13 @@ GROUPS = Path("/sys/fs/cgroup")
 OWN = Path("/proc/self/cgroup")
 
 
-def cache_bytes(text: str) -> int:
+def cache_bytes(text: str, flag: str = "--cache") -> int:
     """Bytes of a size such as 4GB, 500 MB or 2GiB; a share of the free memory for "auto"."""
     if text.strip().lower() == "auto":
         return int(SHARE * free_bytes())
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
     if not found or found[2] not in UNITS:
-        raise BadInput(f"--cache {text}: give a size such as 4GB or 500MB, or auto")
+        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, or auto")
     return int(float(found[1]) * UNITS[found[2]])
 
 

@@ -41,6 +41,11 @@ def outer(draw: Draw) -> Iterator[None]:
         _OUTER.reset(token)
 
 
+def drawn_elsewhere() -> bool:
+    """Whether a larger display has the terminal."""
+    return _OUTER.get() is not None
+
+
 class Display:
     """Step, speed, time left, points, loss, PSNR and memory: a live bar on a terminal, else a line every few seconds.
 

@@ -9,6 +9,7 @@
 #include <optional>
 #include <string>
 
+#include "../../mesh/cpu/bind.h"
 #include "pass.h"
 #include "pool.h"
 
@@ -177,4 +178,6 @@ NB_MODULE(_native, m) {
                            (float)(1 - beta2), (float)second_correction, (float)epsilon);
         });
     });
+
+    add_mesh(m);
 }

@@ -1,0 +1,101 @@
+"""`surfkit mesh`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from surfkit.cli.recipes import ARGV
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.journal import kept
+from surfkit.core.lock import held
+from surfkit.core.registry import choice
+from surfkit.folder import Run, noted
+from surfkit.mesh.base import Mesher
+from surfkit.mesh.tsdf import TSDF
+from surfkit.pipeline import drawer, load_run
+from surfkit.raster.select import Device
+from surfkit.recipe import Recipe
+from surfkit.scene.memory import cache_bytes
+from surfkit.surface import Delivery, deliver, subject
+from surfkit.train.bars import bars
+from surfkit.train.faults import in_one_line
+
+
+def named_mesher() -> Mesher:
+    """That of the recipe of the run which is being named; the usual one if it has none."""
+    for word in ARGV.get():
+        path = Path(word) / "recipe.json"
+        if not word.startswith("-") and path.is_file():
+            return read_json(path, Recipe).mesh or TSDF()
+    return TSDF()
+
+
+@dataclass(frozen=True)
+class MeshOf:
+    """Make the mesh of a finished run, or make it again with other settings; writes mesh.ply, mesh.json and pictures.
+
+    Settings are those of the run's recipe where nothing else is said: `surfkit mesh RUN mesh:tsdf --mesh.voxel 0.5`.
+    Small loose clusters are dropped. Coordinates are those of the data set.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=named_mesher)
+    """How the splats become triangles."""
+
+    delivery: Annotated[Delivery, tyro.conf.arg(name="")] = Delivery()
+    """What is written."""
+
+    memory: str = "auto"
+    """Memory to use, such as 4GB; auto takes half of what is free. Work is done in tiles where it would take more."""
+
+    metres_per_unit: float | None = None
+    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    def __post_init__(self) -> None:
+        if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
+            raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
+
+    def run(self) -> None:
+        """Mesh, and show what came out."""
+        budget = cache_bytes(self.memory, "--memory")
+        with noted(), bars():
+            this, state, scene = load_run(self.run_folder)
+            if self.metres_per_unit is not None:
+                scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
+            rasterizer, _ = drawer(self.device)
+            with held(this.out), in_one_line(this.out), kept(this.out):
+                what = subject(this, state, scene, rasterizer, budget)
+                record = deliver(this, self.mesh, self.delivery, what, state.index)
+        show(this, record)
+
+
+def show(this: Run, record: dict[str, Any]) -> None:
+    """Print what the mesh is, and the paths of what was written."""
+    cleaning, lengths = record["cleaning"], record["lengths"]
+    rows = [
+        ("triangles", f"{cleaning['triangles']:,}"),
+        ("vertices", f"{cleaning['vertices']:,}"),
+        ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
+        ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
+        *((name.replace("_", " "), f"{value:.6g}") for name, value in lengths.items()),
+        ("seconds", f"{record['seconds']:.1f}"),
+    ]
+    print_table(("mesh", "value"), rows)
+    print()
+    paths = [("mesh", this.out / name) for name in record["files"]] + [("facts", this.mesh_record)]
+    paths += [("picture", path) for path in sorted(this.mesh_pictures.glob("*.png"))]
+    print_table(("written", "path"), [(what, str(path)) for what, path in paths])
+
+
+COMMAND = MeshOf

@@ -1,0 +1,13 @@
+"""From splats to triangles."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+from surfkit.mesh.tetra import Tetra
+from surfkit.mesh.tsdf import TSDF
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """Names of what this folder offers."""
+    return {"tsdf": TSDF, "tetra": Tetra}

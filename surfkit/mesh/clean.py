@@ -1,0 +1,148 @@
+"""Leaving out what is no surface: broken triangles, small loose clusters, and what lies outside a crop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.mesh.base import Mesh
+
+
+@dataclass(frozen=True)
+class Report:
+    """What cleaning did, and what is left.
+
+    Attributes:
+        not_finite: Triangles dropped because of a vertex that is not finite.
+        degenerate: Triangles dropped that have no area.
+        cropped: Triangles outside the crop.
+        clusters: Connected parts before the small ones were dropped.
+        clusters_kept: Those that stayed.
+        clustered: Triangles dropped with small clusters.
+        triangles: Left.
+        vertices: Left.
+        boundaries: Closed runs of edges with one triangle: holes, and the rim of the mesh.
+        longest_boundary: Length of the longest of them, local units; of open ground it is mostly the rim.
+        boundary_share: Share of all edges that have one triangle only.
+    """
+
+    not_finite: int
+    degenerate: int
+    cropped: int
+    clusters: int
+    clusters_kept: int
+    clustered: int
+    triangles: int
+    vertices: int
+    boundaries: int
+    longest_boundary: float
+    boundary_share: float
+
+
+Inside = Callable[[np.ndarray], np.ndarray]
+"""Which of (M, 3) local positions lie in a crop."""
+
+
+def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None) -> tuple[Mesh, Report]:
+    """The mesh without what is no surface, and what was left out.
+
+    Args:
+        mesh: Any.
+        most: Clusters that are larger than one which is dropped; with fewer clusters, none is dropped for its rank.
+        least: Triangles that a cluster must have to stay; if none has, the largest stays.
+        inside: The crop; a triangle stays if its middle does.
+
+    Raises:
+        BadInput: Nothing is left.
+    """
+    if not len(mesh.faces):
+        raise BadInput("the mesh has no triangles")
+    finite = np.isfinite(mesh.vertices).all(1)
+    mesh, not_finite = _keep(mesh, finite[mesh.faces].all(1))
+    mesh = _welded(mesh)
+    mesh, degenerate = _keep(mesh, _areas(mesh) > 0)
+    cropped = 0
+    if inside is not None:
+        mesh, cropped = _keep(mesh, inside(mesh.vertices[mesh.faces].mean(1, dtype=np.float64)))
+    if not len(mesh.faces):
+        what = "all lie outside the crop: is it in the frame of the input?" if cropped else "none is whole"
+        raise BadInput(f"no triangle of the mesh is left: {what}")
+    labels, sizes = clusters(mesh)
+    large = _large(sizes, most, least)
+    mesh, clustered = _keep(mesh, large[labels])
+    mesh = _referenced(mesh)
+    dropped = (not_finite, degenerate, cropped, len(sizes), int(large.sum()), clustered)
+    return mesh, Report(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh))
+
+
+def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:
+    """(C,) which clusters stay."""
+    ranked = np.sort(sizes)[::-1]
+    bound = max(least, ranked[most - 1] if len(sizes) >= most else 0)
+    return sizes >= min(bound, ranked[0])
+
+
+def clusters(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) number of the connected part of each triangle, and (C,) triangles of each part; a shared vertex connects."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a = np.concatenate([mesh.faces[:, 0], mesh.faces[:, 1]])
+    b = np.concatenate([mesh.faces[:, 1], mesh.faces[:, 2]])
+    links = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(len(mesh.vertices),) * 2)
+    _, parts = connected_components(links, directed=False)
+    _, labels, sizes = np.unique(parts[mesh.faces[:, 0]], return_inverse=True, return_counts=True)
+    return labels, sizes
+
+
+def boundaries(mesh: Mesh) -> tuple[int, float, float]:
+    """Connected runs of edges that have one triangle only, the length of the longest, and their share of all edges."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    names, counts = np.unique(sides[:, 0] << 32 | sides[:, 1], return_counts=True)
+    rim = names[counts == 1]
+    if not len(rim):
+        return 0, 0.0, 0.0
+    ends = np.stack([rim >> 32, rim & 0xFFFFFFFF], 1)
+    points, at = np.unique(ends, return_inverse=True)
+    at = at.reshape(-1, 2)
+    links = coo_matrix((np.ones(len(at), bool), (at[:, 0], at[:, 1])), shape=(len(points),) * 2)
+    count, parts = connected_components(links, directed=False)
+    places = mesh.vertices[points].astype(np.float64)
+    lengths = np.linalg.norm(places[at[:, 0]] - places[at[:, 1]], axis=1)
+    return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), len(rim) / len(names)
+
+
+def _keep(mesh: Mesh, faces: np.ndarray) -> tuple[Mesh, int]:
+    """The mesh with some of its faces, and how many went."""
+    return replace(mesh, faces=mesh.faces[faces]), int((~faces).sum())
+
+
+def _areas(mesh: Mesh) -> np.ndarray:
+    """(F,) twice the areas."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _referenced(mesh: Mesh) -> Mesh:
+    """The mesh without vertices that no face has."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    place = (np.cumsum(used) - 1).astype(np.int32)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return replace(mesh, vertices=mesh.vertices[used], faces=place[mesh.faces], colors=colors)
+
+
+def _welded(mesh: Mesh) -> Mesh:
+    """The mesh with vertices in the same place made one; the first of them gives the colour."""
+    rows = np.ascontiguousarray(mesh.vertices + np.float32(0))  # -0 becomes 0
+    _, first, place = np.unique(rows.view(np.void(12).dtype)[:, 0], return_index=True, return_inverse=True)
+    if len(first) == len(mesh.vertices):
+        return mesh
+    colors = None if mesh.colors is None else mesh.colors[first]
+    return replace(mesh, vertices=mesh.vertices[first], faces=place.astype(np.int32)[mesh.faces], colors=colors)

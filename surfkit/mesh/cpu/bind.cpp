@@ -1,0 +1,111 @@
+// What Python sees of the grid: arrays are checked in mesh/native.py, which alone calls this.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <cstring>
+#include <string>
+
+#include "bind.h"
+#include "grid.h"
+#include "shade.h"
+
+namespace nb = nanobind;
+
+namespace surfkit {
+namespace {
+
+using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Words = nb::ndarray<const uint32_t, nb::c_contig, nb::device::cpu>;
+using Table = nb::ndarray<const int8_t, nb::c_contig, nb::device::cpu>;
+using Whole = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
+
+template <class T>
+nb::ndarray<nb::numpy, T> given(std::vector<T>&& values, std::vector<size_t> shape) {
+    auto* kept = new std::vector<T>(std::move(values));
+    nb::capsule owner(kept, [](void* p) noexcept { delete (std::vector<T>*)p; });
+    return nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner);
+}
+
+const FuseKernels& named(const std::string& name) {
+#if defined(SURFKIT_X86)
+    if (name == "avx512") return fuse_kernels_avx512();
+    if (name == "avx2") return fuse_kernels_avx2();
+#endif
+    return fuse_kernels_baseline();
+}
+
+Pose pose_of(const std::vector<double>& m) {  // 4 x 4 by rows
+    return {{{m.at(0), m.at(1), m.at(2)}, {m.at(4), m.at(5), m.at(6)}, {m.at(8), m.at(9), m.at(10)}},
+            {m.at(3), m.at(7), m.at(11)}};
+}
+
+}  // namespace
+
+void add_mesh(nb::module_& m) {
+    nb::class_<Grid>(m, "Grid")
+        .def("__init__",
+             [](Grid* self, double voxel, double reach, std::vector<int64_t> low, std::vector<int64_t> high,
+                int64_t most_blocks) { new (self) Grid(voxel, reach, &low.at(0), &high.at(0), most_blocks); })
+        .def("fuse",
+             [](Grid& self, Floats depth, Words shade, std::vector<double> pose, std::vector<double> lens,
+                Floats offsets, std::vector<double> lengths, bool carve, const std::string& kernels, int threads) {
+                 FuseJob job;
+                 job.depth = depth.data();
+                 job.shade = shade.data();
+                 job.height = (int)depth.shape(0);
+                 job.width = (int)depth.shape(1);
+                 job.fx = (float)lens.at(0);
+                 job.fy = (float)lens.at(1);
+                 job.cx = (float)lens.at(2);
+                 job.cy = (float)lens.at(3);
+                 std::memcpy(job.offsets, offsets.data(), sizeof job.offsets);
+                 job.truncation = (float)lengths.at(0);
+                 job.jump = (float)lengths.at(1);
+                 job.fade = (float)lengths.at(2);
+                 const Pose p = pose_of(pose);
+                 nb::gil_scoped_release free;
+                 return self.fuse(job, p, carve, named(kernels), threads);
+             })
+        .def("surface",
+             [](const Grid& self, Table triangles, Whole edges, int least_weight, std::vector<int64_t> end,
+                bool with_edges, int threads) {
+                 const CubeTable table{triangles.data(), (int)triangles.shape(1), edges.data()};
+                 Triangles t;
+                 {
+                     nb::gil_scoped_release free;
+                     t = self.surface(table, least_weight, &end.at(0), with_edges, threads);
+                 }
+                 const size_t v = t.vertices.size() / 3, f = t.faces.size() / 3, e = t.edges.size();
+                 return nb::make_tuple(given(std::move(t.vertices), {v, 3}), given(std::move(t.faces), {f, 3}),
+                                       given(std::move(t.colors), {v, 3}), given(std::move(t.edges), {e}));
+             })
+        .def("contents",
+             [](const Grid& self) {
+                 std::vector<int64_t> keys;
+                 std::vector<uint8_t> raw;
+                 for (const int64_t index : self.order()) {
+                     keys.push_back((int64_t)self.key(index));
+                     const auto* bytes = (const uint8_t*)&self.block(index);
+                     raw.insert(raw.end(), bytes, bytes + sizeof(Block));
+                 }
+                 const size_t count = keys.size();
+                 return nb::make_tuple(given(std::move(keys), {count}),
+                                       given(std::move(raw), {count, sizeof(Block)}));
+             })
+        .def_prop_ro("blocks", &Grid::blocks)
+        .def_prop_ro("bytes", &Grid::bytes);
+
+    m.def("draw_faces", [](Floats vertices, Whole faces, nb::ndarray<float, nb::c_contig, nb::device::cpu> depth,
+                           nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
+        FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),
+                    (int)depth.shape(1), (int)depth.shape(0)};
+        nb::gil_scoped_release free;
+        draw_faces(job, threads);
+    });
+}
+
+}  // namespace surfkit

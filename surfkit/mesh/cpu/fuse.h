@@ -1,0 +1,55 @@
+// The state of voxels and what one view does to a block of them; one compilation for each instruction set.
+// The definition of correct is surfkit/mesh/reference.py: every step here is rounded as it is there, to the same bits.
+#pragma once
+
+#include <cstdint>
+
+namespace surfkit {
+
+constexpr int kSide = 8;  // voxels
+constexpr int kVoxels = kSide * kSide * kSide;
+
+// 7 bytes a voxel, x fastest. Rounding is dithered, so that means over many views do not get stuck.
+struct alignas(64) Block {
+    int16_t distance[kVoxels];   // in 1/32767 of the truncation, positive in front of the surface
+    uint16_t weight[kVoxels];    // 32 is one view that looks straight at a surface from near; 0 is never seen
+    uint8_t color[3][kVoxels];
+};
+
+struct FuseJob {
+    const float* depth;      // (height, width) camera z, 0 for none
+    const uint32_t* shade;   // (height, width) red, green, blue, weight from the lowest byte up
+    int width, height;
+    float fx, fy, cx, cy;
+    float offsets[3][kVoxels];  // camera coordinates of each voxel less those of the first
+    float truncation, jump, fade;  // fade: depth behind the surface at which the weight begins to fall
+};
+
+constexpr int kBlockBits = 17;
+constexpr int kBlockBias = 1 << (kBlockBits - 1);  // blocks along each axis, to either side of the origin
+constexpr uint64_t kNoKey = ~uint64_t{0};
+
+// A row of pixels, and how it lies among the blocks. Lengths are in blocks.
+struct RowJob {
+    const float* depth;
+    const uint32_t* shade;
+    int width;
+    double row, fx, cx, per_block;    // row: y of the ray at z = 1
+    double turn[3][3], eye[3], reach;  // turn: axis of the world, then of the camera
+    int32_t low[3], high[3];           // blocks that may be made, both ends included
+};
+
+struct FuseKernels {
+    // Fuse a view into a block whose first voxel lies at `first` in the camera's frame.
+    void (*block)(const FuseJob& job, const float* first, uint32_t seed, Block& block);
+    // Keys of the first and the last block within reach of what each pixel shows; kNoKey for none.
+    void (*row)(const RowJob& job, uint64_t* low, uint64_t* high);
+};
+
+const FuseKernels& fuse_kernels_baseline();
+#if defined(SURFKIT_X86)
+const FuseKernels& fuse_kernels_avx2();
+const FuseKernels& fuse_kernels_avx512();
+#endif
+
+}  // namespace surfkit

@@ -1,0 +1,126 @@
+"""Meshes as files, in the frame of the input: PLY with double coordinates, OBJ, and GLB with an offset beside it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import numpy as np
+
+from surfkit.core.codec import write_json
+from surfkit.core.files import replacing
+from surfkit.core.version import own_version
+from surfkit.mesh.base import Mesh
+from surfkit.scene.scene import Frame
+
+Format = Literal["ply", "obj", "glb"]
+CHUNK = 1 << 20
+"""Rows that are written at once."""
+UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+"""By columns, z up to y up, as glTF has it."""
+
+
+def write_mesh(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
+    """Write a mesh in the format that the name ends in, and return the files that were written."""
+    kind = Path(path).suffix.lower()
+    if kind == ".glb":
+        return write_glb(path, mesh, frame)
+    with replacing(path) as file:
+        (write_ply if kind == ".ply" else write_obj)(file, mesh, frame)
+    return [Path(path)]
+
+
+def write_ply(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
+    """Binary PLY. Coordinates are doubles: in a national grid, floats would be off by decimetres."""
+    layout = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+    layout += [(name, "u1") for name in ("red", "green", "blue")] if mesh.colors is not None else []
+    kinds = {"<f8": "double", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {note}" for note in notes(frame))]
+    header += [f"element vertex {len(mesh.vertices)}", *(f"property {kinds[kind]} {name}" for name, kind in layout)]
+    header += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
+    file.write("".join(f"{line}\n" for line in header).encode())
+    for at in range(0, len(mesh.vertices), CHUNK):
+        rows = np.empty(len(mesh.vertices[at : at + CHUNK]), layout)
+        rows["x"], rows["y"], rows["z"] = frame.to_input(mesh.vertices[at : at + CHUNK]).T
+        if mesh.colors is not None:
+            rows["red"], rows["green"], rows["blue"] = mesh.colors[at : at + CHUNK].T
+        file.write(rows.tobytes())
+    for at in range(0, len(mesh.faces), CHUNK):
+        rows = np.empty(len(mesh.faces[at : at + CHUNK]), [("count", "u1"), ("at", "<i4", 3)])
+        rows["count"], rows["at"] = 3, mesh.faces[at : at + CHUNK]
+        file.write(rows.tobytes())
+
+
+def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
+    """OBJ with colours after the coordinates, as MeshLab, CloudCompare and Blender read them."""
+    file.write("".join(f"# {note}\n" for note in notes(frame)).encode())
+    decimals = max(0, 6 - int(np.floor(np.log10(1 / frame.scale))))
+    place = " ".join([f"%.{decimals}f"] * 3)
+    for at in range(0, len(mesh.vertices), CHUNK):
+        rows = frame.to_input(mesh.vertices[at : at + CHUNK])
+        line = f"v {place}\n"
+        if mesh.colors is not None:
+            rows = np.concatenate([rows, mesh.colors[at : at + CHUNK] / 255], axis=1)
+            line = f"v {place} %.4f %.4f %.4f\n"
+        file.write("".join([line % tuple(row) for row in rows.tolist()]).encode())
+    for at in range(0, len(mesh.faces), CHUNK):
+        rows = (mesh.faces[at : at + CHUNK] + 1).tolist()
+        file.write("".join([f"f {a} {b} {c}\n" for a, b, c in rows]).encode())
+
+
+def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
+    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input."""
+    corners = frame.to_input(mesh.vertices.min(0)), frame.to_input(mesh.vertices.max(0))
+    offset = np.round((corners[0] + corners[1]) / 2)
+    places = (frame.to_input(mesh.vertices) - offset).astype("<f4")
+    parts = [places.tobytes(), mesh.faces.astype("<u4").tobytes()]
+    views = [{"target": 34962, "byteStride": 12}, {"target": 34963}]
+    accessors = [
+        {"componentType": 5126, "type": "VEC3", "min": places.min(0).tolist(), "max": places.max(0).tolist()},
+        {"componentType": 5125, "type": "SCALAR"},
+    ]
+    counts, attributes = [len(places), mesh.faces.size], {"POSITION": 0}
+    if mesh.colors is not None:
+        opaque = np.full((len(places), 1), 255, np.uint8)
+        parts.append(np.concatenate([mesh.colors, opaque], axis=1).tobytes())
+        views.append({"target": 34962, "byteStride": 4})
+        accessors.append({"componentType": 5121, "normalized": True, "type": "VEC4"})
+        counts.append(len(places))
+        attributes["COLOR_0"] = 2
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    node = {"mesh": 0} | ({"matrix": UP} if frame.crs else {})
+    document = {
+        "asset": {"version": "2.0", "generator": f"surfkit {own_version()}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1, "material": 0}]}],
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": starts[at], "byteLength": len(part), **views[at]}
+            for at, part in enumerate(parts)
+        ],
+        "accessors": [{"bufferView": at, "count": counts[at], **kind} for at, kind in enumerate(accessors)],
+    }
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    with replacing(path) as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + starts[-1]))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        for part in parts:
+            file.write(part)
+    beside = Path(f"{path}.json")
+    up = "y: the file turns z up to y up" if frame.crs else "as in the input"
+    write_json(beside, {"offset": offset.tolist(), "metres_per_unit": frame.metres, "crs": frame.crs, "up": up})
+    return [Path(path), beside]
+
+
+def notes(frame: Frame) -> list[str]:
+    """What a file says of its coordinates."""
+    found = [f"Generated by surfkit {own_version()}"]
+    found += [f"crs {frame.crs}"] if frame.crs else []
+    return found + ([f"metres_per_unit {frame.metres:.9g}"] if frame.metres else [])

@@ -1,0 +1,162 @@
+"""Fusing views one after another into a grid; in tiles where it would become too large."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, Warned, emit
+from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.native import grid
+from surfkit.mesh.tiles import Box, join
+from surfkit.scene.camera import Camera
+
+PIXEL_BYTES = 8
+"""Of a view on disk."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be fused, and how.
+
+    Attributes:
+        lattice: Of all tiles.
+        cameras: Of the views.
+        see: What the view at a position sees; costly.
+        limit: Largest depth, local units.
+        carve: Let each view clear all that it sees through.
+        least_weight: From which a voxel counts.
+        scratch: Folder for what the views see, if there are tiles.
+        label: Of the progress.
+    """
+
+    lattice: Lattice
+    cameras: tuple[Camera, ...]
+    see: Callable[[int], Picture]
+    limit: float
+    carve: bool
+    least_weight: int
+    scratch: Path | None
+    label: str = "fusing views"
+
+
+def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+    """Vertices, faces and colours of the surface, and the number of tiles.
+
+    Args:
+        task: What is to be fused.
+        boxes: Of the tiles; those that turn out to need too many blocks are cut further.
+    """
+    if len(boxes) == 1:
+        whole = grid(task.lattice)
+        if all(step(task, whole, at) for at in range(len(task.cameras))):
+            piece = whole.surface(task.least_weight)
+            return (piece.vertices, piece.faces, piece.colors), 1
+        del whole
+        emit(Warned("the grid became larger than expected: starting again in tiles"))
+        boxes = cut(Box(), task)
+    with spooled(task) as stored:
+        return in_tiles(stored, boxes)
+
+
+def step(task: Task, into: Grid, at: int) -> bool:
+    """Fuse one view; False if there would be too many blocks."""
+    fits = into.fuse(task.see(at), task.carve)
+    emit(Progress(task.label, at + 1, len(task.cameras)))
+    return fits
+
+
+def in_tiles(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+    """The surface, tile by tile."""
+    views = [in_sight(camera, task) for camera in task.cameras]
+    left, pieces, made = list(reversed(boxes)), [], 0
+    while left:
+        box = left.pop()
+        piece = tile(task, box, views)
+        if piece is None:
+            left += reversed(cut(box, task))
+            continue
+        made += 1
+        emit(Progress("fusing tiles", made, made + len(left)))
+        if len(piece.faces):
+            pieces.append(piece)
+    if not pieces:
+        return (np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty((0, 3), np.uint8)), made
+    return join(pieces), made
+
+
+def tile(task: Task, box: Box, views: list[Box]) -> Pieces | None:
+    """The surface in a box; None if its grid would become too large."""
+    around = box.with_border()
+    part = grid(replace(task.lattice, low=around.low, high=around.high))
+    for at, view in enumerate(views):
+        if view.meets(around) and not part.fuse(task.see(at), task.carve):
+            return None
+    return used(part.surface(task.least_weight, box.high, with_edges=True))
+
+
+def used(piece: Pieces) -> Pieces:
+    """Without the vertices that no face has: those of the border."""
+    there = np.zeros(len(piece.vertices), bool)
+    there[piece.faces] = True
+    place = (np.cumsum(there) - 1).astype(np.int32)
+    return Pieces(piece.vertices[there], place[piece.faces], piece.colors[there], piece.edges[there])
+
+
+def cut(box: Box, task: Task) -> list[Box]:
+    """A box in two."""
+    seen = in_sight(task.cameras[0], task)
+    for camera in task.cameras[1:]:
+        seen = seen.joined(in_sight(camera, task))
+    halves = box.halves(seen)
+    if halves is None:
+        raise BadInput(
+            f"{task.lattice.most_blocks} blocks of voxels do not hold one tile; give more --memory, or larger voxels"
+        )
+    return list(halves)
+
+
+def in_sight(camera: Camera, task: Task) -> Box:
+    """Blocks around all that a camera may see."""
+    pose = camera.world_to_camera.numpy()
+    x = (np.array([0, camera.width]) - camera.cx) / camera.fx
+    y = (np.array([0, camera.height]) - camera.cy) / camera.fy
+    rays = np.array([[0, 0, 0], *([a, b, 1] for a in x for b in y)]) * task.limit
+    corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * SIDE)
+    low, high = np.floor(corners.min(0)) - 1, np.floor(corners.max(0)) + 2
+    return Box(_corner(low), _corner(high))
+
+
+def _corner(at: np.ndarray) -> Corner:
+    x, y, z = (int(v) for v in at.clip(1 - MOST, MOST - 1))
+    return x, y, z
+
+
+@contextmanager
+def spooled(task: Task) -> Iterator[Task]:
+    """The task with what every view sees on disk, so that it is drawn once however many tiles there are."""
+    needed = PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
+    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=".tiles-") as name:
+        folder = Path(name)
+        if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
+            raise BadInput(
+                f"{folder.parent}: {needed / 1e9:.1f} GB of disk are needed to mesh in tiles and {free / 1e9:.1f} GB "
+                "are free; make room, give more --memory, or larger voxels"
+            )
+        for at in range(len(task.cameras)):
+            seen = task.see(at)
+            np.save(folder / f"{at}.npy", np.stack([seen.depth.view(np.uint32), seen.shade]))
+            emit(Progress("drawing views", at + 1, len(task.cameras)))
+
+        def read(at: int) -> Picture:
+            depth, shade = np.load(folder / f"{at}.npy")
+            return Picture(depth.view(np.float32), shade, task.cameras[at])
+
+        yield replace(task, see=read)

@@ -1,0 +1,108 @@
+"""What the compiled grid of signed distances and its reference share: the lattice, one view, and what comes out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.scene.camera import Camera
+
+SIDE = 8
+"""Voxels along a block."""
+BLOCK_BYTES = 7 * SIDE**3
+FULL = 32
+"""Weight of a pixel that looks straight at a surface and is no larger than a voxel."""
+REACH = 1.5
+"""Blocks are made where a surface is nearer than this, in voxels, along any axis: cells around it must be whole."""
+JUMP = 2.0
+"""Depths of neighbouring pixels further apart than this, in voxels, do not belong to one surface."""
+FADE = 1.0
+"""Depth behind a surface, in voxels, from which the weight falls to 0 at the truncation: thin walls have two sides."""
+BITS = 17
+MOST = 2 ** (BITS - 1)
+"""Blocks from the origin along an axis that can be numbered."""
+
+Corner = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Voxels of one size, numbered from the origin of the local frame: voxel i lies at i times the size.
+
+    Attributes:
+        voxel: Local units.
+        truncation: Local units; distances further in front of a surface count as this, further behind not at all.
+        low: First block along x, y, z.
+        high: One beyond the last.
+        most_blocks: The grid does not take more.
+    """
+
+    voxel: float
+    truncation: float
+    low: Corner = (1 - MOST,) * 3
+    high: Corner = (MOST - 1,) * 3
+    most_blocks: int = 2**31 - 1
+
+    def offsets(self, camera: Camera) -> np.ndarray:
+        """(3, 512) float32 camera coordinates of the voxels of a block, x fastest, less those of the first."""
+        z, y, x = np.indices((SIDE, SIDE, SIDE)).reshape(3, -1)
+        turn = camera.world_to_camera[:3, :3].numpy()[:, :, None] * self.voxel
+        return (turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z).astype(np.float32)
+
+    @property
+    def lengths(self) -> list[float]:
+        """Truncation, jump and fade in local units."""
+        return [self.truncation, JUMP * self.voxel, min(FADE * self.voxel, 0.5 * self.truncation)]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a view sees.
+
+    Attributes:
+        depth: (H, W) float32 camera z, local units; 0 for none, always finite.
+        shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL`.
+        camera: Of the view.
+    """
+
+    depth: np.ndarray
+    shade: np.ndarray
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A part of a surface.
+
+    Attributes:
+        vertices: (V, 3) float32 local.
+        faces: (F, 3) int32.
+        colors: (V, 3) uint8.
+        edges: (V,) int64 the edge of the lattice that each vertex lies on, the same in every tile; may be empty.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    edges: np.ndarray
+
+
+class Grid(ABC):
+    """Distances, weights and colours of the voxels near surfaces."""
+
+    blocks: int
+    bytes: int
+
+    @abstractmethod
+    def fuse(self, picture: Picture, carve: bool) -> bool:
+        """Average a view into the voxels near what it sees, or with `carve` into all in sight that there are so far.
+
+        False, and nothing is changed, if that took more blocks than the lattice allows.
+        """
+
+    @abstractmethod
+    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
+        """Triangles where all eight voxels around have a weight, of cells in blocks below `end`; front faces see them
+        counter-clockwise."""

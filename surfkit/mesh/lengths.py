@@ -1,0 +1,104 @@
+"""Lengths of a mesher in metres or `auto`, and what they are in the local frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.mesh.base import Subject
+from surfkit.mesh.picture import Which, depth_of
+from surfkit.scene.scene import Frame
+
+Length = float | Literal["auto"]
+SAMPLED = 16
+"""Views that automatic lengths are taken from."""
+PIXELS = 1.0
+"""Automatic voxels are this many pixels wide, at the median depth of the median view, or larger: see tsdf.py."""
+VOXELS = 4.0
+"""Automatic truncation."""
+DEPTHS = 2.0
+"""Automatic limit of the depth, in median depths."""
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Local units: the side of a voxel, the truncation of distances, and the depth from which nothing is fused."""
+
+    voxel: float
+    truncation: float
+    limit: float
+
+
+def check_length(name: str, value: Length) -> None:
+    """BadInput for a length that is not one."""
+    if value != "auto" and not 0 < value < float("inf"):
+        raise BadInput(f"{name} is {value:g}; it must be more than 0 metres, or auto")
+
+
+def resolve(voxel: Length, truncation: Length, limit: Length, subject: Subject, which: Which) -> Lengths:
+    """The lengths in local units; automatic ones follow from what the views see.
+
+    Raises:
+        BadInput: There is no depth in any view, or lengths are in metres and nobody knows how long a unit is.
+    """
+    given = [in_local(value, subject.frame) for value in (voxel, truncation, limit)]
+    if given[0] is None or given[2] is None:
+        depth, pixel = look(subject, which)
+        given[0] = given[0] or PIXELS * pixel
+        given[2] = given[2] or DEPTHS * depth
+    size, cut, far = given
+    cut = cut or VOXELS * size
+    if cut < 2 * size:
+        raise BadInput(
+            f"mesh.truncation is {told(cut, subject.frame)} with voxels of {told(size, subject.frame)}; it must be at "
+            "least two voxels"
+        )
+    return Lengths(size, cut, far)
+
+
+def in_local(value: Length, frame: Frame) -> float | None:
+    """A length in metres in local units; None if it is automatic."""
+    if value == "auto":
+        return None
+    if frame.local_metres is None:
+        raise BadInput(
+            f"a length of {value:g} m cannot be used: the data set does not say how long its unit is; give "
+            "--metres-per-unit (1 if its coordinates are metres), or leave the length at auto"
+        )
+    return value / frame.local_metres
+
+
+def told(length: float, frame: Frame) -> str:
+    """A local length in metres, or in units of the data set where metres are not known."""
+    if frame.local_metres is not None:
+        return f"{length * frame.local_metres:.3g} m"
+    return f"{length / frame.scale:.3g} units"
+
+
+def look(subject: Subject, which: Which) -> tuple[float, float]:
+    """Median over some views of their median depth, and of the width of a pixel there; local units.
+
+    Views without depth are passed over for others.
+    """
+    count = len(subject.views)
+    first = [at * count // min(SAMPLED, count) for at in range(min(SAMPLED, count))]
+    depths, pixels = [], []
+    for at in [*first, *sorted(set(range(count)) - set(first))]:
+        if len(depths) >= len(first) // 2 + 1 and at not in first:
+            break
+        view = subject.views[at]
+        depth = depth_of(subject.draw(view), which)
+        keep = subject.keep(at)
+        depth = depth[depth > 0] if keep is None else depth[(depth > 0) & keep]
+        if len(depth):
+            depths.append(float(depth.median()))
+            pixels.append(depths[-1] / min(view.camera.fx, view.camera.fy))
+    if not depths:
+        raise BadInput(
+            f"no depth in any of {count} views: the splats are not opaque enough to be a surface; train for more steps"
+            + (", or try --mesh.depth expected" if which == "median" else "")
+        )
+    return float(np.median(depths)), float(np.median(pixels))

@@ -1,0 +1,60 @@
+"""The compiled grid of signed distances behind the contract of `Grid`."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from surfkit.core.events import Warned, emit
+from surfkit.mesh.cubes import EDGES, triangles
+from surfkit.mesh.lattice import MOST, REACH, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.reference import ReferenceGrid
+from surfkit.raster.native import module
+
+
+class NativeGrid(Grid):
+    """Runs on `torch.get_num_threads()` threads; their number does not change a bit."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        corners = list(lattice.low), list(lattice.high)
+        self.native = module().Grid(lattice.voxel, REACH * lattice.voxel, *corners, lattice.most_blocks)
+
+    @property
+    def blocks(self) -> int:
+        return self.native.blocks
+
+    @property
+    def bytes(self) -> int:
+        return self.native.bytes
+
+    def fuse(self, picture: Picture, carve: bool) -> bool:
+        camera = picture.camera
+        return self.native.fuse(
+            np.ascontiguousarray(picture.depth, np.float32),
+            np.ascontiguousarray(picture.shade, np.uint32),
+            camera.world_to_camera.flatten().tolist(),
+            [camera.fx, camera.fy, camera.cx, camera.cy],
+            self.lattice.offsets(camera),
+            self.lattice.lengths,
+            carve,
+            module().kernels_in_use(),
+            torch.get_num_threads(),
+        )
+
+    def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
+        table = triangles(), EDGES
+        return Pieces(*self.native.surface(*table, least_weight, list(end), with_edges, torch.get_num_threads()))
+
+
+def grid(lattice: Lattice) -> Grid:
+    """An empty grid, compiled if surfkit is."""
+    if module() is not None:
+        return NativeGrid(lattice)
+    emit(
+        Warned(
+            "surfkit was installed without its compiled part (no C++ compiler was found): depth is fused in numpy "
+            "instead, about a hundred times slower; install GCC or Clang, then surfkit again"
+        )
+    )
+    return ReferenceGrid(lattice)

@@ -1,0 +1,128 @@
+"""How large a grid will be, how it is cut into tiles, and how the pieces become one surface again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.mesh.lattice import BLOCK_BYTES, MOST, SIDE, Corner, Pieces
+from surfkit.raster.api import Splats
+
+GRID_BYTES = 1.05 * BLOCK_BYTES
+"""Of a block, its place in the table included."""
+BLOCK_TRIANGLES = 60
+"""Of a block, about; and half as many vertices."""
+MESH_BYTES = 5_000
+"""Most that these take while tiles are joined: everything twice, and the names of the vertices."""
+SHARE = 0.5
+"""Of the memory budget that a grid may take; the rest is for the triangles."""
+DENSE = 4
+"""Splats in a cell from which it is taken for covered."""
+THICK = 3.0
+"""Blocks for each that a surface passes through."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """Blocks from `low` up to, without, `high`."""
+
+    low: Corner = (1 - MOST,) * 3
+    high: Corner = (MOST - 1,) * 3
+
+    def halves(self, seen: Box) -> tuple[Box, Box] | None:
+        """Cut through the longest side of what has been seen in it; None if it is a single block."""
+        low, high = np.maximum(self.low, seen.low), np.minimum(self.high, seen.high)
+        axis = int((high - low).argmax())
+        if high[axis] - low[axis] < 2:
+            return None
+        cut = int(low[axis] + high[axis]) // 2
+        return Box(self.low, _put(self.high, axis, cut)), Box(_put(self.low, axis, cut), self.high)
+
+    def with_border(self) -> Box:
+        """One more block at the upper ends: cells there have corners in it."""
+        return Box(self.low, tuple(min(side + 1, MOST - 1) for side in self.high))
+
+    def meets(self, other: Box) -> bool:
+        """Whether they have a block in common."""
+        return bool((np.maximum(self.low, other.low) < np.minimum(self.high, other.high)).all())
+
+    def joined(self, other: Box) -> Box:
+        """The smallest box around both."""
+        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
+        return Box(tuple(low.tolist()), tuple(high.tolist()))
+
+
+def _put(corner: Corner, axis: int, value: int) -> Corner:
+    x, y, z = (value if at == axis else old for at, old in enumerate(corner))
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Blocks that a surface will take.
+
+    Attributes:
+        cells: (C, 3) cells that splats lie in.
+        blocks_along: Blocks along a cell.
+        blocks: Estimate for each cell.
+    """
+
+    cells: np.ndarray
+    blocks_along: int
+    blocks: float
+
+    @property
+    def total(self) -> int:
+        """Blocks in all."""
+        return int(len(self.cells) * self.blocks)
+
+
+def estimate(splats: Splats, voxel: float, within: tuple[np.ndarray, np.ndarray]) -> Estimate:
+    """Count blocks from where the splats lie; cells grow until several splats share one, and stand for a surface.
+
+    Args:
+        splats: Those that are hardly visible do not count.
+        voxel: Local units.
+        within: Lowest and highest corner of what views can see, local.
+    """
+    means = splats.means[splats.opacities > 0.1].double().cpu().numpy()
+    means = means[((means >= within[0]) & (means <= within[1])).all(1)]
+    for level in range(BITS_OF_CELL + 1):
+        along = 2**level
+        cells = np.unique(np.floor(means / (voxel * SIDE * along)).astype(np.int64), axis=0)
+        if len(means) >= DENSE * len(cells):
+            break
+    return Estimate(cells, along, THICK * along**2)
+
+
+BITS_OF_CELL = 12
+
+
+def plan(found: Estimate, most_blocks: int) -> list[Box]:
+    """Boxes that together are all of space, none of which is expected to need more than `most_blocks`."""
+
+    def cut(box: Box, cells: np.ndarray) -> list[Box]:
+        if len(cells) * found.blocks <= most_blocks or not len(cells) or not np.ptp(cells, axis=0).any():
+            return [box]
+        axis = int(np.ptp(cells, axis=0).argmax())
+        low, high = cells[:, axis].min(), cells[:, axis].max()
+        at = int(np.clip(np.median(cells[:, axis]), low + 1, high))
+        left, border = cells[:, axis] < at, at * found.blocks_along
+        lower, upper = Box(box.low, _put(box.high, axis, border)), Box(_put(box.low, axis, border), box.high)
+        return [*cut(lower, cells[left]), *cut(upper, cells[~left])]
+
+    return cut(Box(), found.cells)
+
+
+def join(pieces: Sequence[Pieces]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, faces and colours of all; vertices of the same edge of the lattice, which are the same, become one."""
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    names = np.concatenate([piece.edges for piece in pieces])
+    _, first, place = np.unique(names, return_index=True, return_inverse=True)
+    vertices = np.concatenate([piece.vertices for piece in pieces])[first]
+    colors = np.concatenate([piece.colors for piece in pieces])[first]
+    place = place.astype(np.int32)
+    faces = np.concatenate([place[piece.faces + start] for piece, start in zip(pieces, starts, strict=False)])
+    return vertices, faces, colors

@@ -1,0 +1,148 @@
+"""Fusion of depth maps into signed distances, and their zero as the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.fusion import Task, fuse
+from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
+from surfkit.mesh.lengths import VOXELS, Length, Lengths, check_length, resolve, told
+from surfkit.mesh.picture import Which, depth_of, picture
+from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
+
+LEAST_BYTES = 50_000_000
+"""With less memory, tiles would be smaller than what a view sees of a wall."""
+AUTO_TRIANGLES = 10_000_000
+"""About as many as an automatic voxel gives at most."""
+
+
+@dataclass(frozen=True)
+class TSDF(Mesher):
+    """Fuse the depth of every training view into a grid of signed distances (Curless and Levoy 1996; KinectFusion)."""
+
+    voxel: Length = "auto"
+    """Side of a voxel, metres; auto is one pixel at the median depth, or as large as it takes to get no more than about
+    ten million triangles."""
+
+    truncation: Length = "auto"
+    """Distance from a surface over which it is averaged, metres; auto is four voxels. Walls thinner than this may get
+    lost."""
+
+    depth_limit: Length = "auto"
+    """Depth from which a view no longer counts, metres; auto is twice the median depth."""
+
+    depth: Which = "median"
+    """Depth of a pixel: of the splat that makes it half opaque, or the mean of all."""
+
+    carve: bool = True
+    """Let every view clear what it sees through, also where it sees no surface near by; floaters get fewer."""
+
+    least_views: float = 1.0
+    """Views that must have seen a voxel, for it to count; one that looks aslant or from afar is less than one."""
+
+    def __post_init__(self) -> None:
+        for name in ("voxel", "truncation", "depth_limit"):
+            check_length(f"mesh.{name}", getattr(self, name))
+        if not 0 < self.least_views <= 1000:
+            raise BadInput(f"mesh.least_views is {self.least_views:g}; it must be more than 0 and at most 1000")
+
+    def mesh(self, subject: Subject) -> Mesh:
+        """See `Mesher.mesh`."""
+        if not len(subject.splats) or not subject.views:
+            raise BadInput("nothing to mesh: there are no splats or no views")
+        if subject.budget_bytes < LEAST_BYTES:
+            raise BadInput(
+                f"{subject.budget_bytes / 1e6:.0f} MB are too little to mesh in; give --memory "
+                f"{LEAST_BYTES // 10**6}MB or more"
+            )
+        lengths, found = self._lengths(subject)
+        most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
+        lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
+        cameras = tuple(view.camera for view in subject.views)
+
+        def see(at: int) -> Picture:
+            maps = subject.draw(subject.views[at])
+            depth = depth_of(maps, self.depth)
+            depth = torch.where(depth <= lengths.limit, depth, 0.0)
+            if (keep := subject.keep(at)) is not None:
+                depth = torch.where(keep, depth, 0.0)
+            return picture(depth, maps, cameras[at], lengths.voxel)
+
+        least = max(1, round(FULL * self.least_views))
+        label = f"fusing views, {words(lengths, subject)}"
+        task = Task(lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label)
+        (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
+        if not len(faces):
+            raise BadInput(
+                f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} "
+                "views; lower --mesh.least-views, or train for more steps"
+            )
+        return Mesh(vertices, faces, colors, facts(lengths, subject) | {"tiles": tiles})
+
+    def _lengths(self, subject: Subject) -> tuple[Lengths, Estimate]:
+        """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
+        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth)
+        centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
+        within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
+        found = estimate(subject.splats, lengths.voxel, within)
+        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, subject.budget_bytes // MESH_BYTES)
+        if self.voxel == "auto" and found.total > most:
+            emit(
+                Warned(
+                    f"voxels of a pixel, {told(lengths.voxel, subject.frame)}, would give about "
+                    f"{found.total * BLOCK_TRIANGLES / 1e6:.0f} million triangles: they are made larger"
+                )
+            )
+        while self.voxel == "auto" and found.total > most:
+            coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
+            cut = VOXELS * coarser if self.truncation == "auto" else max(lengths.truncation, 2 * coarser)
+            lengths = Lengths(coarser, cut, lengths.limit)
+            found = estimate(subject.splats, coarser, within)
+        refuse_too_fine(lengths, subject, np.abs(within).max())
+        refuse_too_large(lengths, subject, found.total)
+        return lengths, found
+
+
+def words(lengths: Lengths, subject: Subject) -> str:
+    """The lengths for a person."""
+    voxel, cut, far = (told(value, subject.frame) for value in (lengths.voxel, lengths.truncation, lengths.limit))
+    return f"voxels of {voxel}, truncation {cut}, depth up to {far}"
+
+
+def facts(lengths: Lengths, subject: Subject) -> dict[str, Any]:
+    """The lengths for mesh.json, in units of the data set and in metres where they are known."""
+    values = {"voxel": lengths.voxel, "truncation": lengths.truncation, "depth_limit": lengths.limit}
+    metres = subject.frame.local_metres
+    found = {name: value / subject.frame.scale for name, value in values.items()}
+    return found | ({f"{name}_m": value * metres for name, value in values.items()} if metres else {})
+
+
+def refuse_too_fine(lengths: Lengths, subject: Subject, farthest: float) -> None:
+    """BadInput if the voxels cannot be numbered."""
+    blocks = farthest / (lengths.voxel * SIDE)
+    if blocks > MOST - 2:
+        least = farthest / ((MOST - 2) * SIDE)
+        raise BadInput(
+            f"mesh.voxel is {told(lengths.voxel, subject.frame)}, too small for a scene of "
+            f"{told(2 * farthest, subject.frame)}; give {told(1.01 * least, subject.frame)} or more, or a lower "
+            "--mesh.depth-limit"
+        )
+
+
+def refuse_too_large(lengths: Lengths, subject: Subject, blocks: int) -> None:
+    """BadInput if the triangles alone would not fit into the memory."""
+    needed = blocks * MESH_BYTES
+    if needed > subject.budget_bytes:
+        least = lengths.voxel * (needed / subject.budget_bytes) ** 0.5
+        raise BadInput(
+            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million "
+            f"triangles, which take {needed / 1e9:.1f} GB, and {subject.budget_bytes / 1e9:.1f} GB may be used; give "
+            f"--mesh.voxel {told(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more --memory"
+        )

@@ -1,0 +1,67 @@
+"""Progress of other work than training: a live bar on a terminal, else a line every few seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Live
+
+from surfkit.core.events import Progress
+from surfkit.core.registry import hookimpl, plugins
+from surfkit.train.progress import PLAIN_EVERY_S, drawn_elsewhere
+
+
+class Bars:
+    """Shows `Progress` events, one bar for each kind of work."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self.live: Live | None = None
+        self.tasks: dict[str, TaskID] = {}
+        self.told = 0.0
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if not isinstance(event, Progress) or drawn_elsewhere():
+            return
+        if self.console.is_terminal:
+            self.draw(event)
+        elif event.done == event.total or time.perf_counter() - self.told > PLAIN_EVERY_S:
+            self.told = time.perf_counter()
+            self.console.print(f"{event.what}  {event.done}/{event.total}", highlight=False, soft_wrap=True)
+
+    def draw(self, event: Progress) -> None:
+        """Move the bar of the event's work; the last one to end takes the display with it."""
+        if self.live is None:
+            columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+            self.live = Live(*columns, console=self.console)
+            self.live.start()
+        if event.what not in self.tasks:
+            self.tasks[event.what] = self.live.add_task(event.what)
+        self.live.update(self.tasks[event.what], completed=event.done, total=event.total)
+        if self.live.finished:
+            self.close()
+
+    def close(self) -> None:
+        """Leave the bars as they are; the next event begins new ones."""
+        if self.live is not None:
+            self.live.stop()
+        self.live, self.tasks = None, {}
+
+
+@contextmanager
+def bars(console: Console | None = None) -> Iterator[None]:
+    """Within, progress is shown."""
+    shown = Bars(console)
+    plugins().register(shown, "progress bars")
+    try:
+        yield
+    finally:
+        plugins().unregister(shown)
+        shown.close()

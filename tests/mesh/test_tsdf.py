@@ -1,0 +1,224 @@
+"""The mesher: automatic lengths, metres, masks, tiles, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress
+from surfkit.core.registry import hookimpl, plugins
+from surfkit.mesh import fusion, native, tsdf
+from surfkit.mesh.tiles import Box
+from surfkit.mesh.tsdf import TSDF
+from surfkit.raster.api import Maps
+
+from .shapes import around, maps_of, slope, sphere, subject, torus
+
+
+def faces_by_place(mesh):
+    """Triangles as sorted rows of coordinates and colours, each begun at its smallest corner."""
+    corners = np.concatenate([mesh.vertices[mesh.faces], mesh.colors[mesh.faces]], axis=2)
+    first = np.lexsort(corners.transpose(2, 0, 1)[::-1], axis=1)[:, 0]
+    turned = np.take_along_axis(corners, (first[:, None] + np.arange(3))[:, :, None] % 3, axis=1).reshape(-1, 18)
+    return turned[np.lexsort(turned.T[::-1])]
+
+
+@pytest.mark.parametrize("depth", ["median", "expected"])
+@pytest.mark.parametrize("shape", [sphere, torus])
+def test_a_solid_seen_from_all_sides(shape, depth):
+    given = subject(around(24), shape)
+    mesh = TSDF(voxel=0.4, depth=depth).mesh(given)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    solid.remove_unreferenced_vertices()
+    assert solid.is_watertight and solid.volume > 0
+    assert np.abs(shape(solid.vertices)).max() < 0.5 * 0.04
+    assert np.abs(mesh.colors.astype(int) - [204, 102, 51]).max() <= 1
+    assert mesh.facts["voxel"] == pytest.approx(0.4) and mesh.facts["truncation_m"] == pytest.approx(1.6)
+    assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.int32
+
+
+def test_automatic_lengths_are_those_of_the_pixels():
+    given = subject(around(8), sphere)
+    facts = TSDF().mesh(given).facts
+    depths = [float(given.draw(view).median[given.draw(view).median > 0].median()) for view in given.views]
+    assert facts["voxel_m"] == pytest.approx(np.median(depths) / 90 / 0.1, rel=1e-5)
+    assert facts["truncation_m"] == pytest.approx(4 * facts["voxel_m"])
+    assert facts["depth_limit_m"] == pytest.approx(2 * np.median(depths) / 0.1, rel=1e-5)
+    unknown = TSDF().mesh(replace(given, frame=replace(given.frame, metres=None))).facts
+    assert unknown["voxel"] == pytest.approx(facts["voxel"]) and "voxel_m" not in unknown
+
+
+def test_an_automatic_voxel_grows_with_what_would_be_too_many_triangles(monkeypatch):
+    given = subject(around(8), sphere)
+    fine = TSDF().mesh(given)
+    monkeypatch.setattr(tsdf, "AUTO_TRIANGLES", len(fine.faces) // 2)
+    coarse = TSDF().mesh(given)
+    assert 1.1 * fine.facts["voxel"] < coarse.facts["voxel"]
+    assert coarse.facts["truncation"] == pytest.approx(4 * coarse.facts["voxel"])
+
+
+def test_a_depth_limit_and_masks_leave_pixels_out():
+    given = subject(around(16), slope)
+    assert np.linalg.norm(TSDF(voxel=1.0).mesh(given).vertices, axis=1).max() > 1.5
+    near = TSDF(voxel=1.0, depth_limit=19.0).mesh(given).vertices
+    nearest = [np.linalg.norm(near - view.camera.centre.numpy(), axis=1).min() for view in given.views]
+    assert min(nearest) < 1.95 and np.abs(slope(near)).max() < 0.05
+    left = torch.zeros(72, 96, dtype=torch.bool)
+    left[:, :48] = True
+    one, mesher = subject(around(1, above=True), slope), TSDF(voxel=1.0, least_views=0.2)
+    half, whole = mesher.mesh(replace(one, keep=lambda at: left)), mesher.mesh(one)
+    assert 0.2 * len(whole.faces) < len(half.faces) < 0.7 * len(whole.faces)
+
+
+def test_values_that_are_not_finite_are_no_depth():
+    given = subject(around(12), sphere)
+    spoilt = torch.zeros(72, 96, dtype=torch.bool)
+    spoilt[::7, ::5] = True
+
+    def draw(view):
+        maps = given.draw(view)
+        bad = torch.where(torch.arange(96) % 2 == 0, torch.nan, torch.inf).expand(72, 96)
+        return replace(maps, median=torch.where(spoilt, bad, maps.median), color=torch.where(spoilt, bad, maps.color))
+
+    mesh = TSDF(voxel=0.4).mesh(replace(given, draw=draw))
+    assert np.isfinite(mesh.vertices).all() and np.abs(sphere(mesh.vertices)).max() < 0.02
+    assert np.abs(mesh.colors.astype(int) - [204, 102, 51]).max() <= 1
+
+
+def test_a_pixel_counts_by_its_angle_and_its_size():
+    from surfkit.mesh.picture import depth_of, picture
+
+    camera = around(1)[0]
+    depth = torch.full((72, 96), 2.0)
+    toward = -torch.nn.functional.normalize(camera.rays(), dim=0)
+    flat = Maps(torch.zeros(3, 72, 96), torch.ones(72, 96), depth, depth, toward)
+    weights = [picture(depth, flat, camera, voxel).shade >> 24 for voxel in (2 / 90, 1 / 90)]
+    assert (weights[0] == 32).all() and (weights[1] == 8).all()
+    sideways = torch.nn.functional.normalize(toward + torch.linalg.cross(toward, torch.rand(3, 72, 96), dim=0), dim=0)
+    cosines = (sideways * toward).sum(0)
+    aslant = picture(depth, replace(flat, normal=sideways), camera, 1.0).shade >> 24
+    assert np.allclose(aslant, np.round(32 * cosines.numpy()), atol=1)
+    behind = picture(depth, replace(flat, normal=-toward), camera, 1.0).shade >> 24
+    assert (behind == 0).all()
+    half = replace(flat, alpha=torch.full((72, 96), 0.4), depth=0.4 * depth)
+    assert (depth_of(half, "expected") == 0).all() and torch.equal(depth_of(flat, "expected"), depth)
+
+
+@pytest.mark.parametrize("carve", [False, True])
+def test_tiles_join_to_what_one_grid_gives(monkeypatch, tmp_path, carve):
+    given = replace(subject(around(16), torus), scratch=tmp_path)
+    mesher = TSDF(voxel=0.3, carve=carve)
+    whole = mesher.mesh(given)
+    assert whole.facts["tiles"] == 1
+    monkeypatch.setattr(tsdf, "plan", lambda found, most: cut_in_eight())
+    tiled = mesher.mesh(given)
+    assert tiled.facts["tiles"] == 8 and not list(tmp_path.iterdir())
+    assert len(whole.faces) == len(tiled.faces) and np.array_equal(faces_by_place(whole), faces_by_place(tiled))
+    assert len(np.unique(tiled.vertices, axis=0)) == len(tiled.vertices), "no vertex twice, and so no seam"
+
+
+def cut_in_eight():
+    boxes = [Box()]
+    for _ in range(3):
+        boxes = [half for box in boxes for half in box.halves(Box((-3, -2, -1), (2, 3, 2)))]
+    return boxes
+
+
+def test_a_grid_that_outgrows_its_memory_is_cut_until_it_fits(monkeypatch):
+    given = subject(around(10), torus)
+    whole = TSDF(voxel=0.3).mesh(given)
+    made = []
+
+    def counted(lattice):
+        made.append(native.grid(lattice))
+        return made[-1]
+
+    monkeypatch.setattr(fusion, "grid", counted)
+    monkeypatch.setattr(tsdf, "SHARE", 64 * tsdf.GRID_BYTES / given.budget_bytes)
+    monkeypatch.setattr(tsdf, "estimate", lambda *_: tsdf.Estimate(np.zeros((1, 3), int), 1, 1))
+    tiled = TSDF(voxel=0.3).mesh(given)
+    assert tiled.facts["tiles"] >= 4 and max(grid.blocks for grid in made) <= 64
+    assert np.array_equal(faces_by_place(whole), faces_by_place(tiled))
+
+
+def test_the_estimate_is_of_the_right_size():
+    from surfkit.mesh.tiles import estimate
+
+    for voxel in (0.015, 0.05):
+        given = subject(around(24), sphere)
+        made = native.grid(tsdf.Lattice(voxel, 4 * voxel))
+        from .test_grid import plain
+
+        for view in plain(around(24), sphere):
+            made.fuse(view, False)
+        found = estimate(given.splats, voxel, (np.full(3, -2.0), np.full(3, 2.0))).total
+        assert 0.6 < found / made.blocks < 2.5, (voxel, found, made.blocks)
+
+
+def test_progress_is_told():
+    told = []
+
+    class Listener:
+        @hookimpl
+        def surfkit_event(self, event):
+            if isinstance(event, Progress):
+                told.append((event.what, event.done, event.total))
+
+    listener = Listener()
+    plugins().register(listener)
+    try:
+        TSDF(voxel=1.0).mesh(subject(around(5), sphere))
+    finally:
+        plugins().unregister(listener)
+    assert [done for _, done, _ in told] == [1, 2, 3, 4, 5] and {total for *_, total in told} == {5}
+    assert "voxels of 1 m" in told[0][0]
+
+
+def test_what_cannot_be_meshed_is_said():
+    given = subject(around(5), sphere)
+    empty = Maps(*[torch.zeros(shape) for shape in ((3, 72, 96), (72, 96), (72, 96), (72, 96), (3, 72, 96))])
+    with pytest.raises(BadInput, match="no depth in any of 5 views.*--mesh.depth expected"):
+        TSDF().mesh(replace(given, draw=lambda view: empty))
+    with pytest.raises(BadInput, match="no surface.*--mesh.least-views"):
+        TSDF(voxel=1.0, least_views=900).mesh(given)
+    with pytest.raises(BadInput, match="no surface"):
+        TSDF(voxel=1.0, depth_limit=100.0).mesh(replace(given, draw=lambda view: empty))
+    with pytest.raises(BadInput, match="5 m cannot be used.*--metres-per-unit"):
+        TSDF(voxel=5.0).mesh(replace(given, frame=replace(given.frame, metres=None)))
+    with pytest.raises(BadInput, match=r"million triangles, which take .* GB.*--mesh.voxel 0\.\d+ m or more"):
+        TSDF(voxel=0.003).mesh(replace(given, budget_bytes=200_000_000))
+    with pytest.raises(BadInput, match="too small for a scene of .* m; give .* m or more"):
+        TSDF(voxel=1e-5, depth_limit=100.0).mesh(given)
+    with pytest.raises(BadInput, match="truncation is 1 m with voxels of 1 m.*two voxels"):
+        TSDF(voxel=1.0, truncation=1.0).mesh(given)
+    with pytest.raises(BadInput, match="1 MB are too little"):
+        TSDF().mesh(replace(given, budget_bytes=1_000_000))
+    with pytest.raises(BadInput, match="no splats or no views"):
+        TSDF().mesh(replace(given, views=[]))
+    for wrong in ({"voxel": 0.0}, {"truncation": -1.0}, {"depth_limit": float("inf")}, {"least_views": 0.0}):
+        with pytest.raises(BadInput, match=next(iter(wrong))):
+            TSDF(**wrong)
+
+
+def test_one_view_alone_counts_if_it_may():
+    mesh = TSDF(voxel=0.5, least_views=0.1).mesh(subject(around(1, above=True), slope))
+    assert len(mesh.faces) > 100
+
+
+def test_the_reference_gives_the_same_mesh(monkeypatch):
+    given = subject(around(4), sphere)
+    compiled = TSDF(voxel=0.6).mesh(given)
+    monkeypatch.setattr(native, "module", lambda: None)
+    with_numpy = TSDF(voxel=0.6).mesh(given)
+    assert np.array_equal(compiled.vertices, with_numpy.vertices) and np.array_equal(compiled.faces, with_numpy.faces)
+    assert np.array_equal(compiled.colors, with_numpy.colors)
+
+
+def test_normals_are_not_needed():
+    cameras = around(12)
+    given = subject(cameras, sphere)
+    bare = replace(given, draw=lambda view: replace(maps_of(view.camera, sphere), normal=None))
+    assert np.abs(sphere(TSDF(voxel=0.4).mesh(bare).vertices)).max() < 0.02
