@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.codec import load, read_json
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
@@ -22,7 +22,7 @@ from surfkit.core.schedule import rescale
 from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
-from surfkit.folder import Run, claim, discard, noted, refuse_changed, refuse_file, refuse_other, say
+from surfkit.folder import Run, claim, discard, note_metrics, noted, refuse_changed, refuse_file, refuse_other, say
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
@@ -261,7 +261,7 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
 def evaluate(
     this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int | None = None
 ) -> dict[str, Any]:
-    """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
+    """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are."""
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
@@ -285,9 +285,19 @@ def evaluate(
         "cpu_seconds": state.cpu_seconds,
         "peak_memory_bytes": state.peak_memory_bytes or None,
     }
-    write_json(this.metrics, metrics)
-    emit(FileWritten(this.metrics, "metrics"))
-    return metrics
+    return note_metrics(this.metrics, metrics)
+
+
+def opened(out: Path) -> Run:
+    """A run folder and what it was made from, finished or not.
+
+    Raises:
+        BadInput: The folder holds no run.
+    """
+    if not (out / "recipe.json").exists() or not (out / "run.json").exists():
+        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
+    record = read_json(out / "run.json", Any)
+    return Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
 
 
 def load_run(out: Path) -> tuple[Run, StageState, Scene]:
@@ -296,10 +306,7 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     Raises:
         BadInput: The folder holds no run, or one that is not finished.
     """
-    if not (out / "recipe.json").exists() or not (out / "run.json").exists():
-        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
-    record = read_json(out / "run.json", Any)
-    this = Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
+    this = opened(out)
     scene = read(this.data)
     state = saved(this, scene)
     steps = this.recipe.pretrain.steps

@@ -204,8 +204,8 @@ def refuse_misfit(draw: Draw, tau: float) -> None:
         left = "no pair is close enough to align by" if residual is None else f"the ICP residual is {residual:.3g}"
         raise BadInput(
             f"the truth is in another frame or unit: after alignment half of all points are more than {apart:.3g} "
-            f"apart, {apart / tau:.0f} times tau ({tau:.3g}), {left}, and {draw.alignment.matched:.0%} of the points have "
-            "a partner; give --transform, or a larger --tau if that is how rough the reconstruction is"
+            f"apart, {apart / tau:.0f} times tau ({tau:.3g}), {left}, and {draw.alignment.matched:.0%} of the points "
+            "have a partner; give --transform, or a larger --tau if that is how rough the reconstruction is"
         )
 
 

@@ -51,7 +51,7 @@ class Crop:
 
 
 def within(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n,) bool: which of the (n, 2) points lie in the (K, 2) polygon: a ray to the right crosses its sides oddly often.
+    """(n,) bool: which of the (n, 2) points lie in the (K, 2) polygon: a ray from them crosses its sides oddly often.
 
     The points are sorted by height once, so that each side looks only at those of its own heights.
     """

@@ -76,7 +76,7 @@ def _one_piece(triangles: np.ndarray, areas: np.ndarray) -> np.ndarray | None:
 
 
 def _longest_ring(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(K,) rows of the points around the triangles; of several rings the one around the most, which is the outer one."""
+    """(K,) rows of the points around the triangles; of several rings the one around the most: the outer one."""
     a, b, c = (points[triangles[:, i]] for i in range(3))
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     triangles = np.where(turn[:, None] < 0, triangles[:, ::-1], triangles)

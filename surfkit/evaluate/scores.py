@@ -43,6 +43,12 @@ def spacing(there: object, points: np.ndarray) -> float:
     return float(there.query(points, k=2, workers=WORKERS)[0][:, 1].mean())
 
 
+def surface_gap(there: object, points: np.ndarray) -> float:
+    """1 / sqrt(points per area) of a surface that points were drawn from in any way, by the distance to the eighth."""
+    eighth = there.query(points, k=[9], workers=WORKERS)[0][:, 0]
+    return float(np.sqrt(np.pi / 8) * eighth[np.isfinite(eighth)].mean()) if np.isfinite(eighth).any() else 0.0
+
+
 def between(reconstruction: np.ndarray, truth: np.ndarray) -> Distances:
     """Distances between (n, 3) and (m, 3) points, both ways."""
     return Distances(nearest(tree(truth), reconstruction), nearest(tree(reconstruction), truth))

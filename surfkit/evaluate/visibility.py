@@ -12,14 +12,16 @@ from surfkit.scene.scene import Frame, View
 
 LONGEST_PX = 800
 """Of the depth maps; larger photographs are looked at in this size."""
-COVER = 1.5
-"""A point covers a square of this many spacings: neighbours on a surface then leave no hole between them."""
-BEHIND = 2.0
-"""Widths of such a square by which a point may lie behind the nearest one in it and still be seen: surfaces that are
-turned away by up to 63 degrees hide nothing of themselves."""
+COVER = 2.0
+"""A point covers a square of this many gaps between points: of points strewn at random, 2 % leave a hole then."""
+BEHIND = 1.5
+"""Widths of such a square, or of a pixel, by which a point may lie behind the nearest one and still be seen: surfaces
+that are turned away by up to 56 degrees hide nothing of themselves."""
+SIDES = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024])
+"""Of the squares, pixels."""
 
 
-def visible_counts(points: np.ndarray, views: Sequence[View], frame: Frame, spacing: float) -> np.ndarray:
+def visible_counts(points: np.ndarray, views: Sequence[View], frame: Frame, gap: float) -> np.ndarray:
     """(n,) int32: in how many views each point lies in the picture and is not hidden.
 
     Each point fills a square of a depth map, larger where it is near; a point is hidden in a view if it lies further
@@ -29,36 +31,39 @@ def visible_counts(points: np.ndarray, views: Sequence[View], frame: Frame, spac
         points: (n, 3) float64 input frame.
         views: With cameras in the local frame.
         frame: Of the views.
-        spacing: Between neighbouring points, input units.
+        gap: Between points of a surface, input units: 1 / sqrt(points per area).
     """
     counts = np.zeros(len(points), np.int32)
     for done, view in enumerate(views, 1):
         camera = view.camera.fitted(LONGEST_PX)
-        at, seen = visible(points, camera, frame.input_pose(camera.world_to_camera), spacing)
+        at, seen = visible(points, camera, frame.input_pose(camera.world_to_camera), gap)
         counts[at[seen]] += 1
         emit(Progress("counting the views of each point", done, len(views)))
     return counts
 
 
-def visible(points: np.ndarray, camera: Camera, pose: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def visible(points: np.ndarray, camera: Camera, pose: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray]:
     """Which points lie in the picture, (k,) rows, and which of these are not hidden, (k,) bool.
 
     Args:
         points: (n, 3) float64.
         camera: Lens and size; its pose does not count.
         pose: (4, 4) world_to_camera in the frame and units of the points.
-        spacing: Between neighbouring points.
+        gap: Between points of a surface.
     """
-    at, x, y, z = _pictured(points, camera, pose)
-    cover_px = COVER * spacing * max(camera.fx, camera.fy) / z
-    level = np.ceil(np.log2(cover_px.clip(min=1))).astype(np.int64)
-    level = level.clip(max=max(camera.width, camera.height).bit_length())
-    depth = _depth_map(x, y, z, level, (camera.height, camera.width))
-    square = 2.0**level * z / min(camera.fx, camera.fy)
-    return at, z <= depth[y, x] + BEHIND * square
+    at, x, y, z = pictured(points, camera, pose)
+    focal = max(camera.fx, camera.fy)
+    side = sides(COVER * gap * focal / z)
+    depth, _ = nearest_rows(x, y, z, side, (camera.height, camera.width))
+    return at, z <= depth[y, x] + BEHIND * np.maximum(COVER * gap, z / focal)
 
 
-def _pictured(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, ...]:
+def sides(cover_px: np.ndarray) -> np.ndarray:
+    """(n,) int64 sides of squares that are at least (n,) `cover_px` wide, or as wide as squares get."""
+    return SIDES[np.searchsorted(SIDES, cover_px).clip(max=len(SIDES) - 1)]
+
+
+def pictured(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, ...]:
     """Rows, columns, lines and depths of the points in the picture."""
     z = points @ pose[2, :3] + pose[2, 3]
     at = np.flatnonzero(z > 0)
@@ -69,17 +74,39 @@ def _pictured(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.
     return at[inside], x[inside].astype(np.int64), y[inside].astype(np.int64), z[inside]
 
 
-def _depth_map(x: np.ndarray, y: np.ndarray, z: np.ndarray, level: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) nearest depth, inf where there is none; points of level l fill squares of 2^l pixels."""
+def nearest_rows(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, side: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest point at each pixel where every point fills that square of a chequered picture which it lies in.
+
+    Args:
+        x: (n,) columns.
+        y: (n,) lines.
+        z: (n,) depths.
+        side: (n,) of the squares, pixels.
+        size: H and W.
+
+    Returns:
+        (H, W) depths, inf where there is no point, and (H, W) rows of the points, -1 there.
+    """
     height, width = size
-    result = np.full(size, np.inf)
-    for step in np.unique(level):
-        chosen = level == step
-        wide = (width >> step) + 1
-        coarse = np.full(((height >> step) + 1) * wide, np.inf)
-        np.minimum.at(coarse, (y[chosen] >> step) * wide + (x[chosen] >> step), z[chosen])
-        fine = coarse.reshape(-1, wide)
-        if step:
-            fine = fine.repeat(1 << step, axis=0)[:height].repeat(1 << step, axis=1)[:, :width]
-        np.minimum(result, fine[:height, :width], out=result)
-    return result
+    depth, rows = np.full(size, np.inf), np.full(size, -1)
+    for step in np.unique(side):
+        chosen = np.flatnonzero(side == step)
+        wide, high = -(-width // step), -(-height // step)
+        cell = (y[chosen] // step) * wide + x[chosen] // step
+        near, row = np.full(high * wide, np.inf), np.full(high * wide, -1)
+        np.minimum.at(near, cell, z[chosen])
+        first = z[chosen] == near[cell]
+        row[cell[first]] = chosen[first]
+        near, row = (_spread(values.reshape(high, wide), step, size) for values in (near, row))
+        rows = np.where(near < depth, row, rows)
+        depth = np.minimum(depth, near)
+    return depth, rows
+
+
+def _spread(values: np.ndarray, times: int, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) with each value filling a square of `times` pixels."""
+    if times > 1:
+        values = values.repeat(times, axis=0)[: size[0]].repeat(times, axis=1)
+    return values[: size[0], : size[1]]

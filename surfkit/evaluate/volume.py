@@ -11,7 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.evaluate.crop import PLANES, Axis, Crop
 from surfkit.evaluate.outline import outline
-from surfkit.evaluate.scores import spacing, tree
+from surfkit.evaluate.scores import surface_gap, tree
 from surfkit.evaluate.transform import apply, scale_of
 from surfkit.evaluate.visibility import visible_counts
 from surfkit.scene.scene import Frame, View
@@ -50,15 +50,15 @@ def visible_crop(
         enough: What is enough.
     """
     here = apply(np.linalg.inv(matrix), truth)
-    gap = spacing(tree(truth), truth[:: max(1, len(truth) // 100_000)]) / scale_of(matrix)
+    gap = surface_gap(tree(truth), truth[:: max(1, len(truth) // 100_000)]) / scale_of(matrix)
     counts = visible_counts(here, views, frame, gap)
     least = max(1, math.ceil(enough.share * len(views)))
     kept = truth[counts >= least]
     if len(kept) < 3:
         raise BadInput(
             f"--crop auto: {len(kept)} of {len(truth)} points of the truth are seen by {least} or more of {len(views)} "
-            f"views (the best one by {counts.max(initial=0)}): lower --visible, or, if the truth is in another frame or "
-            "unit, give --transform"
+            f"views (the best one by {counts.max(initial=0)}): lower --visible, or give --transform if "
+            "the truth is in another frame or unit"
         )
     along = kept[:, "xyz".index(enough.axis)]
     ground = kept[:, list(PLANES[enough.axis])]
