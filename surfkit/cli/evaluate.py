@@ -65,9 +65,7 @@ class Evaluate:
     def _geometry(self, truth: Path) -> None:
         this = opened(self.target) if self.target.is_dir() else None
         if this is not None and not this.mesh.exists():
-            raise BadInput(
-                f"{self.target}: no {this.mesh.name} in it; make one with surfkit mesh, or name a file instead"
-            )
+            raise BadInput(f"{self.target}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if this is None else this.out)
         scene = self._scene(this)
         found = measure_geometry(
@@ -83,9 +81,7 @@ class Evaluate:
     def _scene(self, this: Run | None) -> Scene | None:
         """The scene whose views make the crop volume; None where nobody names one."""
         if this is not None and self.views is not None:
-            raise BadInput(
-                f"--views {self.views}: a run has views of its own; leave it out, or name the run's mesh.ply"
-            )
+            raise BadInput(f"--views {self.views}: a run has views of its own; leave it out, or name a file")
         if this is not None:
             return read(this.data)
         if self.views is None:

@@ -15,7 +15,7 @@ LEFT, TOP, RIGHT, BOTTOM = 64, 44, 24, 56
 ONCE_MORE = 2
 """Drawn so many times larger and then reduced, so that lines are smooth."""
 INK, GRID = (40, 40, 40), (222, 222, 222)
-LINES = {"precision": (30, 100, 190), "recall": (222, 120, 20), "F1": (90, 90, 90)}
+LINES = {"F1": (200, 200, 200), "precision": (30, 100, 190), "recall": (222, 120, 20)}
 
 
 def write_chart(path: Path, taus: np.ndarray, values: np.ndarray, tau: float, title: str) -> None:
@@ -46,8 +46,8 @@ def write_chart(path: Path, taus: np.ndarray, values: np.ndarray, tau: float, ti
     pen.text((at(tau, 0)[0] + 5 * ONCE_MORE, at(0, 0)[1] - 6 * ONCE_MORE), "tau", INK, font, "ls")
     total = values.sum(1)
     f1 = np.divide(2 * values.prod(1), total, out=np.zeros_like(total), where=total > 0)
-    for color, line in zip(LINES.values(), (*values.T, f1), strict=True):
-        pen.line([at(x, y) for x, y in zip(taus, line, strict=True)], color, 2 * ONCE_MORE, "curve")
+    for color, line, wide in zip(LINES.values(), (f1, *values.T), (4, 2, 2), strict=True):
+        pen.line([at(x, y) for x, y in zip(taus, line, strict=True)], color, wide * ONCE_MORE, "curve")
     for i, (name, color) in enumerate(LINES.items()):
         pen.text(((LEFT + 90 * i) * ONCE_MORE, (SIZE[1] - 12) * ONCE_MORE), name, color, font, "ls")
     pen.text(((SIZE[0] - RIGHT) * ONCE_MORE, (SIZE[1] - 12) * ONCE_MORE), "distance", INK, font, "rs")

@@ -51,9 +51,9 @@ class Comparison:
 
     samples: int | None = None
     """Points drawn from a mesh. Left out, as many as it has vertices and faces, and for a coarse one enough to lie no
-    further apart than half of tau."""
+    further apart than 0.7 times tau."""
 
-    draws: int = 5
+    draws: int = 3
     """Times that the whole measurement is repeated with other random points, for the error bars."""
 
     align: Align = "similarity"

@@ -132,11 +132,11 @@ def write_views(out: Path, outcome: Outcome, views: Sequence[View], frame: Frame
     back = np.linalg.inv(draw.alignment.matrix)
     for i in range(min(PICTURES, len(views))):
         view = views[(2 * i + 1) * len(views) // (2 * min(PICTURES, len(views)))]
-        camera = view.camera.fitted(LONGEST_PX)
+        camera = view.camera.sized(LONGEST_PX)
         pose = frame.input_pose(camera.world_to_camera)
         gap = tau / scale_of(draw.alignment.matrix)
         parts = _parts(draw, tau)
         images = [seen_by(camera, pose, apply(back, points), colors, gap) for _, points, colors in parts]
         path = out / f"view{i}.png"
-        write_row(path, [f"{view.name}, {parts[0][0]}", parts[1][0]], images)
+        write_row(path, [caption for caption, _, _ in parts], images)
         emit(FileWritten(path, "geometry"))

@@ -20,6 +20,8 @@ from surfkit.evaluate.transform import apply
 
 MOST = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
+FOR_ICP = 400_000
+"""Points of the reconstruction that ICP thins and looks at: many more than seven numbers need."""
 LEAST = 10
 """Points on either side without which shares mean nothing."""
 SMALL = 0.1
@@ -78,15 +80,15 @@ def cloud_side(surface: Surface, voxel: float | None) -> Side:
 def mesh_side(surface: Surface, count: int | None, tau: float) -> Side:
     """A mesh, of which as many points are drawn as it has vertices and faces, as the paper does.
 
-    A coarse mesh gets more, so that they lie no further apart than half of tau: right surfaces would count as missing.
+    A coarse mesh gets more, so that they lie no further apart than 0.7 tau: right surfaces would count as missing.
     """
     if count is None:
-        needed = int(4 * float(face_areas(surface).sum()) / tau**2) + 1
+        needed = int(2 * float(face_areas(surface).sum()) / tau**2) + 1
         count = max(len(surface) + len(surface.faces), min(needed, MOST))
         if count < needed:
             emit(
                 Warned(
-                    f"{surface.path}: its {count} samples lie further apart than half of tau ({tau:.3g}), so right "
+                    f"{surface.path}: its {count} samples lie further apart than 0.7 times tau ({tau:.3g}), so right "
                     f"surfaces count as missing; give a larger --tau, or --samples {needed}"
                 )
             )
@@ -127,7 +129,8 @@ class Measurement:
 
     def clouds(self, voxel: float, matrix: np.ndarray) -> tuple[np.ndarray, object, np.ndarray]:
         """What a round of ICP compares (`registration.Clouds`)."""
-        moved = self.thinned(self.cropped(apply(matrix, self.source)), voxel)
+        few = self.source[:: max(1, len(self.source) // FOR_ICP)]
+        moved = self.thinned(self.cropped(apply(matrix, few)), voxel)
         return apply(np.linalg.inv(matrix), moved), *self.targets(voxel)
 
     def draw(self, start: np.ndarray, way: str) -> Draw:

@@ -11,7 +11,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
 LONGEST_PX = 800
-"""Of the depth maps; larger photographs are looked at in this size."""
+"""Of the depth maps, whatever size was trained on: the volume depends on the cameras alone."""
 COVER = 2.0
 """A point covers a square of this many gaps between points: of points strewn at random, 2 % leave a hole then."""
 BEHIND = 1.5
@@ -35,7 +35,7 @@ def visible_counts(points: np.ndarray, views: Sequence[View], frame: Frame, gap:
     """
     counts = np.zeros(len(points), np.int32)
     for done, view in enumerate(views, 1):
-        camera = view.camera.fitted(LONGEST_PX)
+        camera = view.camera.sized(LONGEST_PX)
         at, seen = visible(points, camera, frame.input_pose(camera.world_to_camera), gap)
         counts[at[seen]] += 1
         emit(Progress("counting the views of each point", done, len(views)))

@@ -47,6 +47,11 @@ class Camera:
         by = max(1.0, max(self.width, self.height) / longest)
         return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
 
+    def sized(self, longest: int) -> Camera:
+        """The same camera with a longest side of `longest` pixels."""
+        by = max(self.width, self.height) / longest
+        return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
+
     def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
         x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx
