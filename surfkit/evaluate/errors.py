@@ -21,6 +21,8 @@ LONGEST_PX = 720
 """Of each part of a picture."""
 PAPER, INK = (255, 255, 255), (40, 40, 40)
 CAPTION_PX = 24
+SHADE, MOST_BEHIND = 0.04, 3.0
+"""How dark a neighbour that lies one unit nearer makes a pixel, and the most units that count."""
 
 
 def coloured(distances: np.ndarray, tau: float) -> np.ndarray:
@@ -45,8 +47,9 @@ def seen_by(camera: Camera, pose: np.ndarray, points: np.ndarray, colors: np.nda
         spacing: Between neighbouring points.
     """
     at, x, y, z = pictured(points, camera, pose)
-    _, rows = nearest_rows(x, y, z, sides(spacing * max(camera.fx, camera.fy) / z), (camera.height, camera.width))
-    return np.concatenate([colors[at], [PAPER]])[rows].astype(np.uint8)
+    focal = max(camera.fx, camera.fy)
+    depth, rows = nearest_rows(x, y, z, sides(spacing * focal / z), (camera.height, camera.width))
+    return shaded(np.concatenate([colors[at], [PAPER]])[rows], depth, np.maximum(depth / focal, spacing))
 
 
 def from_above(
@@ -68,8 +71,28 @@ def from_above(
     inside = ((spots >= 0) & (spots < (width, height))).all(1)
     x, y = spots[inside].astype(np.int64).T
     side = sides(np.full(len(x), spacing / pixel))
-    _, rows = nearest_rows(x, y, -points[inside, "xyz".index(up)], side, (int(height), int(width)))
-    return np.concatenate([colors[inside], [PAPER]])[rows].astype(np.uint8)[::-1]
+    depth, rows = nearest_rows(x, y, -points[inside, "xyz".index(up)], side, (int(height), int(width)))
+    picture = np.concatenate([colors[inside], [PAPER]])[rows]
+    return shaded(picture, depth, np.full(depth.shape, max(pixel, spacing)))[::-1]
+
+
+def shaded(picture: np.ndarray, depth: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: a picture of points, darker where neighbours lie nearer, so that shapes are seen without normals.
+
+    Args:
+        picture: (H, W, 3) colours.
+        depth: (H, W), inf where nothing is.
+        unit: (H, W) difference of depth that counts as one.
+    """
+    behind = np.zeros(depth.shape)
+    there = np.isfinite(depth)
+    for reach in (1, 3):
+        for shift, axis in ((reach, 0), (-reach, 0), (reach, 1), (-reach, 1)):
+            beside = np.roll(depth, shift, axis)
+            known = there & np.isfinite(beside)
+            step = np.where(known, depth, 0) - np.where(known, beside, 0)
+            behind += np.where(known, step / np.where(there, unit, 1), 0).clip(0, MOST_BEHIND)
+    return np.where(there[..., None], picture * np.exp(-SHADE * behind)[..., None], picture).astype(np.uint8)
 
 
 def write_plan(
