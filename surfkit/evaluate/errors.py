@@ -77,7 +77,7 @@ def from_above(
 
 
 def shaded(picture: np.ndarray, depth: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: a picture of points, darker where neighbours lie nearer, so that shapes are seen without normals.
+    """(H, W, 3) uint8: a picture of points, darker where neighbours lie nearer: shapes are seen without normals.
 
     Args:
         picture: (H, W, 3) colours.

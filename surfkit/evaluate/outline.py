@@ -7,7 +7,8 @@ import numpy as np
 from surfkit.core.check import BadInput
 
 CELLS = 8
-"""Points closer than a radius over this are one, so that the triangulation stays small."""
+"""Points closer than a radius over this, or than the extent over the next, are one: the triangulation stays small."""
+FINEST = 400
 STRAY = 0.01
 """Pieces of less than this share of the area do not count."""
 
@@ -23,7 +24,8 @@ def outline(points: np.ndarray, radius: float) -> np.ndarray:
     """
     from scipy.spatial import Delaunay, QhullError
 
-    points = _spread(points, radius / CELLS)
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    points = _spread(points, min(radius / CELLS, extent / FINEST)) if extent > 0 else points[:1]
     centre = points.mean(0) if len(points) else 0.0
     try:
         triangles = Delaunay(points - centre).simplices if len(points) > 2 else None
@@ -43,7 +45,7 @@ def outline(points: np.ndarray, radius: float) -> np.ndarray:
 
 def _spread(points: np.ndarray, cell: float) -> np.ndarray:
     """One point in each square cell: the first."""
-    at = np.floor((points - points.min(0)) / cell).astype(np.int64) if len(points) else np.empty((0, 2), np.int64)
+    at = np.floor((points - points.min(0)) / cell).astype(np.int64)
     _, first = np.unique(at, axis=0, return_index=True)
     return points[np.sort(first)]
 

@@ -14,9 +14,9 @@ LONGEST_PX = 800
 """Of the depth maps, whatever size was trained on: the volume depends on the cameras alone."""
 COVER = 2.0
 """A point covers a square of this many gaps between points: of points strewn at random, 2 % leave a hole then."""
-BEHIND = 1.5
+BEHIND = 3.0
 """Widths of such a square, or of a pixel, by which a point may lie behind the nearest one and still be seen: surfaces
-that are turned away by up to 56 degrees hide nothing of themselves."""
+that are turned away by up to 63 degrees hide nothing of themselves."""
 SIDES = np.array([1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024])
 """Of the squares, pixels."""
 
