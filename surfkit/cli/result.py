@@ -8,6 +8,14 @@ from typing import Any
 from surfkit.cli.table import print_table
 from surfkit.folder import Run
 
+LPIPS = {
+    "lpips_vgg": "LPIPS VGG",
+    "lpips_vgg_unscaled": "LPIPS VGG, as 3DGS",
+    "lpips_alex": "LPIPS Alex",
+    "lpips_alex_unscaled": "LPIPS Alex, [0, 1]",
+}
+"""Names in metrics.json, and on the screen."""
+
 
 def show(this: Run, metrics: dict[str, Any]) -> None:
     """Print a table of the metrics, and the paths of what was written."""
@@ -15,6 +23,9 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
     rows = [("views held out", str(len(images["per_image"])))]
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
+        rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
+    if lacking := images.get("lpips_not_measured"):
+        rows.append(("LPIPS", f"not measured: {lacking}"))
     rows += [
         ("points", f"{metrics['points']:,}"),
         ("steps", f"{metrics['steps']:,}"),
@@ -53,6 +64,7 @@ def show_geometry(out: Path, found: dict[str, Any]) -> None:
             "-" if one["residual"] is None else f"{one['residual']:.3g}",
         )
         for way, one in ways.items()
+        if one is not None
     ]
     print_table(("alignment", "P", "R", "F1", "size", "moved", "degrees", "residual"), rows)
     print()

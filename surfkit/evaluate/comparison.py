@@ -27,6 +27,7 @@ RESIZED = 0.02
 """Change of size by ICP above which it is told."""
 
 Align = Literal["similarity", "rigid", "none"]
+WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ class Outcome:
 
     Attributes:
         draws: With the alignment that counts, one for each repetition.
-        others: By way of aligning, from the first repetition; the one that counts too.
+        others: By way of aligning, from the first repetition; the one that counts too. None where too few points are
+            left to compare.
         tau: Threshold.
         matrix: (4, 4) that alignment began with.
         crop: Volume, or None for all of space.
@@ -102,7 +104,7 @@ class Outcome:
     """
 
     draws: tuple[Draw, ...]
-    others: dict[str, Draw]
+    others: dict[str, Draw | None]
     tau: float
     matrix: np.ndarray
     crop: Crop | None
@@ -135,14 +137,15 @@ def compare(
     first = theirs.points(np.random.default_rng(settings.seed))
     refuse_few(first, truth.path)
     crop, seen = volume(first, settings, views, frame, (matrix, tau))
-    draws, others = [], {}
+    draws: list[Draw] = []
+    others: dict[str, Draw | None] = {}
     for number in range(settings.draws):
         measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
         if number == 0:
             measure.refuse_strangers(matrix)
-            others = {way: measure.draw(matrix, way) for way in ("none", "rigid", "similarity")}
-            refuse_misfit(others[settings.align], tau)
-        draws.append(measure.draw(matrix, settings.align) if number else others[settings.align])
+        found = {way: measure.draw(matrix, way) for way in ((settings.align,) if number else WAYS)}
+        others = others or found
+        draws.append(usable(found[settings.align], tau))
         emit(Progress("measuring", number + 1, settings.draws))
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
@@ -196,8 +199,13 @@ def volume(
     return visible_crop(truth, views, frame, matrix, wanted)
 
 
-def refuse_misfit(draw: Draw, tau: float) -> None:
-    """BadInput if even after alignment the two are nowhere near each other."""
+def usable(draw: Draw | None, tau: float) -> Draw:
+    """The repetition, or BadInput if alignment left too little, or the two nowhere near each other."""
+    if draw is None:
+        raise BadInput(
+            f"after alignment fewer than {LEAST} points are left in the crop volume, thinned to half of tau "
+            f"({tau:.3g}): if frames or units differ, give --transform, else lower --tau or widen --crop"
+        )
     apart = min(float(np.median(draw.distances.to_truth)), float(np.median(draw.distances.to_reconstruction)))
     if apart > FAR_OFF * tau:
         residual = draw.alignment.residual
@@ -207,6 +215,7 @@ def refuse_misfit(draw: Draw, tau: float) -> None:
             f"apart, {apart / tau:.0f} times tau ({tau:.3g}), {left}, and {draw.alignment.matched:.0%} of the points "
             "have a partner; give --transform, or a larger --tau if that is how rough the reconstruction is"
         )
+    return draw
 
 
 def warn_of_size(change: float) -> None:

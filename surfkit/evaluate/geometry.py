@@ -70,7 +70,7 @@ def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
         "tau_from": "given" if settings.tau else "spacing of the truth",
         "align": settings.align,
         "draws": each,
-        "alignments": {way: _alignment(draw, outcome) for way, draw in outcome.others.items()},
+        "alignments": {way: draw and _alignment(draw, outcome) for way, draw in outcome.others.items()},
         "chamfer": chamfer(first.distances),
         "chamfer_dtu": {**chamfer(first.distances, far), "far": far},
         "points": {"reconstruction": len(first.reconstruction), "truth": len(first.truth)},

@@ -133,15 +133,15 @@ class Measurement:
         moved = self.thinned(self.cropped(apply(matrix, few)), voxel)
         return apply(np.linalg.inv(matrix), moved), *self.targets(voxel)
 
-    def draw(self, start: np.ndarray, way: str) -> Draw:
-        """Align in one way, and compare."""
+    def draw(self, start: np.ndarray, way: str) -> Draw | None:
+        """Align in one way, and compare; None where that leaves too few points to compare."""
         found = Alignment(start, 0.0, None)
         if way != "none":
             found = align(self.clouds, start, self.tau, with_scale=way == "similarity")
         ours = self.thinned(self.cropped(apply(found.matrix, self.source)), self.tau / 2)
         there, theirs = self.targets(self.tau / 2)
-        for points, path in zip((ours, theirs), self.paths, strict=True):
-            refuse_few(points, path, "after alignment, inside the crop volume and thinned to half of tau, ")
+        if min(len(ours), len(theirs)) < LEAST:
+            return None
         distances = Distances(nearest(there, ours), nearest(tree(ours), theirs))
         if way == "none":
             near = distances.to_truth[distances.to_truth < 2 * self.tau]
@@ -181,9 +181,7 @@ def said(ends: tuple[np.ndarray, np.ndarray]) -> str:
     return " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in zip(*ends, strict=True))
 
 
-def refuse_few(points: np.ndarray, path: Path, when: str = "") -> None:
+def refuse_few(points: np.ndarray, path: Path) -> None:
     """BadInput if shares of so few points would mean nothing."""
     if len(points) < LEAST:
-        raise BadInput(
-            f"{path}: {when}{len(points)} points; {LEAST} or more are needed, so lower --tau or widen --crop"
-        )
+        raise BadInput(f"{path}: {len(points)} points; {LEAST} or more are needed to compare with")

@@ -13,6 +13,8 @@ from surfkit.evaluate.transform import apply, fitted, scale_of
 ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
 """Voxel and reach of each round, multiples of tau (the Tanks and Temples toolbox, whose last round thins by count)."""
 ITERATIONS = 20
+RESIZED = 2.0
+"""Factor of size at which a round gives up."""
 CHANGE = 1e-6
 """Of the matched share and of the residual, as a share of it, at which a round is over."""
 MOST = 100_000
@@ -88,6 +90,8 @@ def icp(
         if near.sum() < 3 or residual == 0:
             return now
         matrix = fitted(source[near], target[partner[near]], with_scale)
+        if not 1 / RESIZED < np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) / start.scale < RESIZED:
+            return now  # the two do not fit, and a smaller one is always nearer
         found = Alignment(matrix, now.matched, now.residual)
     away, _ = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
     near = np.isfinite(away)

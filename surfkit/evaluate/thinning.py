@@ -11,8 +11,9 @@ from surfkit.evaluate.surface import Blocks
 
 BITS = 21
 """Of a voxel's index along each axis, so that all three fit into one integer."""
-COARSE = 512
-"""Voxels along the diagonal by which the area of a large cloud is estimated."""
+COARSE, SPARSE = 512, 0.2
+"""Voxels along the diagonal by which the area of a large cloud is estimated; larger ones where more than such a share
+of the points has a voxel of its own."""
 
 
 def thin(blocks: Iterable[np.ndarray], voxel: float, origin: np.ndarray) -> np.ndarray:
@@ -46,7 +47,9 @@ def voxel_for(blocks: Blocks, most: int) -> float:
     """Edge of voxels of which about `most` would have points: a surface fills them with the inverse square of it."""
     low, high = bounds(blocks())
     coarse = max(float(np.linalg.norm(high - low)) / COARSE, 1e-12)
-    filled = len(thin(blocks(), coarse, low))
+    count = sum(len(block) for block in blocks())
+    while (filled := len(thin(blocks(), coarse, low))) > max(1, SPARSE * count):
+        coarse *= 2
     return coarse * (filled / most) ** 0.5
 
 

@@ -60,16 +60,13 @@ def test_tau_is_taken_from_the_truth():
 
 def test_shifted_copies_by_hand():
     # Points 0.1 apart, thinned to voxels of 0.08, which no two share. Shifted by 1 along x, the last 10 of 60 columns
-    # of either lie alone: 0.1, 0.2, ... 1.0 from the other. Those up to and including 0.3 are within tau = 0.35.
-    outcome = compare(surface(lattice((1, 0, 0))), surface(lattice()), still(tau=0.35, voxel=None))
-    right = f1(outcome)
+    # of either lie alone: 0.1, 0.2, ... 1.0 from the other. The first of these is within tau = 0.16.
     thin = still(tau=0.16)
     assert f1(compare(surface(lattice((0, 0, 0.15))), surface(lattice()), thin)) == (1, 1, 1)
     assert f1(compare(surface(lattice((0, 0, 0.17))), surface(lattice()), thin)) == (0, 0, 0)
     by_hand = (60 - 10 + 1) / 60
     shifted = compare(surface(lattice((1, 0, 0))), surface(lattice()), still(tau=0.16))
     assert f1(shifted) == pytest.approx((by_hand,) * 3)
-    assert right == pytest.approx(((60 - 10 + 3) / 60,) * 3, abs=0.02)
 
 
 def test_alignment_takes_a_shift_away_and_size_only_where_it_may():
@@ -140,9 +137,9 @@ def test_a_large_cloud_is_thinned_while_it_is_read(monkeypatch):
 @pytest.mark.parametrize(
     ("reconstruction", "options", "message"),
     [
-        (lattice() + [1e6, 0, 0], {}, "lies 9.9.*e\\+05 away"),
+        (lattice() + [1e6, 0, 0], {}, r"lies 1e\+06 away"),
         (lattice() * 0.001, {}, "another unit"),
-        (lattice()[:, [0, 2, 1]] + [0, 60, 5], {"tau": 2.0}, "another frame or unit.*residual|ICP|away"),
+        (lattice()[:, [0, 2, 1]] + [0, 60, 5], {"tau": 2.0}, "another frame or unit: after alignment"),
         (lattice()[:5], {}, "5 points of the reconstruction"),
     ],
 )
@@ -208,8 +205,7 @@ def test_everything_is_written(tmp_path):
     assert rows["x"][missing].min() > 2.9
     for name in ("curve.png", "plan.png", "view1.png"):
         with Image.open(out / name) as picture:
-            pixels = np.asarray(picture).astype(int)
-            assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20, name
+            assert len(picture.getcolors(1 << 20)) > 20, name
     assert read_surface(out / "precision.ply").vertices().shape[1] == 3
     again = measure_geometry(files, Comparison(draws=2, align="rigid", crop=str(out / "crop.json")), tmp_path / "again")
     assert again["f1"] == found["f1"]
