@@ -64,7 +64,7 @@ class Comparison:
     """Share of the training views that must see a point for it to lie in the volume of `--crop auto`."""
 
     radius: float | None = None
-    """Of the alpha shape around the visible ground, in units of the truth; 5 % of the diagonal if left out."""
+    """Of the alpha shape around the visible ground, in units of the truth; 2 % of the diagonal if left out."""
 
     up: Axis = "z"
     """Axis of the truth's frame that stands on the ground."""

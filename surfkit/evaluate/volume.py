@@ -16,8 +16,9 @@ from surfkit.evaluate.transform import apply, scale_of
 from surfkit.evaluate.visibility import visible_counts
 from surfkit.scene.scene import Frame, View
 
-RADIUS = 0.05
-"""Of the alpha shape, as a share of the diagonal of the visible ground (the paper's 50 m on a square kilometre)."""
+RADIUS = 0.02
+"""Of the alpha shape, as a share of the diagonal of the visible ground: half of the paper's 50 m on a square kilometre,
+as holes are filled here."""
 
 
 @dataclass(frozen=True)
