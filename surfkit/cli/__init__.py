@@ -19,7 +19,7 @@ from surfkit.core.check import BadInput, Fault
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
-    "evaluate": "Measure a finished run on the photographs it has not seen.",
+    "evaluate": "Measure a finished run on photographs it has not seen, or its mesh against true geometry.",
     "status": "Tell where a run stands.",
     "export": "Write the result of a run for other programs.",
     "prepare": "Make what a data set may need before training: `prepare depth`.",
