@@ -57,9 +57,8 @@ class Evaluate:
         with noted(), shown():
             if self.gt is not None:
                 return self._geometry(self.gt)
-            for name in ("views", "out"):
-                if getattr(self, name) is not None:
-                    raise BadInput(f"--{name} is for measuring geometry: give --gt, too")
+            if (self.views, self.out, self.geometry) != (None, None, Comparison()):
+                raise BadInput("--views, --out and the options of the comparison are for geometry: give --gt, too")
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             this, state, scene = load_run(self.target)
@@ -67,6 +66,8 @@ class Evaluate:
             show(this, evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights))
 
     def _geometry(self, truth: Path) -> None:
+        if self.lpips_weights != "auto" or self.device != "auto":
+            raise BadInput("--lpips-weights and --device are for photographs: leave them out, or --gt")
         this = opened(self.target) if self.target.is_dir() else None
         if this is not None and not this.mesh.exists():
             raise BadInput(f"{self.target}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")

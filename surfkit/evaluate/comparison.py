@@ -80,6 +80,8 @@ class Comparison:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0")
+        if self.seed < 0:
+            raise BadInput(f"--seed {self.seed}: give 0 or more")
         if self.draws < 1:
             raise BadInput(f"--draws {self.draws}: give 1 or more")
         if self.samples is not None and self.samples < LEAST:

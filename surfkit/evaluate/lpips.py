@@ -71,16 +71,16 @@ class Perceptual:
             unscaled: Give the network [0, 1] in place of the [-1, 1] that it was made for, as the published tables of
                 Gaussian splatting do; the distances are smaller.
         """
-        total = torch.zeros((), dtype=torch.float64)
+        total = 0.0
         with torch.inference_mode():
-            pair = torch.stack([a, b]).float().cpu()
+            pair = torch.stack([a, b]).to(self.heads[0])
             for head, (one, two) in zip(self.heads, self._features(pair if unscaled else 2 * pair - 1), strict=True):
                 apart = ((one - two).square() * head[:, None, None]).sum(0)
-                total += apart.mean() if mask is None else _mean_where(apart, mask)
-        return float(total)
+                total += float(apart.mean() if mask is None else _mean_where(apart, mask))
+        return total
 
     def _features(self, pair: Tensor) -> Iterator[Tensor]:
-        x = (pair - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
+        x = (pair - pair.new_tensor(SHIFT)[:, None, None]) / pair.new_tensor(SCALE)[:, None, None]
         for step in PLANS[self.net]:
             if step == "out":
                 yield x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
@@ -93,7 +93,7 @@ class Perceptual:
 
 def _mean_where(apart: Tensor, mask: Tensor) -> Tensor:
     """Mean of an (h, w) map, each place weighted by the share of its pixels that count in the (H, W) mask."""
-    weight = functional.adaptive_avg_pool2d(mask.float().cpu()[None, None], apart.shape)[0, 0]
+    weight = functional.adaptive_avg_pool2d(mask.to(apart)[None, None], apart.shape)[0, 0]
     return (apart * weight).sum() / weight.sum().clamp_min(1e-12)
 
 
@@ -202,7 +202,8 @@ def _carried(net: Net, path: Path) -> Perceptual:
 
 def _checked(net: Net, kernels: list[Tensor], biases: list[Tensor], heads: list[Tensor]) -> Perceptual:
     """The network, if the sizes of its parts fit together."""
-    kernels, biases, heads = ([part.float() for part in parts] for parts in (kernels, biases, heads))
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    kernels, biases, heads = ([part.to(device, torch.float32) for part in parts] for parts in (kernels, biases, heads))
     channels, compared = 3, []
     for step in PLANS[net]:
         if step == "out":

@@ -73,7 +73,7 @@ def cloud_side(surface: Surface, voxel: float | None) -> Side:
     if voxel is None:
         voxel = voxel_for(surface.blocks, MOST)
         emit(Warned(f"{surface.path}: {len(surface)} points, thinned to one in each voxel of {voxel:.3g}"))
-    cloud = thin(surface.blocks(), voxel, next(surface.blocks()).min(0))
+    cloud = thin(surface.blocks(), voxel, next(block[0] for block in surface.blocks() if len(block)))
     return Side(surface, cloud, len(cloud), voxel)
 
 

@@ -74,6 +74,8 @@ def test_a_file_needs_no_run(folder, capsys, tmp_path, views):
         (["{f}/truth.ply", "--gt", "{f}/truth.ply"], "--crop auto needs the photographs"),
         (["{f}/truth.ply", "--gt", "{f}/nothing.ply", "--crop", "none"], "no such file"),
         (["{f}/run", "--views", "{f}/data"], "give --gt, too"),
+        (["{f}/run", "--tau", "0.3"], "give --gt, too"),
+        (["{f}/run", "--gt", "{f}/truth.ply", "--device", "cpu"], "are for photographs"),
         (["{f}/run", "--gt", "{f}/truth.ply", "--views", "{f}/data"], "a run has views of its own"),
         (["{f}/data", "--gt", "{f}/truth.ply"], "no run folder"),
         (["{f}/run", "--gt", "{f}/truth.ply", "--tau", "0"], "--tau 0: it is a length"),
