@@ -217,22 +217,22 @@ def odm(here: Path) -> None:
 
 def run_folder(here: Path, finished: bool = True) -> None:
     """A run that is finished, or stopped after its first step."""
-    from surfkit import pipeline
+    from surfkit import optimise
     from surfkit.cli import main
 
     colmap(here)
-    display = pipeline.Display
+    display = optimise.Display
 
     class Stopping(display):
         def show(self, done: Any) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
 
     if not finished:
-        pipeline.Display = Stopping
+        optimise.Display = Stopping
     try:
         status = main(TRAIN.replace("--steps 2", "--steps 2 --checkpoint-every 1").format(here=here).split())
     finally:
-        pipeline.Display = display
+        optimise.Display = display
     assert status == (0 if finished else 130), status
 
 

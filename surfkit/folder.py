@@ -15,7 +15,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, emit
+from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, emit
 from surfkit.core.registry import hookimpl, plugins, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
@@ -78,6 +78,11 @@ class Run:
     def mesh_pictures(self) -> Path:
         """Pictures of the mesh."""
         return self.out / "mesh_pictures"
+
+    @property
+    def mesh(self) -> Path:
+        """The surface, in the frame of the input."""
+        return self.out / "mesh.ply"
 
     @property
     def pictures(self) -> Path:
@@ -299,6 +304,14 @@ def noted() -> Iterator[Notes]:
         yield notes
     finally:
         plugins().unregister(notes)
+
+
+def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Put measurements into metrics.json beside those of other kinds that are there already, and return them all."""
+    metrics = (read_json(path, Any) if path.exists() else {}) | found
+    write_json(path, metrics)
+    emit(FileWritten(path, "metrics"))
+    return metrics
 
 
 def discard(*paths: Path) -> None:

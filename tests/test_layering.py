@@ -16,6 +16,7 @@ FLOORS = (
     "train partition compress mesh evaluate",
     "recipe",
     "folder",
+    "optimise",
     "surface",
     "pipeline",
     "report doctor",

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import pipeline
+from surfkit import optimise, pipeline
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
@@ -145,13 +145,13 @@ def test_a_file_in_the_place_of_the_folder_is_refused(data, recipe, tmp_path):
 def test_an_interrupted_run_goes_on_to_the_same_points(
     finished, data, recipe, tmp_path, monkeypatch, capsys, number, at
 ):
-    class Interrupting(pipeline.Display):
+    class Interrupting(optimise.Display):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "Display", Interrupting)
+        patch.setattr(optimise, "Display", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path)
     assert f"stopped after step {at} of 60; the same command goes on" in capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
 
 def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
     written = []
-    monkeypatch.setattr(pipeline.checkpoint, "save", lambda path, state: written.append(state.index))
+    monkeypatch.setattr(optimise.checkpoint, "save", lambda path, state: written.append(state.index))
     run(with_steps(recipe, 10), data, tmp_path, every=Every(4))
     assert written == [4, 8, 10]
 

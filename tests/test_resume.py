@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import pipeline
+from surfkit import optimise, pipeline
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core import journal, lock
@@ -67,13 +67,13 @@ def steps(out):
 def interrupted(recipe, data, out, at, monkeypatch, **settings):
     """A run that is asked to stop after a step."""
 
-    class Interrupting(pipeline.Display):
+    class Interrupting(optimise.Display):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "Display", Interrupting)
+        patch.setattr(optimise, "Display", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, out, **settings)
 
@@ -320,7 +320,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
 
 
 def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_path, monkeypatch):
-    step = pipeline.Trainer.step
+    step = optimise.Trainer.step
 
     def short(self, state):
         if state.index == 12:
@@ -328,7 +328,7 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
         return step(self, state)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline.Trainer, "step", short)
+        patch.setattr(optimise.Trainer, "step", short)
         with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
             run(recipe, data, tmp_path / "run", every=Every(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
@@ -361,7 +361,7 @@ def test_out_of_memory_lowers_the_cache_first(data, recipe, tmp_path, monkeypatc
 
 def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkeypatch):
     free = iter([1 << 30, 100 << 20])  # looked at every ten steps
-    monkeypatch.setattr(pipeline, "free_bytes", lambda: next(free))
+    monkeypatch.setattr(optimise, "free_bytes", lambda: next(free))
     assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
     assert len(notes(tmp_path / "run")) == 1
     assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")

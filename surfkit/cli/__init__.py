@@ -20,7 +20,7 @@ from surfkit.core.check import BadInput, Fault
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
-    "evaluate": "Measure a finished run on the photographs it has not seen.",
+    "evaluate": "Measure a finished run on photographs it has not seen, or its mesh against true geometry.",
     "doctor": "Examine a data set before training: faults, and what a run takes.",
     "status": "Tell where a run stands.",
     "export": "Write the result of a run for other programs.",

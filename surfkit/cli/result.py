@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from surfkit.cli.table import print_table
 from surfkit.folder import Run
+
+LPIPS = {
+    "lpips_vgg": "LPIPS VGG",
+    "lpips_vgg_unscaled": "LPIPS VGG, as 3DGS",
+    "lpips_alex": "LPIPS Alex",
+    "lpips_alex_unscaled": "LPIPS Alex, [0, 1]",
+}
+"""Names in metrics.json, and on the screen."""
 
 
 def show(this: Run, metrics: dict[str, Any]) -> None:
@@ -14,6 +23,9 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
     rows = [("views held out", str(len(images["per_image"])))]
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
+        rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
+    if lacking := images.get("lpips_not_measured"):
+        rows.append(("LPIPS", f"not measured: {lacking}"))
     rows += [
         ("points", f"{metrics['points']:,}"),
         ("steps", f"{metrics['steps']:,}"),
@@ -23,6 +35,8 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
     if metrics["fps"]:
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
+    if "geometry" in metrics:
+        rows += geometry_rows(metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
     written = [("metrics", this.metrics), ("points", this.cloud)]
@@ -33,3 +47,47 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
         print(f"... and {len(pictures) - 8} more pictures in {this.pictures}")
+
+
+def show_geometry(out: Path, found: dict[str, Any]) -> None:
+    """Print tables of how close a surface is to the truth, and the paths of what was written."""
+    print_table(("geometry", "value"), geometry_rows(found))
+    print()
+    ways = found["alignments"]
+    rows = [
+        (
+            way,
+            f"{one['precision']:.3f}",
+            f"{one['recall']:.3f}",
+            f"{one['f1']:.3f}",
+            f"{one['scale'] - 1:+.4%}",
+            f"{one['moved']:.3g}",
+            f"{one['turned_degrees']:.3g}",
+            "-" if one["residual"] is None else f"{one['residual']:.3g}",
+        )
+        for way, one in ways.items()
+        if one is not None
+    ]
+    print_table(("alignment", "P", "R", "F1", "size", "moved", "degrees", "residual"), rows)
+    print()
+    written = [out / "metrics.json", *sorted(path for path in (out / "geometry").iterdir() if path.is_file())]
+    print_table(("written",), [(str(path),) for path in written])
+
+
+def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """What metrics.json says of the geometry, for people."""
+
+    def figure(name: str) -> str:
+        error = found[f"{name}_std"]
+        return f"{found[name]:.4f}" + ("" if error is None else f" +- {error:.4f}")
+
+    crop = found["crop"]
+    where = "all" if crop is None else f"area {crop['area']:.0f}, heights {crop['low']:.4g} to {crop['high']:.4g}"
+    rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
+    rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
+    for label, name in (("chamfer", "chamfer"), ("chamfer, as DTU", "chamfer_dtu")):
+        values = [found[name][part] for part in ("accuracy", "completeness", "overall")]
+        texts = ["-" if value is None else f"{value:.3g}" for value in values]
+        rows.append((label, f"{texts[0]} accuracy, {texts[1]} completeness, {texts[2]} overall"))
+    counts = found["points"]
+    return [*rows, ("points compared", f"{counts['reconstruction']:,} with {counts['truth']:,} of the truth")]

@@ -16,7 +16,8 @@ from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
 from surfkit.folder import Run
-from surfkit.pipeline import CHECKPOINT_EVERY, Every, run, with_steps
+from surfkit.optimise import CHECKPOINT_EVERY, Every
+from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard

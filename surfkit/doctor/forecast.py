@@ -17,7 +17,7 @@ from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.gather import heard
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, probe
-from surfkit.pipeline import CHECKPOINT_EVERY
+from surfkit.optimise import CHECKPOINT_EVERY
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data

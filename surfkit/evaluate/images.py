@@ -12,6 +12,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
+from surfkit.evaluate.lpips import Perceptual
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim, ssim_map
 from surfkit.scene.scene import View
@@ -79,6 +80,7 @@ def evaluate_views(
     show: Show | None = None,
     correct_color: bool = False,
     masks: Sequence[Tensor | None] | None = None,
+    networks: Sequence[Perceptual] = (),
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
@@ -92,6 +94,8 @@ def evaluate_views(
         show: Called once a view, to write pictures.
         correct_color: Also measure "psnr_corrected", of `color_corrected` renders.
         masks: Which pixels count, by position in `views`; a view without any is shown but not measured.
+        networks: Of LPIPS: also measure "lpips_NET" as defined, and "lpips_NET_unscaled" as the published tables of
+            Gaussian splatting have it.
     """
     per_image = {}
     for at, view in enumerate(views):
@@ -104,9 +108,10 @@ def evaluate_views(
         if mask is None or mask.any():
             render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
             per_image[view.name] = _measured(render, target, mask, correct_color)
+            per_image[view.name] |= perceived(networks, render, target, mask)
         if show is not None:
             show(view, photo, maps)
-    names = ("psnr", "ssim", *["psnr_corrected"] * correct_color)
+    names = ("psnr", "ssim", *["psnr_corrected"] * correct_color, *lpips_names(networks))
     means = {name: _mean([values[name] for values in per_image.values()]) for name in names}
     return {"images": {**means, "per_image": per_image}, "fps": frames_per_second(views, timed or draw)}
 
@@ -117,6 +122,22 @@ def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color:
     if correct_color:
         found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)
     return found
+
+
+def perceived(
+    networks: Sequence[Perceptual], render: Tensor, photo: Tensor, mask: Tensor | None = None
+) -> dict[str, float]:
+    """LPIPS of (3, H, W) images in [0, 1], as defined and unscaled, by name of the measure."""
+    return {
+        name: network.distance(render, photo, mask, unscaled)
+        for network in networks
+        for unscaled, name in zip((False, True), lpips_names([network]), strict=True)
+    }
+
+
+def lpips_names(networks: Sequence[Perceptual]) -> list[str]:
+    """Names of what networks measure."""
+    return [f"lpips_{network.net}{end}" for network in networks for end in ("", "_unscaled")]
 
 
 def frames_per_second(views: Sequence[View], draw: Draw, warmup: int = 2, most: int = 20) -> float | None:

@@ -53,6 +53,11 @@ class Camera:
         z = local[:, 2]
         return torch.stack([self.fx * local[:, 0] / z + self.cx, self.fy * local[:, 1] / z + self.cy, z], 1)
 
+    def sized(self, longest: int) -> Camera:
+        """The same camera with a longest side of `longest` pixels."""
+        by = max(self.width, self.height) / longest
+        return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
+
     def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
         """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
         x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx

@@ -8,7 +8,7 @@ import signal
 import pytest
 import torch
 
-from surfkit import pipeline
+from surfkit import optimise, pipeline
 from surfkit.cli import main
 from surfkit.recipes.ablations import TABLES
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
@@ -61,13 +61,13 @@ def test_a_real_table_interrupted_and_continued(scene, monkeypatch, tmp_path, ca
     command = ["ablate", "table:gradient", "--data", str(scene), "--steps", "4", "--rows", "1", "SSIM"]
     stop = ["--out", "stopped"]
 
-    class Interrupting(pipeline.Display):
+    class Interrupting(optimise.Display):
         def show(self, done):
             if done.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "Display", Interrupting)
+        patch.setattr(optimise, "Display", Interrupting)
         assert main([*command, *stop]) == 130
     said = capsys.readouterr().err
     assert "stopped after step 2 of 4" in said and "stopped keeps what is finished; the same command goes on" in said

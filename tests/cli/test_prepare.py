@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import pipeline
+from surfkit import optimise
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.tree import evolve
@@ -49,7 +49,7 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
     recipe = with_steps(evolve(recipes()["2dgs"], "primitive.sh_degree", 0), 60)
     losses = recipe.pretrain.losses | {"depth": DepthRegression()}
     seen = []
-    step = pipeline.Trainer.step
+    step = optimise.Trainer.step
 
     def watched(self, state):
         done = step(self, state)
@@ -57,7 +57,7 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
         return done
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline.Trainer, "step", watched)
+        patch.setattr(optimise.Trainer, "step", watched)
         run(evolve(recipe, "pretrain.losses", losses), Data(farm, test_every=4), tmp_path / "run")
     assert len(seen) == 60 and max(seen) > 0  # as soon as rays get opaque
     assert json.loads((tmp_path / "run/run.json").read_text())["notes"] == []

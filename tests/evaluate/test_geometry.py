@@ -1,0 +1,211 @@
+"""Whole comparisons with known answers, what they write, and inputs that do not belong together."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from surfkit.core.check import BadInput
+from surfkit.evaluate import measurement
+from surfkit.evaluate.comparison import Comparison, compare
+from surfkit.evaluate.crop import Crop, write_crop
+from surfkit.evaluate.errors import coloured
+from surfkit.evaluate.geometry import measure_geometry
+from surfkit.evaluate.measurement import cloud_side
+from surfkit.evaluate.scores import shares
+from surfkit.evaluate.surface import Surface, read_surface
+from surfkit.evaluate.transform import apply, write_transform
+from surfkit.scene.ply import read_vertices, write_points
+from surfkit.scene.synthetic import Flight, photograph
+
+
+def lattice(shift=(0, 0, 0), side=60, step=0.1):
+    x, y = np.meshgrid(np.arange(side) * step, np.arange(side) * step)
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1) + shift
+
+
+def surface(points, faces=None):
+    return Surface("given", np.asarray(points, float), faces)
+
+
+def still(**others):
+    return Comparison(**{"crop": "none", "align": "none", "draws": 1} | others)
+
+
+def f1(outcome):
+    return shares(outcome.draws[0].distances, outcome.tau)
+
+
+BALL = trimesh.creation.icosphere(4, 5.0)
+GLOBE = surface(BALL.vertices, np.asarray(BALL.faces))
+
+
+@pytest.mark.parametrize("align", ["none", "rigid", "similarity"])
+def test_the_truth_against_itself(align):
+    assert f1(compare(GLOBE, GLOBE, still(align=align, tau=0.4))) == (1, 1, 1)
+    cloud = surface(lattice())
+    assert f1(compare(cloud, cloud, still(align=align))) == (1, 1, 1)
+
+
+def test_tau_is_taken_from_the_truth():
+    outcome = compare(surface(lattice()), surface(lattice()), still())
+    assert outcome.tau == pytest.approx(0.15)
+    assert compare(surface(lattice()), surface(lattice()), still(voxel=0.2)).tau == pytest.approx(0.3, rel=0.05)
+    with pytest.raises(BadInput, match="give --tau"):
+        compare(surface(lattice()), GLOBE, still())
+
+
+def test_shifted_copies_by_hand():
+    # Points 0.1 apart, thinned to voxels of 0.08, which no two share. Shifted by 1 along x, the last 10 of 60 columns
+    # of either lie alone: 0.1, 0.2, ... 1.0 from the other. The first of these is within tau = 0.16.
+    thin = still(tau=0.16)
+    assert f1(compare(surface(lattice((0, 0, 0.15))), surface(lattice()), thin)) == (1, 1, 1)
+    assert f1(compare(surface(lattice((0, 0, 0.17))), surface(lattice()), thin)) == (0, 0, 0)
+    by_hand = (60 - 10 + 1) / 60
+    shifted = compare(surface(lattice((1, 0, 0))), surface(lattice()), still(tau=0.16))
+    assert f1(shifted) == pytest.approx((by_hand,) * 3)
+
+
+def test_alignment_takes_a_shift_away_and_size_only_where_it_may():
+    truth = surface(BALL.vertices * [1, 1.3, 0.7], np.asarray(BALL.faces))
+    moved = surface(truth.rows * 1.08 + [0.05, -0.03, 0.02], truth.faces)
+    found = {way: f1(compare(moved, truth, still(tau=0.3, align=way)))[2] for way in ("none", "rigid", "similarity")}
+    assert found["similarity"] > 0.99 and found["rigid"] < 0.7 and found["none"] < 0.7
+    outcome = compare(moved, truth, still(tau=0.3))
+    assert outcome.others["similarity"].alignment.scale == pytest.approx(1 / 1.08, rel=2e-3)
+
+
+def test_the_whole_agrees_with_brute_force():
+    draw = np.random.default_rng(0)
+    truth = lattice() + draw.normal(0, 0.03, (3600, 3))
+    ours = lattice()[:1800] + draw.normal(0, 0.03, (1800, 3))
+    tau = 0.06
+    keep = [np.ones(len(p), bool) for p in (ours, truth)]
+    outcome = compare(surface(ours), surface(truth), still(tau=tau))
+    a, b = outcome.draws[0].reconstruction, outcome.draws[0].truth
+    assert 0.8 * keep[0].sum() < len(a) <= len(ours)  # few share a voxel
+    assert cKDTree(ours).query(a)[0].max() < tau
+    near = np.sqrt(((a[:, None] - b[None]) ** 2).sum(2))
+    p, r = (near.min(1) < tau).mean(), (near.min(0) < tau).mean()
+    assert f1(outcome) == pytest.approx((p, r, 2 * p * r / (p + r)), abs=1e-6)
+
+
+def test_a_coarse_mesh_gets_enough_samples():
+    square = surface([[0, 0, 0], [6, 0, 0], [6, 6, 0], [0, 6, 0]], np.array([[0, 1, 2], [0, 2, 3]]))
+    p, r, _ = f1(compare(square, surface(lattice(side=61)), still(tau=0.15)))
+    assert p > 0.999 and r > 0.999
+    assert f1(compare(square, surface(lattice(side=61)), still(tau=0.15, samples=200)))[1] < 0.5
+
+
+def test_draws_differ_and_seeds_repeat():
+    def run(seed):
+        truth = surface(BALL.vertices * 1.07, GLOBE.faces)
+        outcome = compare(GLOBE, truth, still(tau=0.4, draws=3, seed=seed))
+        return [shares(draw.distances, outcome.tau) for draw in outcome.draws]
+
+    first, again, other = run(1), run(1), run(2)
+    assert first == again != other and len(set(first)) == 3
+    assert np.std([draw[2] for draw in first]) < 0.02
+
+
+def test_a_given_transform_and_crop(tmp_path):
+    matrix = np.eye(4)
+    matrix[:3, :3] = 2 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    matrix[:3, 3] = [100, 200, 300]
+    write_transform(tmp_path / "t.txt", matrix)
+    truth = surface(apply(matrix, lattice()))
+    corners = np.array([[94.05, 200.05], [101, 200.05], [101, 206.05], [94.05, 206.05]])
+    write_crop(tmp_path / "c.json", Crop(corners, 299, 301))
+    settings = still(transform=tmp_path / "t.txt", crop=str(tmp_path / "c.json"), tau=0.3)
+    outcome = compare(surface(lattice()), truth, settings)
+    assert f1(outcome) == (1, 1, 1) and len(outcome.draws[0].truth) == 30 * 30
+    write_crop(tmp_path / "c.json", Crop(np.array([[0.0, 0], [1, 0], [1, 1]]), 0, 1))
+    with pytest.raises(BadInput, match="0 points of the reconstruction inside the crop volume.*--transform.*--crop"):
+        compare(surface(lattice()), truth, settings)
+
+
+def test_a_large_cloud_is_thinned_while_it_is_read(monkeypatch):
+    monkeypatch.setattr(measurement, "MOST", 1_000)
+    found = cloud_side(surface(lattice(side=200)), None)
+    assert 300 < len(found.cloud) < 3_000 and found.voxel > 0.3
+    assert len(cloud_side(surface(lattice(side=20)), None).cloud) == 400
+
+
+@pytest.mark.parametrize(
+    ("reconstruction", "options", "message"),
+    [
+        (lattice() + [1e6, 0, 0], {}, r"lies 1e\+06 away"),
+        (lattice() * 0.001, {}, "another unit"),
+        (lattice()[:, [0, 2, 1]] + [0, 60, 5], {"tau": 2.0}, "another frame or unit: after alignment"),
+        (lattice()[:5], {}, "5 points of the reconstruction"),
+    ],
+)
+def test_strangers_are_told(reconstruction, options, message):
+    with pytest.raises(BadInput, match=message):
+        compare(surface(reconstruction), surface(lattice()), still(**options))
+
+
+def test_half_of_all_far_off_is_another_frame():
+    draw = np.random.default_rng(0)
+    ours = draw.uniform(-30, 30, (4_000, 3))
+    with pytest.raises(BadInput, match="another frame or unit.*ICP residual.*give --transform"):
+        compare(surface(ours), surface(lattice() * [8, 8, 1] - [24, 24, 0]), still(tau=0.1, align="similarity"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tau": 0.0}, "--tau 0"),
+        ({"draws": 0}, "--draws 0"),
+        ({"samples": 3}, "--samples 3"),
+        ({"visible": 0.0}, "--visible 0"),
+        ({"far": float("nan")}, "--far nan"),
+    ],
+)
+def test_bad_settings(options, message):
+    with pytest.raises(BadInput, match=message):
+        Comparison(**options)
+
+
+def test_without_views_the_volume_must_be_given():
+    with pytest.raises(BadInput, match="--crop auto needs the photographs"):
+        compare(surface(lattice()), surface(lattice()), Comparison())
+
+
+def test_colours_tell_right_from_wrong():
+    colors = coloured(np.array([0, 0.999, 1.01, 9]), 1.0).astype(int)
+    assert colors[0, 2] > colors[0, 0] and colors[1, 2] > 2 * colors[1, 0]  # blue
+    assert colors[2, 0] > 2 * colors[2, 2] and colors[3, 0] > colors[3, 1]  # orange, dark red
+
+
+def test_everything_is_written(tmp_path):
+    synthetic = photograph(Flight(views=8, width=64, height=48, points=50, test_every=0)).scene
+    x, y = np.meshgrid(np.arange(-9, 9, 0.15), np.arange(-9, 9, 0.15))
+    ground = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
+    ours = ground[ground[:, 0] < 3] + [0, 0, 0.01]
+    grey = np.zeros((len(ground), 3), np.uint8)
+    write_points(tmp_path / "truth.ply", ground, grey)
+    write_points(tmp_path / "ours.ply", ours, grey[: len(ours)])
+    out, settings = tmp_path / "geometry", Comparison(draws=2, align="rigid", visible=0.5)
+    files = (tmp_path / "ours.ply", tmp_path / "truth.ply")
+    found = measure_geometry(files, settings, out, synthetic.train, synthetic.frame)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["precision"] > 0.99 and 0.4 < found["recall"] < 0.95 and 0 <= found["f1_std"] < 0.01
+    assert set(found["alignments"]) == {"none", "rigid", "similarity"} and found["crop"]["from"] == "auto"
+    assert found["alignments"]["rigid"]["scale"] == pytest.approx(1) and found["alignments"]["rigid"]["residual"] > 0
+    assert found["curve"]["precision"][4] == pytest.approx(found["draws"][0]["precision"])
+    names = {"crop.json", "transform.txt", "precision.ply", "recall.ply", "curve.png", "plan.png"}
+    assert {path.name for path in out.iterdir()} == names | {f"view{i}.png" for i in range(3)}
+    rows, _ = read_vertices(out / "recall.ply")
+    missing = rows["red"] > rows["blue"]
+    assert missing.mean() == pytest.approx(1 - found["draws"][0]["recall"], abs=1e-6)
+    assert rows["x"][missing].min() > 2.9
+    for name in ("curve.png", "plan.png", "view1.png"):
+        with Image.open(out / name) as picture:
+            assert len(picture.getcolors(1 << 20)) > 20, name
+    assert read_surface(out / "precision.ply").vertices().shape[1] == 3
+    again = measure_geometry(files, Comparison(draws=2, align="rigid", crop=str(out / "crop.json")), tmp_path / "again")
+    assert again["f1"] == found["f1"]

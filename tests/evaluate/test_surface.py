@@ -1,0 +1,127 @@
+"""Meshes and clouds from files of every kind, and what is wrong with bad ones."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
+from surfkit.core.registry import hookimpl, plugins
+from surfkit.evaluate import surface
+from surfkit.evaluate.surface import read_surface
+from surfkit.scene.ply import write_points
+
+BOX = trimesh.creation.box((1, 2, 3))
+
+
+@pytest.fixture
+def told():
+    """Texts of the warnings."""
+
+    class Ears:
+        texts = []
+
+        @hookimpl
+        def surfkit_event(self, event):
+            if isinstance(event, Warned):
+                self.texts.append(event.text)
+
+    ears = Ears()
+    ears.texts = []
+    plugins().register(ears, "ears")
+    yield ears.texts
+    plugins().unregister(ears)
+
+
+def binary_ply(path, vertices, faces, kind="<f4", corners=3):
+    """A mesh as the project writes it: uchar-counted int lists, colours between."""
+    word = {"<f4": "float", "<f8": "double"}[kind]
+    rows = np.zeros(len(vertices), [(axis, kind) for axis in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    for i, axis in enumerate("xyz"):
+        rows[axis] = np.asarray(vertices)[:, i]
+    lists = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", (corners,))])
+    lists["n"], lists["v"] = corners, np.asarray(faces).reshape(-1, corners)
+    properties = [f"property {word} {axis}" for axis in "xyz"] + [
+        f"property uchar {c}" for c in ("red", "green", "blue")
+    ]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties]
+    head += [f"element face {len(lists)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(head).encode() + rows.tobytes() + lists.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+def test_a_binary_mesh_is_mapped_as_trimesh_reads_it(tmp_path, kind):
+    path = binary_ply(tmp_path / "mesh.ply", BOX.vertices + 1e6 * (kind == "<f8"), BOX.faces, kind)
+    found, other = read_surface(path), trimesh.load(path, process=False)
+    assert np.array_equal(found.vertices(), other.vertices) and np.array_equal(found.faces, other.faces)
+    assert isinstance(found.rows, np.memmap)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "off", "glb"])
+def test_other_meshes(tmp_path, suffix):
+    path = tmp_path / f"mesh.{suffix}"
+    BOX.export(path)
+    found = read_surface(path)
+    corners = found.vertices()[found.faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert areas.sum() == pytest.approx(22, rel=1e-5)
+
+
+def test_text_files(tmp_path):
+    (tmp_path / "mesh.ply").write_bytes(trimesh.exchange.ply.export_ply(BOX, encoding="ascii"))
+    assert np.allclose(read_surface(tmp_path / "mesh.ply").vertices(), BOX.vertices)
+    (tmp_path / "cloud.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+        "1 2 3\n4 5 6\n"
+    )
+    cloud = read_surface(tmp_path / "cloud.ply")
+    assert cloud.faces is None and cloud.vertices().tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_a_cloud_comes_in_blocks(tmp_path, monkeypatch, told):
+    xyz = np.random.default_rng(0).normal(size=(1000, 3))
+    xyz[[3, 700]] = np.nan
+    write_points(tmp_path / "cloud.ply", xyz, np.zeros((1000, 3), np.uint8))
+    monkeypatch.setattr(surface, "BLOCK", 300)
+    blocks = list(read_surface(tmp_path / "cloud.ply").blocks())
+    assert [len(block) for block in blocks] == [299, 300, 299, 100]
+    assert np.array_equal(np.concatenate(blocks), xyz[np.isfinite(xyz).all(1)])
+    assert told == [f"{tmp_path / 'cloud.ply'}: 2 of 1000 points are not finite and are left out"]
+
+
+def test_faces_at_vertices_that_are_not_finite_go(tmp_path, told):
+    vertices = BOX.vertices.copy()
+    vertices[0] = np.inf
+    found = read_surface(binary_ply(tmp_path / "mesh.ply", vertices, BOX.faces))
+    assert len(found.faces) == (BOX.faces != 0).all(1).sum() and len(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "vertices", "faces", "corners", "message"),
+    [
+        ("without", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [], 3, "a mesh without faces"),
+        ("empty", np.empty((0, 3)), [], 3, "no points in it"),
+        ("nan", np.full((3, 3), np.nan), [[0, 1, 2]], 3, "none of its 3 points is finite"),
+        ("far", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]], 3, "names vertex 3 of 3"),
+        ("quads", [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]] * 8, 4, "triangulate it"),
+    ],
+)
+def test_bad_meshes(tmp_path, name, vertices, faces, corners, message):
+    with pytest.raises(BadInput, match=message):
+        read_surface(binary_ply(tmp_path / f"{name}.ply", np.reshape(vertices, (-1, 3)), faces, corners=corners))
+
+
+def test_bad_files(tmp_path):
+    path = binary_ply(tmp_path / "mesh.ply", BOX.vertices, BOX.faces)
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(BadInput, match="cut off"):
+        read_surface(path)
+    (tmp_path / "text.ply").write_text("hello")
+    with pytest.raises(BadInput, match="does not begin with 'ply'"):
+        read_surface(tmp_path / "text.ply")
+    with pytest.raises(BadInput, match="no such file"):
+        read_surface(tmp_path / "missing.ply")
+    (tmp_path / "mesh.xyzzy").write_text("hello")
+    with pytest.raises(BadInput, match="cannot be read as a mesh"):
+        read_surface(tmp_path / "mesh.xyzzy")
