@@ -16,13 +16,13 @@ from surfkit.evaluate.measurement import LEAST, Draw, Measurement, Side, cloud_s
 from surfkit.evaluate.scores import spacing, tree
 from surfkit.evaluate.surface import Surface
 from surfkit.evaluate.transform import read_transform, scale_of
-from surfkit.evaluate.volume import Enough, visible_crop
+from surfkit.evaluate.volume import Enough, said, visible_crop
 from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5
 """Of the mean distance between neighbours in the truth (CityGaussianV2)."""
-FAR_OFF = 10.0
-"""Thresholds by which half of both clouds miss each other only where frames or units differ."""
+OFF, FAR_OFF = 2.0, 10.0
+"""Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
 RESIZED = 0.02
 """Change of size by ICP above which it is told."""
 
@@ -147,7 +147,7 @@ def compare(
             measure.refuse_strangers(matrix)
         found = {way: measure.draw(matrix, way) for way in ((settings.align,) if number else WAYS)}
         others = others or found
-        draws.append(usable(found[settings.align], tau))
+        draws.append(usable(found[settings.align], tau, quiet=number > 0))
         emit(Progress("measuring", number + 1, settings.draws))
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
@@ -201,7 +201,7 @@ def volume(
     return visible_crop(truth, views, frame, matrix, wanted)
 
 
-def usable(draw: Draw | None, tau: float) -> Draw:
+def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
     """The repetition, or BadInput if alignment left too little, or the two nowhere near each other."""
     if draw is None:
         raise BadInput(
@@ -209,14 +209,17 @@ def usable(draw: Draw | None, tau: float) -> Draw:
             f"({tau:.3g}): if frames or units differ, give --transform, else lower --tau or widen --crop"
         )
     apart = min(float(np.median(draw.distances.to_truth)), float(np.median(draw.distances.to_reconstruction)))
+    residual = draw.alignment.residual
+    left = "no pair is close enough to align by" if residual is None else f"the ICP residual is {residual:.3g}"
+    text = (
+        f"after alignment half of all points are more than {apart:.3g} apart, {apart / tau:.1f} times tau ({tau:.3g}), "
+        f"{left}, and {draw.alignment.matched:.0%} of the points have a partner; the reconstruction spans "
+        f"{said(draw.reconstruction)} then, and the truth {said(draw.truth)}"
+    )
     if apart > FAR_OFF * tau:
-        residual = draw.alignment.residual
-        left = "no pair is close enough to align by" if residual is None else f"the ICP residual is {residual:.3g}"
-        raise BadInput(
-            f"the truth is in another frame or unit: after alignment half of all points are more than {apart:.3g} "
-            f"apart, {apart / tau:.0f} times tau ({tau:.3g}), {left}, and {draw.alignment.matched:.0%} of the points "
-            "have a partner; give --transform, or a larger --tau if that is how rough the reconstruction is"
-        )
+        raise BadInput(f"the truth is in another frame or unit: {text}; give --transform, or a larger --tau")
+    if apart > OFF * tau and not quiet:
+        emit(Warned(f"the reconstruction is rough, or the truth is in another frame or unit (--transform): {text}"))
     return draw
 
 

@@ -17,6 +17,7 @@ from surfkit.evaluate.scores import Distances, nearest, tree
 from surfkit.evaluate.surface import Surface
 from surfkit.evaluate.thinning import thin, voxel_for
 from surfkit.evaluate.transform import apply
+from surfkit.evaluate.volume import said
 
 MOST = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
@@ -111,7 +112,7 @@ class Measurement:
         self.source = ours.points(draw)
         target = theirs.points(draw)
         self.target = self.cropped(target)
-        self.spans = spans(self.source), spans(target)
+        self.spans = said(self.source), said(target)
         self.offset = draw.random(3)
         self.targets = cache(self._target)
 
@@ -152,7 +153,7 @@ class Measurement:
     def refuse_strangers(self, matrix: np.ndarray) -> None:
         """BadInput if the two cannot lie in one frame."""
         moved = self.cropped(apply(matrix, self.source))
-        places = f"the reconstruction spans {said(self.spans[0])}, the truth {said(self.spans[1])}"
+        places = f"the reconstruction spans {self.spans[0]}, the truth {self.spans[1]}"
         remedy = "if frames or units differ, give --transform; if the crop volume is wrong, --crop"
         for points, what, path in zip((moved, self.target), ("reconstruction", "truth"), self.paths, strict=True):
             if len(points) < LEAST:
@@ -169,16 +170,6 @@ class Measurement:
             raise BadInput(
                 f"{self.paths[1]}: the truth lies {gap:.3g} away from the reconstruction: {places}; {remedy}"
             )
-
-
-def spans(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3,) least and (3,) greatest coordinates."""
-    return points.min(0), points.max(0)
-
-
-def said(ends: tuple[np.ndarray, np.ndarray]) -> str:
-    """A box in a few words."""
-    return " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in zip(*ends, strict=True))
 
 
 def refuse_few(points: np.ndarray, path: Path) -> None:

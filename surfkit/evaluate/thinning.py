@@ -11,6 +11,8 @@ from surfkit.evaluate.surface import Blocks
 
 BITS = 21
 """Of a voxel's index along each axis, so that all three fit into one integer."""
+MERGE_AT = 1 << 20
+"""Voxels that wait to be merged, at least."""
 COARSE, SPARSE = 512, 0.2
 """Voxels along the diagonal by which the area of a large cloud is estimated; larger ones where more than such a share
 of the points has a voxel of its own."""
@@ -30,7 +32,7 @@ def thin(blocks: Iterable[np.ndarray], voxel: float, origin: np.ndarray) -> np.n
     waiting: list[tuple[np.ndarray, np.ndarray]] = []
     for block in blocks:
         waiting.append(_grouped(_keys(block, voxel, origin), np.column_stack([block - origin, np.ones(len(block))])))
-        if sum(len(part) for part, _ in waiting) > max(len(keys), 1 << 20):
+        if sum(len(part) for part, _ in waiting) > max(len(keys), MERGE_AT):
             keys, sums = _merged([(keys, sums), *waiting])
             waiting = []
     keys, sums = _merged([(keys, sums), *waiting])

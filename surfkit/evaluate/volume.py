@@ -58,7 +58,8 @@ def visible_crop(
     if len(kept) < 3:
         raise BadInput(
             f"--crop auto: {len(kept)} of {len(truth)} points of the truth are seen by {least} or more of {len(views)} "
-            f"views (the best one by {counts.max(initial=0)}): lower --visible, or give --transform if "
+            f"views (the best one by {counts.max(initial=0)}); the truth spans {said(here)}, for the "
+            f"cameras, and these {said(centres(views, frame))}: lower --visible, or give --transform if "
             "the truth is in another frame or unit"
         )
     along = kept[:, "xyz".index(enough.axis)]
@@ -66,3 +67,13 @@ def visible_crop(
     radius = enough.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
     low, high = float(along.min()) - enough.margin, float(along.max()) + enough.margin
     return Crop(outline(ground, radius), low, high, enough.axis), len(kept)
+
+
+def centres(views: Sequence[View], frame: Frame) -> np.ndarray:
+    """(V, 3) float64 places of the cameras, input frame."""
+    return frame.to_input(np.stack([view.camera.centre.numpy() for view in views]))
+
+
+def said(points: np.ndarray) -> str:
+    """The box of (n, 3) points in a few words."""
+    return " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in zip(points.min(0), points.max(0), strict=True))

@@ -122,6 +122,7 @@ def test_a_given_transform_and_crop(tmp_path):
     settings = still(transform=tmp_path / "t.txt", crop=str(tmp_path / "c.json"), tau=0.3)
     outcome = compare(surface(lattice()), truth, settings)
     assert f1(outcome) == (1, 1, 1) and len(outcome.draws[0].truth) == 30 * 30
+    assert np.array_equal(outcome.draws[0].alignment.matrix, matrix)
     write_crop(tmp_path / "c.json", Crop(np.array([[0.0, 0], [1, 0], [1, 1]]), 0, 1))
     with pytest.raises(BadInput, match="0 points of the reconstruction inside the crop volume.*--transform.*--crop"):
         compare(surface(lattice()), truth, settings)
@@ -146,6 +147,11 @@ def test_a_large_cloud_is_thinned_while_it_is_read(monkeypatch):
 def test_strangers_are_told(reconstruction, options, message):
     with pytest.raises(BadInput, match=message):
         compare(surface(reconstruction), surface(lattice()), still(**options))
+
+
+def test_a_rough_fit_is_told(told):
+    compare(surface(lattice((0, 0, 0.5))), surface(lattice()), still(tau=0.16))
+    assert len(told) == 1 and "another frame or unit (--transform)" in told[0] and "0.5 apart, 3.1 times tau" in told[0]
 
 
 def test_half_of_all_far_off_is_another_frame():

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
+from surfkit.evaluate import thinning
 from surfkit.evaluate.registration import align
 from surfkit.evaluate.sampling import sample_surface
 from surfkit.evaluate.scores import Distances, chamfer, curve, nearest, shares, spacing, surface_gap, tree
@@ -51,7 +52,8 @@ def test_a_mesh_of_lines_has_no_area():
         sample_surface(Surface("flat.ply", np.zeros((3, 3)), np.array([[0, 1, 2]])), 10, rng())
 
 
-def test_thinning_is_the_mean_of_each_voxel_whatever_the_blocks():
+def test_thinning_is_the_mean_of_each_voxel_whatever_the_blocks(monkeypatch):
+    monkeypatch.setattr(thinning, "MERGE_AT", 100)
     points = rng().normal(size=(5_000, 3)) * [3, 2, 1] + [5e5, -2e6, 100]
     origin, voxel = points.min(0) - 0.1, 0.4
     cells = {}

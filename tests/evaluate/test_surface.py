@@ -5,32 +5,11 @@ import pytest
 import trimesh
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
-from surfkit.core.registry import hookimpl, plugins
 from surfkit.evaluate import surface
 from surfkit.evaluate.surface import read_surface
 from surfkit.scene.ply import write_points
 
 BOX = trimesh.creation.box((1, 2, 3))
-
-
-@pytest.fixture
-def told():
-    """Texts of the warnings."""
-
-    class Ears:
-        texts = []
-
-        @hookimpl
-        def surfkit_event(self, event):
-            if isinstance(event, Warned):
-                self.texts.append(event.text)
-
-    ears = Ears()
-    ears.texts = []
-    plugins().register(ears, "ears")
-    yield ears.texts
-    plugins().unregister(ears)
 
 
 def binary_ply(path, vertices, faces, kind="<f4", corners=3):
