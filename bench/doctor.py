@@ -1,7 +1,7 @@
 """How near the estimate of `surfkit doctor` is to what a run takes, once its number of points is known.
 
-Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, and not that
-of the rule of thumb for points. On a machine that does other things, compare times by their processor time only.
+Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, and not
+that of the rule of thumb for points. Times compare only on a machine that does nothing else.
 
 Usage: python bench/doctor.py [--data examples/boruszyn] [--steps 1000] [--scale 4]
 """
