@@ -1,7 +1,7 @@
 """How near the estimate of `surfkit doctor` is to what a run takes, once its number of points is known.
 
-Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, not that
-of the rule of thumb for points. On a machine that does other things, compare times by their processor time only.
+Trains, then estimates with the points that the run ended with: what is left is the error of the measurement, and not
+that of the rule of thumb for points. Times compare only on a machine that does nothing else.
 
 Usage: python bench/doctor.py [--data examples/boruszyn] [--steps 1000] [--scale 4]
 """
@@ -20,7 +20,8 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, forecast
-from surfkit.pipeline import Every, run, with_steps
+from surfkit.optimise import Every
+from surfkit.pipeline import run, with_steps
 from surfkit.scene.data import Data
 
 
