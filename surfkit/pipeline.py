@@ -147,7 +147,8 @@ def evaluate(
     lpips_weights: str = "auto",
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are."""
-    perceptual, lacking = networks(lpips_weights) if scene.held_out else ((), "no photograph is held out")
+    sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
+    perceptual, lacking = networks(lpips_weights, min(sides, default=0))
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 

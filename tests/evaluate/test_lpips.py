@@ -102,6 +102,13 @@ def test_both_layouts_give_one_network(folder, net, tmp_path):
     assert one == pytest.approx(two, rel=1e-6)
 
 
+@pytest.mark.parametrize("net", PLANS)
+def test_the_smallest_images(folder, net):
+    a, b = torch.rand(2, 3, 32, 40, generator=torch.Generator().manual_seed(2))
+    assert load_perceptual(net, str(folder)).distance(a, b) > 0
+    assert networks(str(folder), 31)[0] == () and "less than 32 pixels" in networks(str(folder), 31)[1]
+
+
 def test_masked_pixels_do_not_count(folder):
     a = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(2))
     spoilt, mask = a.clone(), torch.ones(64, 64, dtype=torch.bool)
