@@ -69,12 +69,14 @@ class Perceptual:
         Args:
             a: (3, H, W) in [0, 1].
             b: Likewise.
-            mask: (H, W) bool, False where pixels do not count.
+            mask: (H, W) bool, False where pixels do not count; there the images are alike to the network.
             unscaled: Give the network [0, 1] in place of the [-1, 1] that it was made for, as the published tables of
                 Gaussian splatting do; the distances are smaller.
         """
         total = 0.0
         with torch.inference_mode():
+            if mask is not None:
+                b = torch.where(mask, b, a)
             pair = torch.stack([a, b]).to(self.heads[0])
             for head, (one, two) in zip(self.heads, self._features(pair if unscaled else 2 * pair - 1), strict=True):
                 apart = ((one - two).square() * head[:, None, None]).sum(0)
