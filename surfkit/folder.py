@@ -15,7 +15,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import PhotoSkipped, Warned, emit
+from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, emit
 from surfkit.core.registry import hookimpl, plugins, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
@@ -24,6 +24,10 @@ from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
 from surfkit.scene.scene import Frame, Scene
+
+FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
+"""In a run folder."""
+FOLDERS = ("pretrain", "pictures", "progress")
 
 
 @dataclass(frozen=True)
@@ -82,9 +86,49 @@ class Run:
 
 
 def refuse_file(out: Path) -> None:
-    """BadInput if a file is in the place of a run folder."""
+    """BadInput if a file is in the place of a run folder, or a folder in the place of one of its files."""
     if out.exists() and not out.is_dir():
         raise BadInput(f"--out {out}: a file, not a folder; name another one")
+    for name in FILES:
+        if (out / name).is_dir():
+            raise BadInput(f"{out / name}: a folder, where the run keeps a file; delete it")
+    for name in FOLDERS:
+        if (out / name).is_file():
+            raise BadInput(f"{out / name}: a file, where the run keeps a folder; delete it")
+
+
+def refuse_no_run(out: Path) -> None:
+    """BadInput if a folder holds no run."""
+    if not (out / "recipe.json").exists() or not (out / "run.json").exists():
+        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
+
+
+def read_record(out: Path) -> dict[str, Any]:
+    """What run.json of a run folder says; empty where there is none.
+
+    Raises:
+        BadInput: It is damaged.
+    """
+    path = out / "run.json"
+    record = read_json(path, dict[str, Any]) if path.exists() else {}
+    for name in ("notes", "skipped"):
+        _require_texts(path, name, record.get(name, []))
+    if (memory := record.get("memory_bytes")) is not None:
+        load(dict[str, int], memory, f"{path}: memory_bytes")
+    return record
+
+
+def read_data(out: Path) -> Data:
+    """The data that a run was made from."""
+    try:
+        return load(Data, read_record(out).get("data"), "data")
+    except BadInput as error:
+        raise BadInput(f"{out / 'run.json'}: {error}") from error
+
+
+def _require_texts(path: Path, name: str, value: Any) -> None:
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise BadInput(f"{path}: {name} is not a list of texts; {path.parent} is damaged, begin in another folder")
 
 
 def refuse_other(this: Run) -> None:
@@ -100,7 +144,7 @@ def refuse_other(this: Run) -> None:
             )
         )
     if not found and this.record.exists():
-        before = dump(load(Data, read_json(this.record, Any).get("data"), "data"))  # with defaults of newer settings
+        before = dump(read_data(this.out))  # with defaults of newer settings
         found = difference(before, dump(this.data), "data")
     if found:
         at, old, new = found
@@ -117,7 +161,8 @@ def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
     """
     plain = difference(there, dump(this.recipe))
     now = this.recipe.pretrain.steps
-    before = there.get("pretrain", {}).get("steps") if isinstance(there, dict) else None
+    stage = there.get("pretrain") if isinstance(there, dict) else None
+    before = stage.get("steps") if isinstance(stage, dict) else None
     if not isinstance(before, int) or not 0 < before < now:
         return plain
     old = read_json(this.out / "recipe.json", Recipe)
@@ -161,7 +206,7 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
 
 def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
     """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
-    before = read_json(this.record, Any) if this.record.exists() else {}
+    before = read_record(this.out)
     notes.begin(
         this.record,
         {
@@ -186,11 +231,12 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Fra
 
 
 class Notes:
-    """Prints the warnings of a run, and keeps them and the photographs it passed over in run.json."""
+    """Prints the warnings of a run, and keeps them, the photographs it passed over and its memory in run.json."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
         self.skipped: list[str] = []
+        self.memory: dict[str, int] = {}
         self.path: Path | None = None
         self.facts: dict[str, Any] = {}
 
@@ -199,12 +245,14 @@ class Notes:
         self.path, self.facts = path, facts
         self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
         self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
+        self.memory = before.get("memory_bytes") or {}
         self.write()
 
     def write(self) -> None:
         """Save what there is."""
         if self.path is not None:
-            write_json(self.path, self.facts | {"notes": self.texts, "skipped": self.skipped})
+            found = {"notes": self.texts, "skipped": self.skipped, "memory_bytes": self.memory}
+            write_json(self.path, self.facts | found)
 
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
@@ -212,6 +260,10 @@ class Notes:
         if isinstance(event, Warned):
             say(f"note: {event.text}")
             self.keep(self.texts, event.text)
+        elif isinstance(event, MemoryTaken):
+            if event.parts["peak"] >= self.memory.get("peak", 0):
+                self.memory = dict(event.parts)
+                self.write()
         elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
             say(f"note: {event.reason}; the run goes on without this photograph")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.codec import load, read_json, write_json
-from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
@@ -21,30 +21,49 @@ from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw, evaluate_views, frames_per_second
+from surfkit.evaluate.metrics import read_metrics
 from surfkit.evaluate.pictures import panel, picture_path, write_picture
-from surfkit.folder import Run, claim, discard, noted, refuse_changed, refuse_file, refuse_other, say
+from surfkit.folder import (
+    Run,
+    claim,
+    discard,
+    noted,
+    read_data,
+    read_record,
+    refuse_changed,
+    refuse_file,
+    refuse_no_run,
+    refuse_other,
+    say,
+)
 from surfkit.primitives.base import to_table
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.recipe import Recipe
-from surfkit.scene.cache import Cache, share
 from surfkit.scene.cameras import write_cameras
 from surfkit.scene.data import Data
-from surfkit.scene.depth_prior import Priors, read_priors
-from surfkit.scene.masks import mask_cache, mask_sizes
-from surfkit.scene.memory import cache_bytes
+from surfkit.scene.masks import mask_cache
+from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
-from surfkit.train.faults import MOST_HALVINGS, Diverged, in_one_line
+from surfkit.train.faults import MOST_HALVINGS, Diverged, in_one_line, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
+from surfkit.train.material import Material, Store, read_ahead
+from surfkit.train.meter import Meter
 from surfkit.train.progress import Display
 from surfkit.train.stage import StageState, Trainer
 
 CHECKPOINT_EVERY = 500
+WATCH_EVERY = 10
+"""Steps between two looks at the free memory."""
+LEAST_FREE = 256 << 20
+"""Bytes of free memory; when there are fewer, the caches are lowered before the system ends the process."""
+AHEAD = 8
+"""Photographs in memory while held-out ones are measured: each is needed once."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +72,32 @@ class Every:
 
     Attributes:
         checkpoint: States of the optimisation.
-        pictures: Pictures of a few held-out views; 0 for none.
+        pictures: Pictures of a few held-out views; a fifth of the run if None, 0 for none.
     """
 
     checkpoint: int = CHECKPOINT_EVERY
-    pictures: int = 0
+    pictures: int | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the steps of a run are made with.
+
+    Attributes:
+        this: The run.
+        scene: Its data.
+        rasterizer: What draws.
+        every: When to write what.
+        given: What to look at.
+        meter: Sees what memory is taken by.
+    """
+
+    this: Run
+    scene: Scene
+    rasterizer: Rasterizer
+    every: Every
+    given: Material
+    meter: Meter
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
@@ -72,9 +112,8 @@ def run(
     data: Data,
     out: Path,
     device: Device = "auto",
-    checkpoint_every: int = CHECKPOINT_EVERY,
-    pictures_every: int | None = None,
-    cache: str = "auto",
+    every: Every | None = None,
+    store: Store | None = None,
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
 
@@ -83,9 +122,8 @@ def run(
         data: What to do it with.
         out: Run folder.
         device: Where to compute.
-        checkpoint_every: Steps between checkpoints.
-        pictures_every: Steps between pictures of a few held-out views; a fifth of the run if None, 0 for none.
-        cache: Memory for photographs, masks and depth priors, such as "4GB"; the result does not depend on it.
+        every: When checkpoints and pictures are written.
+        store: Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
 
     Raises:
         BadInput: `out` holds a run of another recipe or of other data, another process works in it, or the data cannot
@@ -94,31 +132,34 @@ def run(
         KeyboardInterrupt: The run was asked to stop, and has saved its state.
     """
     this = Run(out, recipe, replace(data, path=data.path.resolve()))
-    pictures_every = max(1, recipe.pretrain.steps // 5) if pictures_every is None else pictures_every
+    every, store, meter = every or Every(), store or Store(), Meter()
+    if every.pictures is None:
+        every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_file(out)
-    budget = cache_bytes(cache)
+    store.bytes()  # or BadInput, before anything is done
     with noted() as notes, held(out), in_one_line(out):
         sweep(out)
         refuse_other(this)
         scene = read(this.data)
+        meter.scene_read()
         rasterizer, backend = drawer(device)
         state = saved(this, scene, repair=True)
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         unfinished = state is None or state.index < recipe.pretrain.steps
-        given = read_ahead(this, scene, budget) if unfinished else None
+        given = read_ahead(this.data, scene, recipe.pretrain.losses, store) if unfinished else None
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
-            if unfinished:
+            if given is not None:
                 discard(this.metrics, this.cloud)
-                every = Every(checkpoint_every, pictures_every)
-                state = optimise(this, scene, rasterizer, state, every, given)
+                state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
+                del given  # its memory is free for what comes
             elif this.metrics.exists() and this.cloud.exists():
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
-                return read_json(this.metrics, Any)
+                return read_metrics(out)
             if not this.cloud.exists():
                 export(this, state, scene)
-            return evaluate(this, state, scene, rasterizer, budget)
+            return evaluate(this, state, scene, rasterizer)
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -142,85 +183,87 @@ def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
     return state
 
 
-@dataclass(frozen=True)
-class Material:
-    """What training looks at, by position of the view.
-
-    Attributes:
-        photos: (3, H, W) uint8.
-        masks: (H, W) bool or None.
-        priors: Estimated depths, if a loss of the recipe needs them and the data set has any.
-    """
-
-    photos: Cache[Tensor]
-    masks: Cache[Tensor | None] | None = None
-    priors: Priors | None = None
-
-    def expect(self, coming: Sequence[int]) -> None:
-        """Read in this order from now on."""
-        for cache in filter(None, (self.photos, self.masks, self.priors)):
-            cache.expect(coming)
-
-
-def read_ahead(this: Run, scene: Scene, budget_bytes: int) -> Material:
-    """The photographs, masks and depth priors of the training views, within a number of bytes."""
-    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if this.needs_priors else 0]
-    for_photos, for_masks, for_priors = share(budget_bytes, wanted)
-    priors = read_priors(this.data, scene, for_priors) if this.needs_priors else None
-    return Material(photo_cache(scene.train, for_photos), mask_cache(scene.train, for_masks), priors)
-
-
-def optimise(
-    this: Run,
-    scene: Scene,
-    rasterizer: Rasterizer,
-    state: StageState | None,
-    every: Every,
-    given: Material,
-) -> StageState:
+def optimise(job: Job, state: StageState | None) -> StageState:
     """Run the stage from its last state, or from the sparse points, to its end.
 
     After numbers that are not finite it goes back to its last checkpoint with half the learning rates, twice at most.
+    When memory gives out, it goes back with a smaller cache, until there is none.
     """
+    this, given = job.this, job.given
     stage, primitive = this.recipe.pretrain, this.recipe.primitive
-    sources = (given.photos, rasterizer, given.priors, given.masks, given.expect)
-    trainer = Trainer(stage, primitive, scene.train, *sources)
-    along = Along(this.out / "progress", scene.held_out) if every.pictures and scene.held_out else None
+    sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
+    trainer = Trainer(stage, primitive, job.scene.train, *sources)
+    along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
-        return trainer.begin(Points.fresh(primitive.init(scene.cloud, generator)), generator)
+        return trainer.begin(Points.fresh(primitive.init(job.scene.cloud, generator)), generator)
 
     if state is not None:
         say(f"{this.out}: going on after step {state.index} of {stage.steps}")
     state = state or begin()
     while True:
         try:
-            return take_steps(this, trainer, state, every, along)
+            return take_steps(job, trainer, state, along)
         except Diverged as error:
             state = rolled_back(this, state.halvings, error, begin)
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            if not lower(given, f"step {state.index + 1}: out of memory"):
+                raise out_of_memory(this.out, ", though photographs are no longer kept in it") from error
+            state = None  # the error and all that it holds go first
+        state = state or last_good(this, begin)
 
 
-def take_steps(this: Run, trainer: Trainer, state: StageState, every: Every, along: Along | None) -> StageState:
+def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | None) -> StageState:
     """Take the steps that are left, and write checkpoints and pictures on the way."""
+    this, every, meter = job.this, job.every, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
     emit(StageBegan("pretrain", steps, len(state.points), state.index + 1))
     with graceful() as request, Display("pretrain", steps) as display:
         for done in trainer.run(state):
             display.show(done)
+            meter.step(state, job.given)
+            if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
+                lower(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
             if along is not None and done.index % every.pictures == 0 and done.index < steps:
-                along.look(done.index, drawing(this, state, trainer.rasterizer))
+                with meter.adding("pictures"):
+                    along.look(done.index, drawing(this, state, trainer.rasterizer))
             if request.asked or done.index % every.checkpoint == 0 or done.index == steps:
-                state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
-                checkpoint.save(this.checkpoint, state)
-                emit(FileWritten(this.checkpoint, "checkpoint"))
+                save(this, state, meter)
             if request.asked:
                 break
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
     emit(StageEnded("pretrain", steps, len(state.points), state.seconds - seconds))
+    return state
+
+
+def save(this: Run, state: StageState, meter: Meter) -> None:
+    """Write a checkpoint, and what the memory is taken by."""
+    state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+    with meter.adding("checkpoints"):
+        checkpoint.save(this.checkpoint, state)
+    emit(FileWritten(this.checkpoint, "checkpoint"))
+    emit(MemoryTaken(meter.report()))
+
+
+def lower(given: Material, why: str) -> bool:
+    """Make the caches smaller, and say so; False if they are as small as can be."""
+    found = given.lower()
+    if found is not None:
+        before, after = (f"{count / 1e6:.3g} MB" for count in found)
+        emit(Warned(f"{why}; photographs, masks and depth priors in memory are lowered from {before} to {after}"))
+    return found is not None
+
+
+def last_good(this: Run, begin: Callable[[], StageState]) -> StageState:
+    """The state of the last checkpoint, or a new beginning."""
+    found = checkpoint.load_last(this.checkpoint)
+    state = found[0] if found else begin()
+    say(f"{this.out}: going on after step {state.index} of {this.recipe.pretrain.steps}")
     return state
 
 
@@ -260,24 +303,24 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     emit(FileWritten(this.cloud, "points"))
 
 
-def evaluate(
-    this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int | None = None
-) -> dict[str, Any]:
+def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer) -> dict[str, Any]:
     """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
+    ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
 
     measured = evaluate_views(
         scene.held_out,
-        photo_cache(scene.held_out, budget_bytes),
+        photo_cache(scene.held_out, ahead),
         draw,
         timed=colors,
         show=show,
         correct_color=this.recipe.pretrain.appearance is not None,
-        masks=mask_cache(scene.held_out, budget_bytes),
+        masks=mask_cache(scene.held_out, ahead),
     )
+    memory = read_record(this.out).get("memory_bytes") or {}
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
@@ -285,7 +328,8 @@ def evaluate(
         "steps": state.index,
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
-        "peak_memory_bytes": state.peak_memory_bytes or None,
+        "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,
+        "memory_bytes": memory,
     }
     write_json(this.metrics, metrics)
     emit(FileWritten(this.metrics, "metrics"))
@@ -298,10 +342,8 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     Raises:
         BadInput: The folder holds no run, or one that is not finished.
     """
-    if not (out / "recipe.json").exists() or not (out / "run.json").exists():
-        raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it); name one that surfkit train made")
-    record = read_json(out / "run.json", Any)
-    this = Run(out, read_json(out / "recipe.json", Recipe), load(Data, record["data"], "data"))
+    refuse_no_run(out)
+    this = Run(out, read_json(out / "recipe.json", Recipe), read_data(out))
     scene = read(this.data)
     state = saved(this, scene)
     steps = this.recipe.pretrain.steps

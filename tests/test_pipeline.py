@@ -14,11 +14,12 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
-from surfkit.pipeline import load_run, run, with_steps
+from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
 from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train.material import Store
 
 STEPS = 60
 
@@ -57,6 +58,18 @@ def test_a_run_leaves_everything_behind(finished, data, recipe):
     with Image.open(out / "pictures" / "view_000.png.png") as picture:
         assert picture.size == (4 * 64, 48)
     assert not list(out.rglob(".*")), "nothing half-written stays"
+
+
+def test_memory_is_told_by_part(finished):
+    out, metrics = finished
+    parts = dict(metrics["memory_bytes"])
+    assert json.loads((out / "run.json").read_text())["memory_bytes"] == parts
+    peak = parts.pop("peak")
+    assert peak <= metrics["peak_memory_bytes"] and sum(parts.values()) == peak and min(parts.values()) >= 0
+    assert parts["photographs"] == 10 * 64 * 48 * 3
+    state = load_run(out)[1]
+    end = sum(value.nbytes for group in vars(state.points).values() for value in group.values())
+    assert end / 2 <= parts["points"] <= 2 * end and parts["program"] > 50e6
 
 
 def test_points_are_in_the_frame_of_the_input(finished, data):
@@ -154,7 +167,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
 def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(pipeline.checkpoint, "save", lambda path, state: written.append(state.index))
-    run(with_steps(recipe, 10), data, tmp_path, checkpoint_every=4)
+    run(with_steps(recipe, 10), data, tmp_path, every=Every(4))
     assert written == [4, 8, 10]
 
 
@@ -199,12 +212,14 @@ def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
         load_run(tmp_path)
 
 
-def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path, cache="20KB")  # two photographs of 64 x 48
+@pytest.mark.parametrize("copies", [False, True])
+def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path, copies):
+    metrics = run(recipe, data, tmp_path, store=Store("20KB", copies))  # two photographs of 64 x 48
+    assert (data.path / "resized").exists() == copies
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
     assert metrics["images"] == finished[1]["images"]
     with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
-        run(recipe, data, tmp_path, cache="lots")
+        run(recipe, data, tmp_path, store=Store("lots"))
 
 
 def test_masks_train_end_to_end(data, recipe, tmp_path):

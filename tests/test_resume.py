@@ -1,5 +1,6 @@
 """Runs that are interrupted, made longer, damaged, or met by what gives out."""
 
+import errno
 import json
 import os
 import resource
@@ -13,6 +14,7 @@ import torch
 from PIL import Image
 
 from surfkit import pipeline
+from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core import journal, lock
 from surfkit.core.check import BadInput, Fault
@@ -21,11 +23,11 @@ from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
 from surfkit.evaluate import images
 from surfkit.losses.depth import DepthRegression
-from surfkit.pipeline import load_run, run, with_steps
+from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import confidence_path, map_path, write_map, write_record
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint
+from surfkit.train import checkpoint, stage
 
 STEPS = 24
 
@@ -79,7 +81,7 @@ def interrupted(recipe, data, out, at, monkeypatch, **settings):
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_path, monkeypatch, capsys):
     whole, out = tmp_path / "whole", tmp_path / "run"
     run(recipe, data, whole)
-    interrupted(recipe, data, out, 17, monkeypatch, checkpoint_every=8)
+    interrupted(recipe, data, out, 17, monkeypatch, every=Every(8))
     path = out / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-40])
     run(recipe, data, out)
@@ -90,7 +92,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_pat
 
 
 def test_a_damaged_checkpoint_does_not_push_out_the_good_one(data, recipe, tmp_path, monkeypatch):
-    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, checkpoint_every=8)
+    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, every=Every(8))
     path = tmp_path / "run" / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(b"")
     interrupted(recipe, data, tmp_path / "run", 18, monkeypatch)
@@ -281,7 +283,7 @@ def spoilt(recipe, at, above, monkeypatch):
 def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data, recipe, tmp_path, monkeypatch):
     out = tmp_path / "run"
     rate = recipe.pretrain.rates["scales"].start
-    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, checkpoint_every=10)
+    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, every=Every(10))
     assert metrics["steps"] == STEPS and checkpoint.load(out / "pretrain" / "checkpoint.safetensors").halvings == 2
     assert [("(1 of 2" in text, "(2 of 2" in text) for text in notes(out)] == [(True, False), (False, True)]
     for text in notes(out):
@@ -296,7 +298,7 @@ def test_a_third_time_is_the_last(data, recipe, tmp_path, monkeypatch, at):
         with pytest.raises(
             Fault, match=rf"step {at}, view view_0\d\d.png: the scales are not finite, also after .* 2 t"
         ):
-            run(bad, data, out, checkpoint_every=10)
+            run(bad, data, out, every=Every(10))
     state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
     assert state.halvings == 2 and state.index == (10 if at == 13 else 0) and len(notes(out)) == 2
     assert all(torch.isfinite(value).all() for value in state.points.params.values())
@@ -310,7 +312,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size // 2, limits[1]))
     try:
         with pytest.raises(Fault, match=r"the disk is full .* last checkpoint in .*run is whole: free some space"):
-            run(recipe, data, out, checkpoint_every=5)
+            run(recipe, data, out, every=Every(5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert checkpoint.load(path).index == 9 and not list(out.rglob(".*"))
@@ -327,15 +329,94 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
 
     with monkeypatch.context() as patch:
         patch.setattr(pipeline.Trainer, "step", short)
-        with pytest.raises(Fault, match="out of memory.*--longest"):
-            run(recipe, data, tmp_path / "run", checkpoint_every=10)
+        with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
+            run(recipe, data, tmp_path / "run", every=Every(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
     run(recipe, data, tmp_path / "run")
 
 
+@pytest.mark.parametrize("photographs", [3, 1])
+def test_out_of_memory_lowers_the_cache_first(data, recipe, tmp_path, monkeypatch, photographs):
+    """As long as more photographs than some are kept, memory is short, in the middle of a step; nothing is lost."""
+    whole, out, update = tmp_path / "whole", tmp_path / "run", stage.adam_step
+    run(recipe, data, whole)
+    kept = []
+
+    def short(points, grads, rates, index):
+        update(points, grads, rates, index)
+        kept.append(given[0].photos.bytes)
+        if index == 13 and kept[-1] > photographs * 40 * 30 * 3:
+            raise MemoryError
+
+    given, read_ahead = [], pipeline.read_ahead
+    monkeypatch.setattr(pipeline, "read_ahead", lambda *args: given.append(read_ahead(*args)) or given[-1])
+    monkeypatch.setattr(stage, "adam_step", short)
+    run(recipe, data, out, every=Every(10))
+    times = {3: 1, 1: 2}[photographs]
+    assert len(notes(out)) == times and kept[-1] <= photographs * 40 * 30 * 3 < kept[11]
+    assert all(text.startswith("step 13: out of memory; photographs, masks and depth priors in") for text in notes(out))
+    assert (out / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    assert steps(out) == list(range(1, STEPS + 1))
+
+
+def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkeypatch):
+    free = iter([1 << 30, 100 << 20])  # looked at every ten steps
+    monkeypatch.setattr(pipeline, "free_bytes", lambda: next(free))
+    assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
+    assert len(notes(tmp_path / "run")) == 1
+    assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")
+
+
+@pytest.mark.parametrize("name", ["point_cloud.ply", "metrics.json", "view_000.png.png", "run.json"])
+def test_a_disk_that_is_full_at_the_end(data, recipe, tmp_path, monkeypatch, name):
+    out, replace = tmp_path / "run", os.replace
+    run(recipe, data, out)
+    wanted = {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()}
+    (out / "metrics.json").unlink()
+    (out / "point_cloud.ply").unlink()
+
+    def full(old, new):
+        if os.path.basename(new) == name:
+            raise OSError(errno.ENOSPC, "No space left on device", str(new))
+        replace(old, new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        with pytest.raises(Fault, match=rf"{name}: the disk is full .* last checkpoint in .*run is whole: free some"):
+            run(recipe, data, out)
+    assert not list(out.rglob(".*")) and not (out / "metrics.json").exists()
+    assert checkpoint.load(out / "pretrain" / "checkpoint.safetensors").index == STEPS
+    run(recipe, data, out)
+    assert {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()} == wanted
+
+
+def test_commands_on_a_run_folder_take_its_lock(data, recipe, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    out = tmp_path / "run"
+    run(recipe, data, out)
+    with held(out):
+        for words in (["evaluate", str(out)], ["export", str(out)]):
+            assert main(words) == 2 and f"process {os.getpid()} on" in capsys.readouterr().err
+        assert main(["export", str(out), "--out", str(tmp_path / "a.ply")]) == 0
+    assert main(["evaluate", str(out)]) == main(["export", str(out)]) == 0
+    assert main(["evaluate", str(tmp_path / "nowhere")]) == 2 and not (tmp_path / "nowhere").exists()
+
+
+def test_checkpoints_can_be_read_by_whom_the_umask_lets(data, recipe, tmp_path):
+    for mask, mode in ((0o022, 0o644), (0o027, 0o640)):
+        before = os.umask(mask)
+        try:
+            run(with_steps(recipe, 1), data, tmp_path / f"run-{mode}")
+            assert os.umask(mask) == mask
+        finally:
+            os.umask(before)
+        path = tmp_path / f"run-{mode}" / "pretrain" / "checkpoint.safetensors"
+        assert path.stat().st_mode & 0o777 == mode
+
+
 def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
-    a = run(recipe, data, tmp_path / "a", pictures_every=0)
-    b = run(recipe, data, tmp_path / "b", pictures_every=10)
+    a = run(recipe, data, tmp_path / "a", every=Every(pictures=0))
+    b = run(recipe, data, tmp_path / "b", every=Every(pictures=10))
     assert a["images"] == b["images"] and not (tmp_path / "a" / "progress").exists()
     found = sorted(p.relative_to(tmp_path / "b" / "progress").as_posix() for p in (tmp_path / "b").rglob("0000*/*.png"))
     assert found == [f"0000{step}/view_00{view}.png.png" for step in (10, 20) for view in (0, 8)]
@@ -345,6 +426,6 @@ def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
 
 
 def test_the_psnr_along_the_way_is_that_of_the_end(data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path / "run", pictures_every=STEPS - 1)
+    metrics = run(recipe, data, tmp_path / "run", every=Every(pictures=STEPS - 1))
     line = next(line for line in journal.read(tmp_path / "run" / "events.jsonl") if line["event"] == "Measured")
     assert images.statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)

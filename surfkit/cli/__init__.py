@@ -79,6 +79,13 @@ def _guarded(words: list[str]) -> int:
     except (BadInput, Fault) as error:
         print(f"surfkit: {' '.join(str(error).split())}", file=sys.stderr)
         return 2 if isinstance(error, BadInput) else 1
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # no permission, a folder in the place of a file, a disk that is gone
+        if error.filename is None:
+            raise
+        print(f"surfkit: {os.fsdecode(error.filename)}: {error.strerror}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("surfkit: interrupted", file=sys.stderr)
         return 130

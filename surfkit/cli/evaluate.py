@@ -9,9 +9,11 @@ from typing import Annotated
 import tyro
 
 from surfkit.cli.result import show
-from surfkit.folder import noted
+from surfkit.core.lock import held
+from surfkit.folder import noted, refuse_no_run
 from surfkit.pipeline import drawer, evaluate, load_run
 from surfkit.raster.select import Device
+from surfkit.train.faults import in_one_line
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Evaluate:
 
     def run(self) -> None:
         """Measure, and show what came out."""
-        with noted():
+        refuse_no_run(self.run_folder)
+        with noted(), held(self.run_folder), in_one_line(self.run_folder):
             this, state, scene = load_run(self.run_folder)
             rasterizer, _ = drawer(self.device)
             show(this, evaluate(this, state, scene, rasterizer))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +10,12 @@ from typing import Annotated
 import tyro
 
 from surfkit.core.check import BadInput
+from surfkit.core.lock import held
+from surfkit.folder import refuse_no_run
 from surfkit.pipeline import load_run
 from surfkit.primitives.base import to_table
 from surfkit.scene.ply import write_splats
+from surfkit.train.faults import in_one_line
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,11 @@ class Export:
 
     def run(self) -> None:
         """Write the file."""
+        refuse_no_run(self.run_folder)
+        with held(self.run_folder) if self.out is None else nullcontext(), in_one_line(self.run_folder):
+            self._write()
+
+    def _write(self) -> None:
         this, state, scene = load_run(self.run_folder)
         path = self.out or this.cloud
         if path.suffix.lower() != ".ply":

@@ -16,10 +16,11 @@ from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
 from surfkit.folder import Run
-from surfkit.pipeline import CHECKPOINT_EVERY, run, with_steps
+from surfkit.pipeline import CHECKPOINT_EVERY, Every, run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
+from surfkit.train.material import Store
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
@@ -107,7 +108,11 @@ class Train:
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
-    does not depend on it."""
+    does not depend on it. When memory gives out, it is lowered by itself."""
+
+    resized_copies: bool = False
+    """Keep photographs that do not fit into the cache on disk too, decoded and reduced, in DATA/resized: worth its
+    space when large photographs are used much smaller. The result does not depend on it."""
 
     folder: tyro.conf.Suppress[str] = ""
 
@@ -125,7 +130,8 @@ class Train:
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
-            metrics = run(recipe, data, out, self.device, self.checkpoint_every, self.pictures_every, self.cache)
+            every, store = Every(self.checkpoint_every, self.pictures_every), Store(self.cache, self.resized_copies)
+            metrics = run(recipe, data, out, self.device, every, store)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -79,7 +79,9 @@ def read_json(path: Path, hint: Any) -> Any:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     except json.JSONDecodeError as error:
         raise BadInput(f"{path}: not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
-    except (BadInput, UnicodeDecodeError) as error:
+    except RecursionError as error:
+        raise BadInput(f"{path}: not JSON: nested too deeply") from error
+    except ValueError as error:  # BadInput, bytes that are no UTF-8, a number of thousands of digits
         raise BadInput(f"{path}: not JSON: {error}") from error
     try:
         return load(hint, data)
@@ -95,7 +97,7 @@ def write_json(path: Path, value: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """Save text; the file is whole or not there, also when the process dies."""
     with replacing(path) as file:
-        file.write(text.encode("utf-8"))
+        file.write(text.encode("utf-8", "backslashreplace"))  # half a character, as JSON writes it too
 
 
 def _load_union(args: tuple[Any, ...], data: Any, at: str) -> Any:
@@ -163,9 +165,9 @@ def _load_scalar(hint: Any, data: Any, at: str) -> Any:
             return None
         raise _unfit(at, "null", data)
     if hint is float:
-        if isinstance(data, (int, float)) and not isinstance(data, bool):
+        if isinstance(data, float) or (isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**1023):
             return float(data)
-        if data in _NON_FINITE:
+        if isinstance(data, str) and data in _NON_FINITE:
             return float(data)
         raise _unfit(at, "a number", data)
     if hint is Path:

@@ -135,6 +135,17 @@ class Measured:
 
 
 @dataclass(frozen=True)
+class MemoryTaken:
+    """What the most memory that was held so far was taken by.
+
+    Attributes:
+        parts: Bytes by part, and "peak" for all of them together.
+    """
+
+    parts: Mapping[str, int]
+
+
+@dataclass(frozen=True)
 class StageEnded:
     """An optimisation run is complete.
 
@@ -151,7 +162,7 @@ class StageEnded:
     seconds: float
 
 
-Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | PhotoSkipped | Measured | StageEnded
+Event = StageBegan | StepDone | PointsEdited | FileWritten | Warned | PhotoSkipped | Measured | MemoryTaken | StageEnded
 
 _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""

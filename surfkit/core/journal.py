@@ -19,6 +19,8 @@ from surfkit.core.registry import hookimpl, plugins
 NAME = "events.jsonl"
 COUNTED = {"StepDone", "PointsEdited", "Measured"}
 """Events that carry the index of their step."""
+ALWAYS = {"event": str, "time": (int, float)}
+"""What every line has."""
 
 
 class Journal:
@@ -68,7 +70,7 @@ def kept(folder: Path) -> Iterator[None]:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The lines of a journal; those that a dying process did not finish are left out."""
+    """The lines of a journal; those that are damaged, or that a dying process did not finish, are left out."""
     return [line for _, line in _lines(path)]
 
 
@@ -90,8 +92,14 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
         try:
             line = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
-        if text.endswith("\n") and isinstance(line, dict) and "event" in line:
+        if text.endswith("\n") and _is_sound(line):
             found.append((text, line))
     return found
+
+
+def _is_sound(line: Any) -> bool:
+    if not isinstance(line, dict) or not all(isinstance(line.get(name), kind) for name, kind in ALWAYS.items()):
+        return False
+    return line["event"] not in COUNTED or isinstance(line.get("index"), int)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import sys
+from contextlib import suppress
 
 
 def peak_memory_bytes() -> int:
@@ -13,3 +15,16 @@ def peak_memory_bytes() -> int:
         return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def resident_bytes() -> int:
+    """The memory that this process holds now."""
+    import psutil
+
+    return psutil.Process().memory_info().rss
+
+
+def give_back() -> None:
+    """Hand memory that was freed back to the system, where the C library keeps it for itself (glibc)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -9,9 +9,12 @@ from typing import Any
 
 from surfkit.core import journal
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import load, read_json
 from surfkit.core.lock import holder
+from surfkit.evaluate.metrics import read_metrics
 
+NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
+"""What lines of the journal may have, and of what kind it is."""
 PACE_OVER = 100
 """Last steps that the speed is the mean of."""
 
@@ -63,10 +66,9 @@ def status(out: Path) -> Status:
     if not recipe.exists() or not record.exists():
         doing = f"; {process} is about to begin one" if process else ""
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it){doing}")
-    kept, lines = read_json(record, Any), journal.read(out / journal.NAME)
+    kept, lines = read_json(record, dict[str, Any]), _sound(journal.read(out / journal.NAME))
     last, metrics = _last(lines), _metrics(out, lines)
-    steps = int(read_json(recipe, Any)["pretrain"]["steps"])
-    step = int(last["StepDone"].get("index", 0))
+    steps, step = _steps(recipe), last["StepDone"].get("index", 0)
     finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
     pace = _pace(lines)
     return Status(
@@ -82,9 +84,34 @@ def status(out: Path) -> Status:
         loss=_total(last["StepDone"].get("losses")),
         peak_memory_bytes=last["StepDone"].get("peak_memory_bytes") or None,
         metrics=metrics,
-        warnings=tuple(kept.get("notes", [])),
-        skipped=tuple(kept.get("skipped", [])),
+        warnings=_texts(record, kept, "notes"),
+        skipped=_texts(record, kept, "skipped"),
     )
+
+
+def _steps(recipe: Path) -> int:
+    """How many steps the stage of a recipe has."""
+    stage = read_json(recipe, dict[str, Any]).get("pretrain")
+    if not isinstance(stage, dict) or not isinstance(stage.get("steps"), int):
+        raise BadInput(f"{recipe}: no recipe: it lacks pretrain.steps")
+    return stage["steps"]
+
+
+def _texts(path: Path, record: dict[str, Any], name: str) -> tuple[str, ...]:
+    return tuple(load(tuple[str, ...], record.get(name, []), f"{path}: {name}"))
+
+
+def _sound(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The lines without those whose numbers are none."""
+    return [line for line in lines if all(_is(kind, line[key]) for key, kind in NUMBERS.items() if key in line)]
+
+
+def _is(kind: Any, value: Any) -> bool:
+    try:
+        load(kind, value)
+    except BadInput:
+        return False
+    return True
 
 
 def _last(lines: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -108,17 +135,17 @@ def _saved(lines: list[dict[str, Any]]) -> int | None:
     for line in lines:
         if line["event"] == "StepDone":
             index = line["index"]
-        elif line["event"] == "FileWritten" and line["what"] == "checkpoint":
+        elif line["event"] == "FileWritten" and line.get("what") == "checkpoint":
             saved = index
     return saved
 
 
 def _metrics(out: Path, lines: list[dict[str, Any]]) -> dict[str, Any] | None:
     if (out / "metrics.json").exists():
-        images = read_json(out / "metrics.json", Any)["images"]
+        images = read_metrics(out)["images"]
         return {"psnr": images["psnr"], "ssim": images["ssim"], "views": len(images["per_image"])}
     found = _last(lines)["Measured"]
-    if not found:
+    if not found.get("psnr"):
         return None
     values = list(found["psnr"].values())
     return {"psnr": sum(values) / len(values), "views": len(values), "step": found["index"]}

@@ -41,6 +41,8 @@ class Cache(Sequence, Generic[T]):
         self._stop = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
         self._kept: dict[int, Future[T]] = {}  # the longest unused first
         self._bytes = 0
+        self.lowered = False
+        """Whether the budget has been changed."""
         self.expect(range(len(self._sizes)))
 
     def __len__(self) -> int:
@@ -63,6 +65,11 @@ class Cache(Sequence, Generic[T]):
         self._fetch()
         try:
             return future.result()
+        except BaseException:
+            if self._kept.get(at) is future:  # what went wrong may not go wrong again
+                del self._kept[at]
+                self._bytes -= self._sizes[at]
+            raise
         finally:
             del self._needed[at]
 
@@ -78,6 +85,22 @@ class Cache(Sequence, Generic[T]):
         """Read nothing more."""
         self._needed, self._next = {}, None
         self._stop()
+
+    def resize(self, budget_bytes: int) -> None:
+        """Keep no more than so many bytes from now on, and let go of the rest; one value is still held at a time."""
+        self._budget = budget_bytes
+        self.lowered = True
+        self._make_room(0, -1)
+
+    @property
+    def sizes(self) -> Sequence[int]:
+        """Bytes of each value."""
+        return self._sizes
+
+    @property
+    def budget(self) -> int:
+        """Most bytes to keep."""
+        return self._budget
 
     @property
     def bytes(self) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.scene.data import Data
 
@@ -99,6 +100,21 @@ class Tracked(ABC):
     @abstractmethod
     def tracks(self, data: Data) -> Tracks:
         """The observations of the sparse model."""
+
+
+def camera_of(where: str, model: str, size: tuple[int, int], params: Sequence[float]) -> Any:
+    """A pycolmap camera, or BadInput that names `where` its numbers come from."""
+    try:
+        return library().Camera(model=model, width=size[0], height=size[1], params=list(params))
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        numbers = ", ".join(f"{value:g}" for value in params)
+        raise BadInput(f"{where}: no {model} camera has size {size[0]} x {size[1]} and parameters {numbers}") from error
+
+
+def shortened(value: object) -> str:
+    """What a file has in the place of something else, in a few words."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def library() -> Any:

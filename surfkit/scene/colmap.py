@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.scene.capture import Capture, Reader, Shot, Tracked, Tracks, library
+from surfkit.scene.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.scene.data import Data, nearest
 from surfkit.scene.names import find_files
 
@@ -23,8 +23,6 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 BASES = ("sparse", "colmap/sparse")
 """Where COLMAP numbers the models of photographs that it could not connect."""
 ENDS = (".bin", ".txt")
-PARTS = {"cameras": 40, "images": 73, "points3D": 51}
-"""The files of a model, and the fewest bytes that an entry of the binary one takes."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,8 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
         reject(BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP"))
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    finite = np.isfinite(xyz.astype(np.float32)).all(1)
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(xyz.astype(np.float32)).all(1)
     if points and not finite.any():
         reject(BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again"))
     elif not finite.all():
@@ -153,9 +152,15 @@ def _reconstruction(folder: Path) -> Any:
     """pycolmap's model, or BadInput for one that is damaged."""
     binary = not _lacking(folder, ".bin")
     if binary:  # of text files, pycolmap sees by itself that they are cut off
-        _refuse_cut_off(folder)
+        refuse_cut_off(folder)
     try:
         model = library().Reconstruction(str(folder))
+        for image in model.images.values():
+            image.name  # noqa: B018 (is decoded here)
+    except UnicodeDecodeError as error:
+        raise BadInput(
+            f"{folder}: the name of an image is not UTF-8 ({error.object!r}); rename the photograph, also in the model"
+        ) from error
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         if "model does not exist" in str(error):
             raise BadInput(
@@ -166,56 +171,8 @@ def _reconstruction(folder: Path) -> Any:
         raise BadInput(f"{folder}: the COLMAP model is damaged: {reason}; write it again or copy it whole") from error
     cameras = sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
     if binary and (folder / "cameras.bin").stat().st_size < 8 + cameras:
-        raise _cut_off(folder / "cameras.bin")
+        raise cut_off(folder / "cameras.bin")
     return model
-
-
-def _refuse_cut_off(folder: Path) -> None:
-    """BadInput where a binary file ends before its entries do: pycolmap would read beyond the end, or for ever."""
-    cut = []
-    for part, least in PARTS.items():
-        path = folder / f"{part}.bin"
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            count = struct.unpack("<Q", file.read(8))[0] if size >= 8 else 1
-            whole = size >= 8 + count * least
-            if whole and count and part in ENTRIES:
-                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
-                    whole = ENTRIES[part](raw, count) <= size
-        if not whole:
-            cut.append(path)
-    if cut:
-        raise _cut_off(*cut)
-
-
-def _end_of_images(raw: mmap.mmap, count: int) -> int:
-    """Where the entries end: 64 bytes, a name, and a number of observations of 24 bytes."""
-    at = 8
-    for _ in range(count):
-        end = raw.find(b"\0", at + 64)
-        if end < 0 or end + 9 > len(raw):
-            return len(raw) + 1
-        at = end + 9 + 24 * struct.unpack_from("<Q", raw, end + 1)[0]
-    return at
-
-
-def _end_of_points(raw: mmap.mmap, count: int) -> int:
-    """Where the entries end: 43 bytes, and a number of observations of 8 bytes."""
-    length, last, at = struct.Struct("<Q").unpack_from, len(raw) - 51, 8
-    for _ in range(count):
-        if at > last:
-            return len(raw) + 1
-        at += 51 + 8 * length(raw, at + 43)[0]
-    return at
-
-
-ENTRIES = {"images": _end_of_images, "points3D": _end_of_points}
-"""Of the files whose entries differ in length; those of cameras are known when they are read."""
-
-
-def _cut_off(path: Path, *others: Path) -> BadInput:
-    also = f" (and so are {', '.join(other.name for other in others)})" if others else ""
-    return BadInput(f"{path}: the file is cut off or no COLMAP file{also}; copy it whole")
 
 
 def _shots(folder: Path, model: Any) -> list[Image]:

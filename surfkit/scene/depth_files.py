@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.files import replacing
+from surfkit.scene.photos import opened
 
 EXR = ".exr"
 NO_DEPTH = 65504.0
@@ -142,17 +143,33 @@ def save_array(path: Path, values: np.ndarray) -> None:
 
 def _stored(path: Path) -> np.ndarray:
     """The numbers in a .npy file or in a picture of one channel."""
-    from PIL import Image
-
     if path.suffix.lower() == EXR:
         return _exr(path)
+    if path.suffix.lower() == ".npy":
+        return _array(path)
     try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
-        with Image.open(path) as picture:
-            return np.asarray(picture)
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        return opened(path, np.array)
+    except BadInput as error:
+        raise BadInput(f"cannot be read: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def _array(path: Path) -> np.ndarray:
+    """The numbers in a .npy file, mapped from disk: memory is not taken because a header says so."""
+    try:
+        with np.errstate(over="ignore"):
+            stored = np.lib.format.open_memmap(path, "r")
+    except Exception as error:  # the header is parsed as Python, of which anything may come; nothing is allocated here
         raise BadInput(f"cannot be read: {' '.join(str(error).split())}") from error
+    if stored.dtype.kind not in "fiub" or not stored.size:
+        raise BadInput(f"cannot be read: it holds {stored.size} times {stored.dtype}, not numbers")
+    return stored
+
+
+def _number(path: Path, at: str, value: Any) -> float:
+    try:
+        return load(float, value, at)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}") from error
 
 
 def _exr(path: Path) -> np.ndarray:
@@ -197,7 +214,7 @@ def _hierarchical(root: Path, model: Path) -> Finder | None:
         entry = params.get(stem)
         if not isinstance(entry, dict) or not {"scale", "offset"} <= entry.keys():
             return None
-        scale, offset = float(entry["scale"]), float(entry["offset"])
+        scale, offset = (_number(places[0], f"{stem}.{part}", entry[part]) for part in ("scale", "offset"))
         return DepthFile(root / "depths" / f"{stem}.png", True, scale / 65536, offset) if scale > 0 else None
 
     return find
@@ -209,13 +226,14 @@ def _nerfstudio(root: Path, model: Path) -> Finder | None:
     if not path.exists():
         return None
     contents = read_json(path, Any)
-    frames = contents.get("frames", []) if isinstance(contents, dict) else []
+    listed = contents.get("frames") if isinstance(contents, dict) else None
+    frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
     depths = {
         str(f["file_path"]): str(f["depth_file_path"]) for f in frames if f.keys() >= {"file_path", "depth_file_path"}
     }
     if not depths:
         return None
-    unit = float(contents.get("depth_unit_scale_factor", MILLIMETRE))
+    unit = _number(path, "depth_unit_scale_factor", contents.get("depth_unit_scale_factor", MILLIMETRE))
     by_name = {PurePosixPath(photo.removeprefix("./")): depth for photo, depth in depths.items()}
     by_name |= {PurePosixPath(*photo.parts[1:]): depth for photo, depth in list(by_name.items())}
 

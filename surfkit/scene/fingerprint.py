@@ -143,7 +143,8 @@ def _feed(found: Any, value: Any) -> None:
             _feed(found, getattr(value, field.name))
     elif isinstance(value, (np.ndarray, float)):
         array = np.asarray(value)
-        array = array.astype("<f4") if array.dtype.kind == "f" else array
+        with np.errstate(over="ignore"):  # infinite, and so is another run's
+            array = array.astype("<f4") if array.dtype.kind == "f" else array
         found.update(f"\0{array.dtype.str}{array.shape}".encode())
         found.update(np.ascontiguousarray(array).tobytes())
     else:

@@ -28,8 +28,8 @@ def cache_bytes(text: str) -> int:
 
 
 def free_bytes() -> int:
-    """Memory that this process may still take: what the machine has free, and what its control groups allow."""
-    return max(0, min([psutil.virtual_memory().available, *_allowed()]))
+    """Memory that this process may still take: what the machine has free, and what its limits allow."""
+    return max(0, min([psutil.virtual_memory().available, *_allowed(), *_unreserved()]))
 
 
 def _allowed() -> Iterator[int]:
@@ -42,6 +42,17 @@ def _allowed() -> Iterator[int]:
             most, used = _number(folder / limit), _number(folder / usage)
             if most is not None and used is not None:
                 yield most - used + _entry(folder / "memory.stat", cached)
+
+
+def _unreserved() -> Iterator[int]:
+    """What `ulimit -v` still allows."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if most != resource.RLIM_INFINITY:
+        yield most - psutil.Process().memory_info().vms
 
 
 def _groups() -> Iterator[Path]:

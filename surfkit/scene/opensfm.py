@@ -12,7 +12,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
-from surfkit.scene.capture import Capture, Reader, Shot, library
+from surfkit.scene.capture import Capture, Reader, Shot, camera_of
 from surfkit.scene.data import Data
 from surfkit.scene.georeference import placed
 from surfkit.scene.names import find_files
@@ -58,7 +58,7 @@ class ODM(Reader):
             rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
         except BadInput:
             raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
         good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
         return _on_earth(Capture(shots, xyz[good], rgb[good].astype(np.uint8)), data.path, path.parent, model)
@@ -105,7 +105,7 @@ def _camera(where: str, lens: Mapping[str, Any]) -> Any:
         if abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
             raise BadInput(f"{where}: projection {kind} with two focal lengths; convert the camera to brown")
         focal = focal[:1]
-    return library().Camera(model=model, width=width, height=height, params=[*focal, *centre, *extra])
+    return camera_of(where, model, (width, height), [*focal, *centre, *extra])
 
 
 def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo: Path) -> Shot:

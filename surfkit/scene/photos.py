@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,6 +15,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.scene.cache import Cache
+from surfkit.scene.copies import Copies
+from surfkit.scene.gate import Gate
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
@@ -31,12 +35,33 @@ UNDONE = {
     8: TURN.ROTATE_270,
 }
 """What brings a picture back that was turned as its EXIF says."""
+# Photographs of 90 to 180 million pixels are no attack; larger ones are refused.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+RECIPE = "1"
+"""Changes when the same photograph would be read otherwise: copies on disk are then made again."""
+MOST_OPEN = 256 << 20
+"""Bytes of photographs, as large as they are on disk, that may be decoded at the same time; one always may."""
+GATE = Gate(MOST_OPEN)
 
 
-def photo_cache(views: Sequence[View], budget_bytes: int | None = None, threads: int | None = None) -> Cache[Tensor]:
-    """The photographs of views by position, (3, H, W) uint8."""
+def photo_cache(
+    views: Sequence[View], budget_bytes: int | None = None, copies: Copies | None = None, threads: int | None = None
+) -> Cache[Tensor]:
+    """The photographs of views by position, (3, H, W) uint8; with `copies`, decoded only once, also between runs."""
     sizes = [3 * view.camera.width * view.camera.height for view in views]
-    return Cache(lambda at: view_photo(views[at]), sizes, budget_bytes, threads)
+    if copies is None:
+        return Cache(lambda at: view_photo(views[at]), sizes, budget_bytes, threads)
+
+    def read(at: int) -> Tensor:
+        view = views[at]
+        shape = (3, view.camera.height, view.camera.width)
+        key = f"{RECIPE} {shape} {view.white}"
+        try:
+            return torch.from_numpy(copies.get(view.path, key, shape, lambda: view_photo(view).numpy()))
+        except FileNotFoundError as error:
+            raise BadInput(f"{view.path}: no such photograph") from error
+
+    return Cache(read, sizes, budget_bytes, threads)
 
 
 def view_photo(view: View) -> Tensor:
@@ -50,18 +75,16 @@ def photo_size(path: Path) -> tuple[int, int]:
     Raises:
         BadInput: The file is no picture that Pillow reads.
     """
-    return opened(path, _stored_size)
+    with _picture(path) as image:
+        return _stored_size(image)
 
 
 def is_turned(path: Path) -> bool:
     """Whether EXIF says to turn or mirror a picture before it is looked at."""
-
-    def tagged(image: Image.Image) -> bool:
+    with _picture(path) as image:
         if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode all of it, to look behind
             return False
         return image.getexif().get(ORIENTATION, 1) not in (0, 1)
-
-    return opened(path, tagged)
 
 
 def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
@@ -131,9 +154,16 @@ def _as_stored(image: Image.Image) -> Image.Image:
 
 def opened(path: Path, use: Callable[[Image.Image], T]) -> T:
     """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput."""
+    with _picture(path) as image, GATE.taking(len(image.getbands()) * image.width * image.height):
+        return use(image)
+
+
+@contextmanager
+def _picture(path: Path) -> Iterator[Image.Image]:
+    """The open picture, not yet decoded; within, what Pillow finds wrong becomes BadInput."""
     try:
         with Image.open(path) as image:
-            return use(image)
+            yield image
     except BadInput:
         raise
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:

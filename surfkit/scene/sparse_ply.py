@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,8 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
         values = np.stack([columns[name] for name in names], 1)
         scale = 255 if values.dtype.kind == "f" and values.max(initial=0) <= 1 else 1
         rgb = (values * scale).clip(0, 255).astype(np.uint8)
-    finite = np.isfinite(xyz.astype(np.float32)).all(1)
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(xyz.astype(np.float32)).all(1)
     if not finite.any():
         raise BadInput(f"{path}: no point in it with finite coordinates; write the file again")
     if not finite.all():
@@ -58,11 +60,20 @@ def _text(path: Path) -> dict[str, np.ndarray]:
     begun = words.index(elements[0])
     ended = words.index(elements[1]) if len(elements) > 1 else len(words)
     properties = [row for row in words[begun:ended] if row[0] == "property"]
+    if not all(len(row) == 3 for row in properties):
+        raise BadInput(f"{path}: a property of the vertices that is no single number; write the file again")
     kinds = ["i8" if "char" in row[1] or "int" in row[1] else "f8" for row in properties]
-    try:
-        rows = np.loadtxt(path, np.float64, skiprows=len(head), max_rows=int(elements[0][2]), ndmin=2)
-    except ValueError as error:
-        raise BadInput(f"{path}: not whole: {' '.join(str(error).split())}") from error
-    if rows.shape != (int(elements[0][2]), len(properties)):
+    count = int(elements[0][2]) if len(elements[0][2]) < 19 else 0
+    with path.open(encoding="latin-1", newline="\n") as file:
+        lines = (line for line in islice(file, len(head), None) if line.strip())
+        if not (first := list(islice(lines, 1))) or not count:
+            raise BadInput(f"{path}: no points after its header; write or copy it again")
+        try:
+            rows = np.loadtxt(islice(chain(first, lines), count), np.float64, comments=None, ndmin=2)
+        except ValueError as error:
+            raise BadInput(f"{path}: not whole: {' '.join(str(error).split())}") from error
+    if rows.shape != (count, len(properties)):
         raise BadInput(f"{path}: {rows.shape[0]} rows of {rows.shape[1]} numbers, not what its header says")
-    return {row[-1]: rows[:, at].astype(kind) for at, (row, kind) in enumerate(zip(properties, kinds, strict=True))}
+    with np.errstate(invalid="ignore"):  # a colour that is not finite
+        columns = [rows[:, at].astype(kind) for at, kind in enumerate(kinds)]
+    return {row[-1]: column for row, column in zip(properties, columns, strict=True)}

@@ -13,7 +13,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
-from surfkit.scene.capture import Capture, Reader, Shot, library
+from surfkit.scene.capture import Capture, Reader, Shot, camera_of, shortened
 from surfkit.scene.data import Data
 from surfkit.scene.depth_cloud import points_of_depth
 from surfkit.scene.depth_files import matrixcity_maps
@@ -26,6 +26,8 @@ NUMBERED = ("", "rgb", "images", "input")
 """Where MatrixCity's numbered photographs may lie, below their poses; or in a folder of the block's own name."""
 POINTS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Files of sparse points that a data set need not name."""
+MOST = 1e30
+"""Numbers beyond it are a mistake."""
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 
 
@@ -167,8 +169,8 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
 
 def _number(where: str, values: Mapping[str, Any], name: str, default: float | None = None) -> float:
     value = values.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise BadInput(f"{where}: {name} is {value!r}, not a number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MOST:
+        raise BadInput(f"{where}: {name} is {shortened(value)}, not a number")
     return float(value)
 
 
@@ -193,7 +195,7 @@ def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
         model, extra = "PINHOLE", []
     else:
         model, extra = "FULL_OPENCV", [k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], 0, 0, 0]
-    return library().Camera(model=model, width=width, height=height, params=[fx, fy, *centre, *extra])
+    return camera_of(where, model, (width, height), [fx, fy, *centre, *extra])
 
 
 def _focal(where: str, values: Mapping[str, Any], width: int, height: int) -> tuple[float, float]:
@@ -202,8 +204,12 @@ def _focal(where: str, values: Mapping[str, Any], width: int, height: int) -> tu
     def along(axis: str, size: int) -> float | None:
         if f"fl_{axis}" in values:
             return _number(where, values, f"fl_{axis}")
-        angle = f"camera_angle_{axis}"
-        return size / 2 / math.tan(_number(where, values, angle) / 2) if angle in values else None
+        if (name := f"camera_angle_{axis}") not in values:
+            return None
+        angle = _number(where, values, name)
+        if not 0 < angle < math.pi:
+            raise BadInput(f"{where}: {name} is {angle:g}; an angle of view lies between 0 and pi")
+        return size / 2 / math.tan(angle / 2)
 
     fx, fy = along("x", width), along("y", height)
     if fx is None and fy is None:
@@ -216,13 +222,15 @@ def _pose(where: str, frame: Mapping[str, Any]) -> np.ndarray:
     given = frame.get("transform_matrix", frame.get("rot_mat"))
     try:
         matrix = np.array(given, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise BadInput(f"{where}: transform_matrix is not 4 x 4 finite numbers")
     turn, centre = matrix[:3, :3], matrix[:3, 3]
-    scale = np.cbrt(np.linalg.det(turn))
-    if scale <= 0 or np.abs(turn.T @ turn / scale**2 - np.eye(3)).max() > 1e-2:
+    with np.errstate(all="ignore"):  # of numbers near the ends of float64; the comparison fails then
+        scale = np.cbrt(np.linalg.det(turn))
+        rotation = scale > 0 and np.abs(turn.T @ turn / scale**2 - np.eye(3)).max() < 1e-2
+    if not rotation:
         raise BadInput(f"{where}: transform_matrix is not a rotation")
     left, _, right = np.linalg.svd(turn / scale)
     axes = left @ right @ np.diag([1.0, -1.0, -1.0])

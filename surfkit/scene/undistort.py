@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +15,7 @@ from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
 from surfkit.scene.capture import library
+from surfkit.scene.copies import digest, place
 from surfkit.scene.masks import read_mask
 from surfkit.scene.photos import read_photo
 from surfkit.scene.ply import replacing
@@ -27,8 +26,6 @@ RECIPE = "1"
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are pinholes when all their coefficients are 0."""
-ENDS = 1 << 16
-"""Bytes at either end of a file that stand for all of it."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +124,7 @@ def _warp(lens: _Lens) -> tuple[Any, Tensor, Tensor]:
     rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
     share = np.asarray(source.img_from_cam(rays)) / (lens.width, lens.height)
     inside = (np.isfinite(share) & (share >= 0) & (share <= 1)).all(1)
-    grid = np.nan_to_num(share * 2 - 1, nan=-2, posinf=2, neginf=-2).astype(np.float32)
+    grid = np.nan_to_num(share * 2 - 1, nan=-2).clip(-2, 2).astype(np.float32)  # beyond 1 is outside
     shape = (camera.height, camera.width)
     return camera, torch.from_numpy(grid).reshape(1, *shape, 2), torch.from_numpy(inside).reshape(shape)
 
@@ -142,28 +139,13 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
 
 def _cached(picture: Picture, lens: _Lens, root: Path) -> str:
     """The name of the undistorted picture, which tells what went into it."""
-    place = os.path.relpath(picture.path, root)
-    key = hashlib.blake2b(f"{RECIPE} {lens} {picture.white} {place}".encode(), digest_size=8)
-    for path in filter(None, (picture.path, picture.mask)):
-        key.update(_content(path))
-    return f"{picture.path.stem}-{key.hexdigest()}.png"
-
-
-def _content(path: Path) -> bytes:
-    """Size and both ends of a file; whole photographs would take minutes to read in a large data set."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(ENDS)
-        file.seek(max(0, size - ENDS))
-        return size.to_bytes(8, "little") + head + file.read()
+    paths = [path for path in (picture.path, picture.mask) if path is not None]
+    return f"{picture.path.stem}-{digest(root, f'{RECIPE} {lens} {picture.white}', paths)}.png"
 
 
 def cache_folder(root: Path) -> Path:
     """Where the undistorted photographs of a data set are kept."""
-    if os.access(root, os.W_OK):
-        return root / FOLDER
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "surfkit" / FOLDER
+    return place(root, FOLDER)
 
 
 def _save(path: Path, pixels: Tensor) -> None:

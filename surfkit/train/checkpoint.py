@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import load as load_value
 from surfkit.core.files import sync_folder
 from surfkit.primitives.points import Points
 from surfkit.train.stage import StageState
@@ -25,9 +26,18 @@ from surfkit.train.views import Order
 
 FORMAT = "surfkit-stage-3"
 GROUPS = ("params", "first", "second", "stats")
-SCALARS = ("index", "seconds", "cpu_seconds", "peak_memory_bytes", "reset_at", "sh_degree", "halvings", "skipped")
+SCALARS = {
+    "index": int,
+    "seconds": float,
+    "cpu_seconds": float,
+    "peak_memory_bytes": int,
+    "reset_at": int,
+    "sh_degree": int,
+    "halvings": int,
+    "skipped": tuple[int, ...],
+}
 """What of a state is written as it is."""
-FACTS = {"views", "shown", *SCALARS}
+FACTS = {"views": int, "shown": int, **SCALARS}
 SYSTEM = re.compile(r"os error (\d+)")
 """How safetensors says what the system has refused."""
 
@@ -105,9 +115,14 @@ def load(path: Path) -> StageState:
     points = Points(**groups)
     _check(path, points, tensors["order"], facts)
     generator = torch.Generator()
-    generator.set_state(tensors["generator"])
+    try:
+        generator.set_state(tensors["generator"])
+    except (TypeError, RuntimeError) as error:
+        raise _unusable(path, "the state of the random generator is none") from error
     order = Order(facts["views"], tensors["order"], facts["shown"])
-    return StageState(points, order, generator, looks=looks, **{name: facts[name] for name in SCALARS})
+    state = StageState(points, order, generator, looks=looks, **{name: facts[name] for name in SCALARS})
+    state.skipped = list(state.skipped)
+    return state
 
 
 def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
@@ -122,6 +137,9 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
         said = SYSTEM.search(str(error))
         code = int(said[1]) if said else errno.EIO
         raise OSError(code, os.strerror(code), str(part)) from error
+    mask = os.umask(0o077)  # it can only be read by being set
+    os.umask(mask)
+    os.chmod(part, 0o666 & ~mask)  # safetensors lets nobody else read its files
     with open(part, "rb+") as file:
         os.fsync(file.fileno())
 
@@ -143,10 +161,19 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
     if _digest(tensors, metadata["facts"]) != metadata.get("digest"):
         raise BadInput(f"{path} is damaged: its digest does not fit what is in it; delete it to start anew")
+    if not isinstance(facts, dict):
+        raise _unusable(path, "it lacks its facts")
     wanted = {"params.means", "order", "generator"}
-    if missing := (wanted - tensors.keys()) | (FACTS - facts.keys()):
-        raise BadInput(f"{path} lacks {', '.join(sorted(missing))}; delete it to start anew")
-    return tensors, facts
+    if missing := (wanted - tensors.keys()) | (FACTS.keys() - facts.keys()):
+        raise _unusable(path, f"it lacks {', '.join(sorted(missing))}")
+    try:
+        return tensors, {name: load_value(hint, facts[name], name) for name, hint in FACTS.items()}
+    except BadInput as error:
+        raise _unusable(path, str(error)) from error
+
+
+def _unusable(path: Path, why: str) -> BadInput:
+    return BadInput(f"{path}: {why}; delete it to start anew")
 
 
 def _digest(tensors: dict[str, Tensor], facts: str) -> str:
@@ -164,14 +191,19 @@ def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> 
     count = len(points)
     for group in GROUPS:
         for name, value in getattr(points, group).items():
-            if len(value) != count:
-                raise BadInput(
-                    f"{path}: {group}.{name} has {len(value)} rows for {count} points; delete it to start anew"
-                )
-    shapes = [
-        {name: value.shape for name, value in group.items()} for group in (points.params, points.first, points.second)
+            if value.shape[:1] != (count,):
+                raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {count} points")
+    kinds = [
+        {name: (value.shape, value.dtype) for name, value in group.items()}
+        for group in (points.params, points.first, points.second)
     ]
-    if shapes[0] != shapes[1] or shapes[0] != shapes[2]:
-        raise BadInput(f"{path}: the optimiser's moments do not fit the parameters; delete it to start anew")
-    if len(order) not in (0, facts["views"]) or facts["shown"] > len(order):
-        raise BadInput(f"{path}: the order of views does not fit {facts['views']} views; delete it to start anew")
+    if kinds[0] != kinds[1] or kinds[0] != kinds[2] or not all(kind.is_floating_point for _, kind in kinds[0].values()):
+        raise _unusable(path, "the optimiser's moments do not fit the parameters")
+    whole = torch.arange(facts["views"] if len(order) else 0)
+    ordered = order.dtype == torch.int64 and torch.equal(order.sort().values, whole)
+    if not ordered or not 0 <= facts["shown"] <= len(order):
+        raise _unusable(path, f"the order of views does not fit {facts['views']} views")
+    if not set(facts["skipped"]) <= set(range(facts["views"])) or not 0 <= facts["sh_degree"] <= 3:
+        raise _unusable(path, "it knows of views or degrees of harmonics that do not exist")
+    if min(facts[name] for name in ("index", "seconds", "cpu_seconds", "reset_at", "halvings")) < 0:
+        raise _unusable(path, "a number in it is below 0")

@@ -51,7 +51,8 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Whether memory gave out, of the processor or of the device."""
     if isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError)):
         return True
-    return isinstance(error, RuntimeError) and any(words in str(error).lower() for words in NO_MEMORY)
+    known = isinstance(error, RuntimeError) and not isinstance(error, Fault)
+    return known and any(words in str(error).lower() for words in NO_MEMORY)
 
 
 @contextmanager
@@ -70,9 +71,14 @@ def in_one_line(out: Path) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
-        raise Fault(
-            f"{out}: out of memory{held}; smaller photographs (--longest, --scale) or fewer points (a higher "
-            "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
-            "last checkpoint is whole, and where there is more memory the same command goes on from there"
-        ) from error
+        raise out_of_memory(out) from error
+
+
+def out_of_memory(out: Path, also: str = "") -> Fault:
+    """What is said of a run in the folder `out` that cannot go on; `also` tells what has been tried."""
+    held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
+    return Fault(
+        f"{out}: out of memory{held}{also}; smaller photographs (--longest, --scale) or fewer points (a higher "
+        "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
+        "last checkpoint is whole, and where there is more memory the same command goes on from there"
+    )

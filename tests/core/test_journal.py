@@ -43,7 +43,7 @@ def test_steps_that_come_again_are_there_once(tmp_path):
 
 def test_an_event_after_a_torn_line_is_whole(tmp_path):
     path = tmp_path / "events.jsonl"
-    path.write_text('{"event": "StepDone", "index": 1}\n{"event": "War')
+    path.write_text('{"time": 1, "event": "StepDone", "index": 1}\n{"event": "War')
     with kept(tmp_path):
         emit(Warned("next"))
     assert [line["event"] for line in read(path)] == ["StepDone", "Warned"]

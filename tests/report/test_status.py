@@ -8,6 +8,8 @@ from surfkit.core.events import FileWritten, Measured, StageBegan, StepDone, emi
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 
+TOTALS = {"points": 9, "steps": 40, "seconds": 2.0, "cpu_seconds": 3.0}
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -57,7 +59,7 @@ def test_a_running_run_names_its_process_and_the_time_left(folder, capsys):
 
 
 def test_a_finished_run(folder, capsys):
-    write_json(folder / "metrics.json", {"images": {"psnr": 23.456, "ssim": 0.8, "per_image": {"a": {}}}})
+    write_json(folder / "metrics.json", {"images": {"psnr": 23.456, "ssim": 0.8, "per_image": {"a": {}}}} | TOTALS)
     (folder / "point_cloud.ply").touch()
     assert main(["status", str(folder)]) == 0
     assert "23.46 dB of 1 views\n" in capsys.readouterr().out

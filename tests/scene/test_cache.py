@@ -1,5 +1,6 @@
 """Memory stays within the budget, values are read in the coming order, and nothing depends on either."""
 
+import resource
 import threading
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from surfkit.core.check import BadInput
 from surfkit.scene import memory
 from surfkit.scene.cache import Cache, share
+from surfkit.scene.gate import Gate
 from surfkit.scene.memory import cache_bytes, free_bytes
 
 
@@ -89,6 +91,81 @@ def test_a_failure_is_raised_where_it_is_asked_for_and_nowhere_else():
             cache[2]
 
 
+def test_a_failure_is_not_kept():
+    short = [True]
+
+    def read(at):
+        if short[0]:
+            raise MemoryError
+        return at
+
+    cache = Cache(read, [5] * 3, threads=1)
+    settle_failed(cache)
+    with pytest.raises(MemoryError):
+        cache[1]
+    short[0] = False
+    assert cache.bytes == 10 and cache[1] == 1
+
+
+def settle_failed(cache):
+    """Wait for what is being read, and goes wrong."""
+    for future in list(cache._kept.values()):
+        future.exception()
+
+
+def test_a_smaller_budget_lets_go_at_once():
+    shelf = Shelf()
+    cache = Cache(shelf, [10] * 20, threads=1)
+    for at in range(20):
+        assert cache[at] == 10 * at
+    assert cache.bytes == 200
+    cache.resize(35)
+    assert cache.bytes == 30 and cache.budget == 35
+    cache.expect(range(20))
+    for at in range(20):
+        assert cache[at] == 10 * at and cache.bytes <= 35
+    cache.resize(0)
+    assert cache.bytes == 0 and cache[3] == 30 and cache.bytes == 10
+
+
+def test_a_gate_lets_in_what_fits_and_one_that_does_not():
+    gate, taken, most = Gate(100), [0], [0]
+    lock, both = threading.Lock(), threading.Barrier(2, timeout=10)
+
+    def work(count):
+        with gate.taking(count):
+            with lock:
+                taken[0] += count
+                most[0] = max(most[0], taken[0])
+            if count == 50:
+                both.wait()  # two of them are in at the same time
+            with lock:
+                taken[0] -= count
+
+    threads = [threading.Thread(target=work, args=(count,)) for count in (50, 50, 70, 70, 300, 70)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert most[0] == 300 and gate.taken == 0
+
+
+def test_no_two_large_ones_are_in_a_gate():
+    gate = Gate(100)
+    entered = threading.Event()
+
+    def work():
+        with gate.taking(40):
+            entered.set()
+
+    with gate.taking(70):
+        other = threading.Thread(target=work)
+        other.start()
+        assert not entered.wait(0.05) and gate.taken == 70
+    other.join(10)
+    assert entered.is_set() and gate.taken == 0
+
+
 def test_a_closed_cache_reads_nothing_more():
     shelf = Shelf()
     cache = Cache(shelf, [1] * 100, threads=1)
@@ -134,3 +211,14 @@ def test_limits_of_control_groups_are_respected(tmp_path, monkeypatch, version):
     assert free_bytes() == 1_200_000 and cache_bytes("auto") == 600_000
     monkeypatch.setattr(memory, "OWN", tmp_path / "none")
     assert free_bytes() > 1_200_000
+
+
+def test_the_limit_of_the_address_space_is_respected():
+    import psutil
+
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + 300_000_000, limits[1]))
+    try:
+        assert 200_000_000 < free_bytes() <= 500_000_000  # threads come and go meanwhile
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)

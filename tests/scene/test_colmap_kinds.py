@@ -10,7 +10,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.folder import noted
-from surfkit.scene import undistort
+from surfkit.scene import copies, undistort
 from surfkit.scene.capture import library
 from surfkit.scene.data import Data
 from surfkit.scene.photos import read_photo, view_photo
@@ -242,7 +242,7 @@ def test_a_lens_without_distortion_is_left_alone(farm):
 
 def test_a_folder_that_cannot_be_written_uses_the_cache_of_the_user(farm, monkeypatch, tmp_path):
     distort(farm, "RADIAL")
-    monkeypatch.setattr(undistort.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(copies.os, "access", lambda path, mode: False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     view = read(Data(farm)).train[0]
     assert view.path.parent == tmp_path / "cache" / "surfkit" / "undistorted" and view.path.exists()

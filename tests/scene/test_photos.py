@@ -8,8 +8,10 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.scene import photos
 from surfkit.scene.camera import Camera
 from surfkit.scene.capture import library
+from surfkit.scene.copies import Copies
 from surfkit.scene.photos import is_turned, photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View
 
@@ -147,3 +149,44 @@ def test_memory_stays_within_the_budget(tmp_path):
         assert cache.bytes <= budget
         most = max(most, process.memory_info().rss)
     assert most - before < budget + 80_000_000, "all of them are 346 MB; the rest is for decoding, and the allocator's"
+
+
+def test_copies_on_disk_are_the_same_pixels_and_made_once(tmp_path, monkeypatch):
+    paths = [save(tmp_path / f"{name}.png", stripes(40, 30)) for name in "ab"]
+    views = [view(path) for path in paths]
+    wanted = [read_photo(path, (8, 6)) for path in paths]
+    for _ in range(2):
+        cache = photo_cache(views, 0, Copies(tmp_path))
+        assert all(torch.equal(cache[at], wanted[at]) for at in (0, 1, 0))
+    made = sorted((tmp_path / "resized").iterdir())
+    assert [path.name[:2] for path in made] == ["a-", "b-"]
+    with monkeypatch.context() as patch:
+        patch.setattr(photos, "read_photo", None)  # decoding again would fail
+        assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[1], wanted[1])
+    made[0].write_bytes(made[0].read_bytes()[:-5])  # damaged: made again
+    assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[0], wanted[0])
+    save(paths[1], 255 - stripes(40, 30))  # another photograph of that name
+    assert torch.equal(photo_cache(views, 0, Copies(tmp_path))[1], read_photo(paths[1], (8, 6)))
+    assert len(list((tmp_path / "resized").iterdir())) == 3
+    paths[0].unlink()
+    with pytest.raises(BadInput, match="a.png: no such photograph"):
+        photo_cache(views, 0, Copies(tmp_path))[0]
+
+
+def test_large_photographs_are_decoded_one_after_the_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(photos.GATE, "most", 3 * 40 * 30)
+    inside, most = [0], [0]
+    original = photos._rgb
+
+    def counted(*args):
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        try:
+            return original(*args)
+        finally:
+            inside[0] -= 1
+
+    monkeypatch.setattr(photos, "_rgb", counted)
+    views = [view(save(tmp_path / f"{at}.png", stripes(40, 30))) for at in range(20)]
+    cache = photo_cache(views, threads=4)
+    assert len({tuple(cache[at].shape) for at in range(20)}) == 1 and most[0] == 1

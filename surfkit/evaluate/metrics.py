@@ -1,0 +1,31 @@
+"""The measurements of a run, as metrics.json keeps them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+
+
+def read_metrics(out: Path) -> dict[str, Any]:
+    """The measurements of a finished run.
+
+    Raises:
+        BadInput: They are damaged.
+    """
+    path = out / "metrics.json"
+    found = read_json(path, dict[str, Any])
+    images = found.get("images")
+    sound = isinstance(images, dict) and isinstance(images.get("per_image"), dict)
+    sound = sound and all(_is_number(found.get(name)) for name in ("points", "steps", "seconds", "cpu_seconds"))
+    sound = sound and all(images.get(name, "") is None or _is_number(images.get(name)) for name in ("psnr", "ssim"))
+    sound = sound and all(not found.get(name) or _is_number(found[name]) for name in ("peak_memory_bytes", "fps"))
+    if not sound:
+        raise BadInput(f"{path}: damaged; delete it, and the surfkit train command of the run measures again")
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e30

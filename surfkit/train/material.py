@@ -1,0 +1,91 @@
+"""What training looks at, kept in memory within a number of bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surfkit.core.memory import give_back
+from surfkit.losses.base import Loss
+from surfkit.scene.cache import Cache, share
+from surfkit.scene.copies import Copies
+from surfkit.scene.data import Data
+from surfkit.scene.depth_prior import Priors, read_priors
+from surfkit.scene.masks import mask_cache, mask_sizes
+from surfkit.scene.memory import cache_bytes
+from surfkit.scene.photos import photo_cache
+from surfkit.scene.scene import Scene
+
+LOWERED = 4
+"""The caches keep this share of what they held when memory ran short, the first time; nothing the second time."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
+
+    Attributes:
+        cache: Memory for them, such as "4GB"; "auto" takes half of what is free.
+        copies: Whether photographs that do not fit are also kept on disk as they are used, decoded and reduced.
+    """
+
+    cache: str = "auto"
+    copies: bool = False
+
+    def bytes(self) -> int:
+        """The memory that may be taken now."""
+        return cache_bytes(self.cache)
+
+
+@dataclass(frozen=True)
+class Material:
+    """What training looks at, by position of the view.
+
+    Attributes:
+        photos: (3, H, W) uint8.
+        masks: (H, W) bool or None.
+        priors: Estimated depths, if a loss of the recipe needs them and the data set has any.
+    """
+
+    photos: Cache[Tensor]
+    masks: Cache[Tensor | None] | None = None
+    priors: Priors | None = None
+
+    def caches(self) -> Iterator[Cache]:
+        """Those that there are."""
+        return filter(None, (self.photos, self.masks, self.priors))
+
+    def bytes(self) -> dict[str, int]:
+        """What each of them keeps or reads now."""
+        named = {"photographs": self.photos, "masks": self.masks, "priors": self.priors}
+        return {name: cache.bytes for name, cache in named.items() if cache is not None}
+
+    def expect(self, coming: Sequence[int]) -> None:
+        """Read in this order from now on."""
+        for cache in self.caches():
+            cache.expect(coming)
+
+    def lower(self) -> tuple[int, int] | None:
+        """Keep much less from now on: bytes kept before and after; None if there is nothing left to lower."""
+        before = sum(cache.bytes for cache in self.caches())
+        if not any(cache.budget for cache in self.caches()):
+            return None
+        for cache in self.caches():
+            kept = cache.bytes // LOWERED
+            cache.resize(kept if kept > max(cache.sizes, default=0) and not cache.lowered else 0)
+        give_back()
+        return before, sum(cache.bytes for cache in self.caches())
+
+
+def read_ahead(data: Data, scene: Scene, losses: Mapping[str, Loss], store: Store) -> Material:
+    """The photographs, masks and depth priors of the training views, as far as losses need them."""
+    budget = store.bytes()
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train)
+    needed = any(loss.needs_prior for loss in losses.values())
+    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
+    for_photos, for_masks, for_priors = share(budget, wanted)
+    priors = read_priors(data, scene, for_priors) if needed else None
+    copies = Copies(data.path) if store.copies and 3 * pixels > for_photos else None
+    return Material(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)

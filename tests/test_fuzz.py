@@ -1,0 +1,78 @@
+"""A few hundred of the cases of `bench/fuzz.py`: damaged files end in one line, whatever is wrong with them."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+
+from surfkit.core.check import BadInput
+
+BENCH = Path(__file__).parents[1] / "bench"
+CASES = 16
+TARGETS = (
+    "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
+    "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """The modules of the bench."""
+    sys.path.insert(0, str(BENCH))
+    try:
+        import damage
+        import fuzz
+
+        yield fuzz, damage
+    finally:
+        sys.path.remove(str(BENCH))
+
+
+def test_every_target_is_here(bench):
+    assert tuple(bench[0].TARGETS) == TARGETS
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_damage_is_one_line(bench, name, tmp_path):
+    fuzz, damage = bench
+    case = fuzz.Fuzz(name, tmp_path)
+    assert case.case([]) is None and case.files, "what is whole is taken"
+
+    @settings(
+        max_examples=CASES,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(damage.damages(case.files))
+    def check(listed):
+        assert (found := case.case(listed)) is None, found
+
+    check()
+
+
+def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
+    """A crash, a write elsewhere and an endless loop."""
+    fuzz, _ = bench
+    case = fuzz.Fuzz("points-as-text", tmp_path)
+
+    def found(read):
+        with monkeypatch.context() as patch:
+            patch.setattr("surfkit.scene.transforms.read_points", read)
+            return case.case([]).what
+
+    def writing(path):
+        (path.parent / "x").touch()
+        raise BadInput("no points")
+
+    def looping(path):
+        while True:
+            pass
+
+    monkeypatch.setattr(fuzz, "SECONDS", 1)
+    assert found(lambda path: 1 // 0) == "ZeroDivisionError in transforms.py points"
+    assert found(writing).startswith("wrote outside the run folder: ['open ")
+    assert found(looping).startswith("TimeoutError")
