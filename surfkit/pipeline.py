@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -159,7 +160,7 @@ def run(
                 return read_metrics(out)
             if not this.cloud.exists():
                 export(this, state, scene)
-            return evaluate(this, state, scene, rasterizer)
+            return evaluate(this, state, scene, rasterizer, meter)
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -303,23 +304,31 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     emit(FileWritten(this.cloud, "points"))
 
 
-def evaluate(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer) -> dict[str, Any]:
-    """Measure on the held-out photographs, write metrics and pictures, and return the metrics."""
+def evaluate(
+    this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, meter: Meter | None = None
+) -> dict[str, Any]:
+    """Measure on the held-out photographs, write metrics and pictures, and return the metrics.
+
+    `meter`: of a run that is being made; without one, what memory was taken by stays as it was measured then.
+    """
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
 
-    measured = evaluate_views(
-        scene.held_out,
-        photo_cache(scene.held_out, ahead),
-        draw,
-        timed=colors,
-        show=show,
-        correct_color=this.recipe.pretrain.appearance is not None,
-        masks=mask_cache(scene.held_out, ahead),
-    )
+    with meter.adding("pictures") if meter else nullcontext():
+        measured = evaluate_views(
+            scene.held_out,
+            photo_cache(scene.held_out, ahead),
+            draw,
+            timed=colors,
+            show=show,
+            correct_color=this.recipe.pretrain.appearance is not None,
+            masks=mask_cache(scene.held_out, ahead),
+        )
+    if meter:
+        emit(MemoryTaken(meter.report()))
     memory = read_record(this.out).get("memory_bytes") or {}
     metrics = {
         **measured,
