@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -284,9 +284,9 @@ def focal(lens: Any) -> str:
     return f", focal length {sum(lengths) / len(lengths):.0f} px" if lengths else ""
 
 
-def counted(values: Sequence[str] | object, most: int = 4) -> str:
+def counted(values: Iterable[str], most: int = 4) -> str:
     """The most frequent of some texts, with how often each occurs."""
-    counts = Counter(values)  # type: ignore[arg-type]
+    counts = Counter(values)
     shown = [f"{text} ({count})" if len(counts) > 1 else text for text, count in counts.most_common(most)]
     return "; ".join(shown) + (f"; and {len(counts) - most} other kinds" if len(counts) > most else "")
 

@@ -74,23 +74,25 @@ def gather(data: Data) -> Gathered:
 @contextmanager
 def heard() -> Iterator[list[str]]:
     """Within, warnings are not lost: their texts are in the list."""
-
-    class Listener:
-        texts: list[str] = []
-
-        @hookimpl
-        def surfkit_event(self, event: Any) -> None:
-            """See one event."""
-            if isinstance(event, Warned):
-                self.texts.append(event.text)
-
-    listener = Listener()
-    listener.texts = []
+    listener = _Listener()
     plugins().register(listener)
     try:
         yield listener.texts
     finally:
         plugins().unregister(listener)
+
+
+class _Listener:
+    """Keeps the texts of warnings."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if isinstance(event, Warned):
+            self.texts.append(event.text)
 
 
 def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:

@@ -51,8 +51,9 @@ class Geometry:
     findings: tuple[Finding, ...]
 
 
+@np.errstate(all="ignore")
 def survey(shots: Sequence[Shot], train: Sequence[Shot], xyz: np.ndarray, near: float) -> Geometry:
-    """Measure cameras and points.
+    """Measure cameras and points; numbers may be as large as they come.
 
     Args:
         shots: All that have a pose.

@@ -85,6 +85,9 @@ class Reader(Component):
     def read(self, data: Data) -> Capture:
         """What is in the folder `data.path`.
 
+        What is wrong with one photograph, or can be gone on after, goes through `core.check.reject` or `leaving_out`:
+        so `surfkit doctor` finds everything that is wrong at once.
+
         Raises:
             BadInput: Something is missing or damaged; one line says what to do.
         """

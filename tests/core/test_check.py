@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from surfkit.core.check import BadInput, expect
+from surfkit.core.check import BadInput, collecting, expect, few, leaving_out, reject
 
 
 def test_letters_are_bound_and_passed_on():
@@ -29,3 +29,35 @@ def test_other_shapes_are_refused(shape, wanted, message):
 def test_shapeless():
     with pytest.raises(BadInput, match="got list, which has no shape"):
         expect("means", [1, 2], ("N",))
+
+
+def read_three():
+    """Reads three items, of which two are wrong, and goes on where that is asked for."""
+    read = []
+    for item in "abc":
+        with leaving_out():
+            if item == "b":
+                raise BadInput("b is wrong")
+            read.append(item)
+    if len(read) < 3:
+        reject(BadInput("fewer than three"))
+    return read
+
+
+def test_faults_are_raised_unless_they_are_collected():
+    with pytest.raises(BadInput, match="b is wrong"):
+        read_three()
+    with collecting() as faults:
+        assert read_three() == ["a", "c"]
+        with collecting() as inner:
+            reject(BadInput("inner"))
+        with pytest.raises(KeyError), leaving_out():
+            raise KeyError("no mistake of the user")
+    assert [str(fault) for fault in faults] == ["b is wrong", "fewer than three"] and len(inner) == 1
+    with pytest.raises(BadInput, match="b is wrong"):
+        read_three()
+
+
+def test_a_few_names_stand_for_many():
+    assert few(["a"]) == "'a'" and few(["a", "b", "c"]) == "'a', 'b', 'c'"
+    assert few(list("abcde")) == "'a', 'b', 'c' and 2 more"

@@ -390,3 +390,29 @@ def test_distorted_photographs_are_not_undistorted_yet(farm):
     assert any(text.startswith("undistort 16 photographs, once, into") for text in examined.diagnosis.will)
     assert "reduce photographs of 64 x 48 px to 32 x 24" in examined.diagnosis.will
     assert replace(examined.diagnosis, findings=()).sound
+
+
+ODD = {
+    "a-pose-beyond-all-numbers": pose(3, lambda v: [*v[:4], 1e300, *v[5:]]),
+    "all-poses-beyond-all-numbers": lambda f: [pose(at, lambda v: [*v[:4], 1e300, *v[5:]])(f) for at in range(16)],
+    "far-points": moved_points((3e37, 0, 0), 0.5),
+    "points-in-one-place": lambda f: lines(
+        f / POINTS, lambda rows: [f"{i} 1 1 1 9 9 9 0" for i, _ in enumerate(rows, 1)]
+    ),
+    "one-point": lambda f: lines(f / POINTS, lambda rows: rows[:1]),
+    "one-photograph": lambda f: lines(f / IMAGES, lambda rows: rows[:2]),
+    "a-panorama": lens("1 EQUIRECTANGULAR 64 48"),
+    "a-fisheye": lens("1 OPENCV_FISHEYE 64 48 30 30 32 24 9 9 9 9"),
+    "no-size": lens("1 PINHOLE 0 0 50 50 32 24"),
+    "wild-distortion": lens("1 FULL_OPENCV 64 48 50 50 32 24 1e9 -1e9 3 4 5 6 7 8"),
+    "a-folder-for-a-photograph": lambda f: [gone("view_003.png")(f), (f / "images/view_003.png").mkdir()],
+    "text-for-a-photograph": lambda f: (f / "images/view_003.png").write_text("nothing"),
+    "no-photographs": lambda f: [path.unlink() for path in (f / "images").iterdir()],
+}
+
+
+@pytest.mark.parametrize("oddity", ODD)
+def test_nothing_odd_is_too_much(farm, oddity):
+    ODD[oddity](farm)
+    told(farm)
+    told(farm, quick=True, test_every=0)
