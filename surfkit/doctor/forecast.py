@@ -174,6 +174,9 @@ def _scene(data: Data, examined: Examined, load: Load, folder: Path) -> tuple[Sc
 
 def _failed(probed: Probed, parts: Sequence[Part]) -> Finding:
     """What it means that a probe ended early."""
+    kind, _, said = (probed.failure or "").partition(": ")
+    if kind == BadInput.__name__:
+        return Finding("error", "probe", said)
     done = len(probed.taken)
     points = parts[min(done, len(parts) - 1)].points
     where = "before its first step" if done == 0 else f"with {points:,} points"

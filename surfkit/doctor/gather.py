@@ -16,7 +16,7 @@ from surfkit.core.registry import components, hookimpl, plugins
 from surfkit.doctor.finding import Finding, from_errors
 from surfkit.scene.capture import Capture, Reader, Shot
 from surfkit.scene.data import Data
-from surfkit.scene.masks import find_masks
+from surfkit.scene.masks import FOLDER, MARKS, find_masks
 from surfkit.scene.names import PICTURES
 from surfkit.scene.read import captured, reader_of
 
@@ -116,9 +116,11 @@ def _loose(data: Data, shots: Sequence[Shot]) -> tuple[Path, ...]:
     named = data.path / (data.images or "images")
     folders = [named] if named.is_dir() else sorted({path.parent for path in used})
     found = (path for folder in folders for path in sorted(folder.rglob("*") if folder == named else folder.glob("*")))
-    masks = ("masks", "_mask.png", ".mask.png")
     return tuple(
-        path
-        for path in found
-        if path.suffix.lower() in PICTURES and path not in used and not any(mark in str(path) for mark in masks)
+        path for path in found if path.suffix.lower() in PICTURES and path not in used and not _is_mask(path, data.path)
     )
+
+
+def _is_mask(path: Path, root: Path) -> bool:
+    """Whether a picture is called as masks are."""
+    return path.stem.endswith(MARKS) or FOLDER in path.relative_to(root).parts

@@ -416,3 +416,31 @@ def test_nothing_odd_is_too_much(farm, oddity):
     ODD[oddity](farm)
     told(farm)
     told(farm, quick=True, test_every=0)
+
+
+def test_every_shot_of_an_odm_project_is_looked_at(farm):
+    shutil.rmtree(farm / "sparse")
+    shots = {
+        path.name: {"rotation": [np.pi, 0, 0], "translation": [at, at % 4, 9], "camera": "c"}
+        for at, path in enumerate(sorted((farm / "images").iterdir()))
+    }
+    shots["view_003.png"]["rotation"][1] = shots["view_004.png"]["translation"][0] = float("nan")
+    gone("view_001.png")(farm)
+    cut("view_002.png")(farm)
+    camera = {"projection_type": "brown", "width": 64, "height": 48, "focal_x": 0.9, "focal_y": 0.9}
+    model = [{"cameras": {"c": camera}, "shots": shots, "points": {}}]
+    (farm / "reconstruction.json").write_text(json.dumps(model))
+    found = told(farm)
+    texts = [finding.text for finding in found["data-set"]]
+    assert any("1 of 16 photographs are missing: 'view_001.png'" in text for text in texts)
+    assert any("'view_003.png' is not finite" in text and "more like it: view_004.png" in text for text in texts)
+    assert found["damaged-photographs"][0].names == ("view_002.png",)
+
+
+def test_masks_beside_photographs_are_no_unused_pictures(farm):
+    moved = Path(shutil.move(farm, farm.parent / "masks"))
+    for name in ("view_003_mask.png", "view_004.mask.png"):
+        paint(f"images/{name}", np.full((48, 64), 255, np.uint8))(moved)
+    assert told(moved) == {}
+    paint("images/more.png", np.zeros((9, 9), np.uint8))(moved)
+    assert told(moved)["unused-pictures"][0].names == ("images/more.png",)

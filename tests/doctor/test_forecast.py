@@ -180,6 +180,33 @@ def test_a_probe_that_is_killed_says_so(farm, tmp_path):
     assert "BadInput: rates has" in broken.failure and broken.taken == ()
 
 
+@pytest.mark.parametrize(
+    "taken, failure, level, words",
+    [
+        (0, "BadInput: rates has none; give some", "error", "rates has none; give some"),
+        (
+            0,
+            "RuntimeError: not enough memory",
+            "error",
+            "the probe ended before its first step: RuntimeError: not enough",
+        ),
+        (
+            1,
+            "the system killed it",
+            "warning",
+            "the probe ended with 900 points: the system killed it; if memory ran out",
+        ),
+    ],
+)
+def test_what_it_means_that_a_probe_ended_early(farm, monkeypatch, taken, failure, level, words):
+    broken = Probed(STARTED, probed().taken[:taken], None, failure)
+    monkeypatch.setattr("surfkit.doctor.forecast.probe", lambda job, told: broken)
+    monkeypatch.setattr("surfkit.doctor.forecast.schedule", lambda *_: parts(300, 900, 900, 900, 900))
+    data, recipe = Data(farm, test_every=0), recipes()["2dgs"]
+    found, (finding,) = forecast(data, recipe, examine(data, recipe, quick=True), Plan())
+    assert found is None and finding.level == level and finding.text.startswith(words)
+
+
 def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path):
     """Of the disk; memory and time depend on what else the machine does, and are looked at in bench/doctor.py."""
     farm = Path(shutil.copytree(farm, tmp_path / "farm", ignore=shutil.ignore_patterns("undistorted")))
