@@ -222,7 +222,7 @@ def resealed(path: Path, damage: Damage) -> None:
         return
     names = sorted(tensors)
     name = names[int(damage.at * (len(names) - 1))]
-    value = tensors[name]
+    value = torch.atleast_1d(tensors[name])
     spoilt = float("nan") if value.is_floating_point() else 99
     twice = value.repeat(2, *[1] * (value.dim() - 1))
     shapes = (value[:0], value[:1], value.flatten(), value[None].clone(), twice, torch.zeros(()))

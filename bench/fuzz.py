@@ -513,6 +513,7 @@ def main() -> int:
                 else:
                     found[key] = finding
                     print(f"{name}: {finding.what}\n    {finding.damages}\n    {finding.said[-600:]}", flush=True)
+        print(f"{sum(counts.values())} cases, {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
     report = {"cases": counts, "seconds": round(time.monotonic() - start), "found": [asdict(f) for f in found.values()]}
     for finding in found.values():
         print(f"{finding.times:5} x {finding.target}: {finding.what}")

@@ -17,6 +17,7 @@ _HOME = {
     "surfkit.core.events": (
         "FileWritten",
         "Measured",
+        "MemoryTaken",
         "PhotoSkipped",
         "PointsEdited",
         "StageBegan",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.events import FileWritten, Warned, emit
+from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
@@ -119,7 +120,7 @@ def run(
                 export(this, state, scene)
             if not meshed(this, state.index):
                 mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto")))
-            return evaluate(this, state, scene, rasterizer)
+            return evaluate(this, state, scene, rasterizer, meter)
 
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
@@ -144,9 +145,19 @@ def evaluate(
     state: StageState,
     scene: Scene,
     rasterizer: Rasterizer,
+    meter: Meter | None = None,
     lpips_weights: str = "auto",
 ) -> dict[str, Any]:
-    """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are."""
+    """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.
+
+    Args:
+        this: The run.
+        state: Its splats.
+        scene: Its data.
+        rasterizer: What draws.
+        meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
+        lpips_weights: See `surfkit.evaluate.lpips.load_perceptual`; or "none".
+    """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides, default=0))
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
@@ -155,18 +166,21 @@ def evaluate(
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
 
-    measured = evaluate_views(
-        scene.held_out,
-        photo_cache(scene.held_out, ahead),
-        draw,
-        timed=colors,
-        show=show,
-        correct_color=this.recipe.pretrain.appearance is not None,
-        masks=mask_cache(scene.held_out, ahead),
-        networks=perceptual,
-    )
+    with meter.adding("pictures") if meter else nullcontext():
+        measured = evaluate_views(
+            scene.held_out,
+            photo_cache(scene.held_out, ahead),
+            draw,
+            timed=colors,
+            show=show,
+            correct_color=this.recipe.pretrain.appearance is not None,
+            masks=mask_cache(scene.held_out, ahead),
+            networks=perceptual,
+        )
     if lacking is not None:
         measured["images"]["lpips_not_measured"] = lacking
+    if meter:
+        emit(MemoryTaken(meter.report()))
     memory = read_record(this.out).get("memory_bytes") or {}
     metrics = {
         **measured,

@@ -8,12 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.cli.data import data_of
 from surfkit.cli.recipes import chosen_recipe
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
@@ -25,7 +26,6 @@ from surfkit.doctor.forecast import Plan, forecast
 from surfkit.pipeline import with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Data
 
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
@@ -72,6 +72,16 @@ class Doctor:
     test_list: Path | None = None
     """Keep the photographs named in this file from training instead: one name a line, as below images/."""
 
+    model: Path | None = None
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+
+    split: Literal["gauu-scene"] | None = None
+    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
+    numbers, k = n // ceil(n / 10)."""
+
+    test_data: Path | None = None
+    """Another data set, of the same layout and in the same coordinates, all of which is kept from training."""
+
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
@@ -98,9 +108,7 @@ class Doctor:
 
     def run(self) -> int:
         """Examine, and tell."""
-        data = Data(
-            self.data, self.scale, self.longest, self.test_every, self.test_list, self.images, self.masks, self.layout
-        )
+        data = data_of(self.data, self)
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with watched() as told:
             examined = examine(data, recipe, self.quick, told)

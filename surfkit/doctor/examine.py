@@ -298,7 +298,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> tuple
         return ()
     train, held = len(gathered.train), len(shots) - len(gathered.train)
     whose = "its own split" if gathered.capture.held_out is not None else f"every {data.test_every}th"
-    whose = "as listed" if data.test_list is not None else whose
+    whose = data.split or ("as listed" if data.test_list is not None else whose)
     told = [f"train on {train} photographs, and measure on {held}" + (f" ({whose})" if held else "")]
     changes = {(look.size, data.size(*look.size)) for look in known.values() if look.size}
     if smaller := sorted((a, b) for a, b in changes if a != b):

@@ -185,10 +185,10 @@ def _numbers(shots: Sequence[Shot], xyz: np.ndarray, extent: float | None) -> li
     if spacing <= COARSE * extent:
         return []
     text = (
-        f"coordinates of up to {most:,.0f} in a scene of {extent:,.3g} units: training is not touched, but files of "
-        f"32-bit numbers such as point_cloud.ply hold positions to {spacing:.2g} units only; subtract an offset first"
+        f"coordinates of up to {most:,.0f} in a scene of {extent:,.3g} units, of which 32 bits hold {spacing:.2g} "
+        "at best: point_cloud.ply leaves out an offset, which its header and run.json name"
     )
-    return [Finding("warning", "large-coordinates", text)]
+    return [Finding("note", "large-coordinates", text)]
 
 
 def _points(shots: Sequence[Shot], xyz: np.ndarray, inside: np.ndarray) -> list[Finding]:

@@ -41,7 +41,7 @@ def refuse_cut_off(folder: Path) -> None:
 
 
 def cut_off(path: Path, *others: Path) -> BadInput:
-    """What is said of files that end too early."""
+    """What is said of a file that ends too early, and of others that do."""
     also = f" (and so are {', '.join(other.name for other in others)})" if others else ""
     return BadInput(f"{path}: the file is cut off or no COLMAP file{also}; copy it whole")
 

@@ -91,7 +91,7 @@ def find_maps(root: Path, model: Path, names: Sequence[str], metres: float | Non
         if found is not None:
             maps = {name: found(name.replace("\\", "/")) for name in names}
             return {name: depth for name, depth in maps.items() if depth is not None and depth.path.is_file()}
-    return _matrixcity(root, names, metres) if metres else {}
+    return matrixcity_maps(root, names, metres) if metres else {}
 
 
 def map_path(root: Path, name: str) -> Path:
@@ -244,7 +244,7 @@ def _nerfstudio(root: Path, model: Path) -> Finder | None:
     return find
 
 
-def _matrixcity(root: Path, names: Sequence[str], metres: float) -> dict[str, DepthFile]:
+def matrixcity_maps(root: Path, names: Sequence[str], metres: float) -> dict[str, DepthFile]:
     """MatrixCity: centimetres in BLOCK/depth/0000.exr or BLOCK_depth/0000.exr, below the data set or CITY_depth/."""
     found = {}
     for name in names:

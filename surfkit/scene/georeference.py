@@ -17,6 +17,10 @@ from surfkit.core.events import Warned, emit
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis, metres, and flattening."""
+POLAR, BESIDE = 84.0, 30.0
+"""Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
+MOST_M = 1e8
+"""No coordinate on Earth is larger, metres."""
 FOLDER = "odm_georeferencing"
 ZONES = (r"WGS ?84 / UTM zone (\d+)([NS])", r"WGS84 UTM (\d+)([NS])", r"\+proj=utm.*\+zone=(\d+)(.*\+south)?")
 """How OpenDroneMap writes a zone of UTM, in coords.txt and in proj.txt."""
@@ -74,16 +78,21 @@ def placed(root: Path, folder: Path, model: Mapping[str, Any], height: float) ->
     lines = _lines(root / FOLDER / "coords.txt")
     texts = [*lines[:1], *_lines(root / FOLDER / "proj.txt")[:1]]
     zone = next((found for text in texts for found in [_zone(text)] if found), None)
-    if zone is None:
+    if zone is None or abs(latitude) > POLAR:
         if texts:
             emit(
                 Warned(
-                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM, so coordinates are metres east, north and up of "
-                    f"{latitude:.6f}, {longitude:.6f}"
+                    f"{root / FOLDER}: {texts[0]!r} is no zone of UTM at {latitude:.6f}, {longitude:.6f}: "
+                    "coordinates are metres east, north and up of there"
                 )
             )
         return Place(local)
     number, south = zone
+    if not abs((longitude - (6 * number - 183) + 180) % 360 - 180) < BESIDE:
+        raise BadInput(
+            f"{root / FOLDER}: zone {number} of UTM is far from the reconstruction's {latitude:.6f}, {longitude:.6f}; "
+            "run OpenDroneMap again, or delete coords.txt and proj.txt"
+        )
     shift = _offset(root / FOLDER / "coords.txt", lines)
     return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift)
 
@@ -132,10 +141,10 @@ def _reference(folder: Path, model: Mapping[str, Any]) -> tuple[float, float, fl
         return None
     try:
         values = tuple(float(given[name]) for name in ("latitude", "longitude", "altitude"))
-    except (TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise BadInput(f"{path}: lacks latitude, longitude or altitude; run OpenSfM again") from error
-    if not all(map(math.isfinite, values)) or abs(values[0]) > 90 or abs(values[1]) > 180:
-        raise BadInput(f"{path}: {values[0]:g}, {values[1]:g} is no latitude and longitude; run OpenSfM again")
+    if not (abs(values[0]) <= 90 and abs(values[1]) <= 180 and abs(values[2]) < MOST_M):
+        raise BadInput(f"{path}: {values[0]:g}, {values[1]:g} at {values[2]:g} m is no place; run OpenSfM again")
     return None if values[:2] == (0, 0) else values  # type: ignore[return-value]
 
 
@@ -167,6 +176,6 @@ def _offset(path: Path, lines: list[str]) -> tuple[float, float, float] | None:
         east, north = (float(word) for word in lines[1].split()[:2])
     except ValueError as error:
         raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two numbers; run OpenDroneMap again") from error
-    if not (math.isfinite(east) and math.isfinite(north)):
-        raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two finite numbers; run OpenDroneMap again")
+    if not (abs(east) < MOST_M and abs(north) < MOST_M):
+        raise BadInput(f"{path}: line 2 is {lines[1]!r}, not two lengths on Earth; run OpenDroneMap again")
     return east, north, 0.0

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import components, find
 from surfkit.scene.camera import Camera
@@ -63,7 +63,7 @@ def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Coll
     held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     if twice := next((a.name for a, b in pairwise(shots) if a.name == b.name), None):
-        raise BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out")
+        reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
     wanted = [shot for shot in shots if only is None or shot.name in only]

@@ -32,7 +32,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if names is not None:
         values = np.stack([columns[name] for name in names], 1)
         scale = 255 if values.dtype.kind == "f" and values.max(initial=0) <= 1 else 1
-        rgb = (values * scale).clip(0, 255).astype(np.uint8)
+        rgb = np.nan_to_num(values * scale).clip(0, 255).astype(np.uint8)
     with np.errstate(over="ignore"):
         finite = np.isfinite(xyz.astype(np.float32)).all(1)
     if not finite.any():

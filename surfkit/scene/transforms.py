@@ -16,7 +16,7 @@ from surfkit.core.codec import read_json
 from surfkit.scene.capture import Capture, Reader, Shot, camera_of, shortened
 from surfkit.scene.data import Data
 from surfkit.scene.depth_cloud import points_of_depth
-from surfkit.scene.depth_files import find_maps
+from surfkit.scene.depth_files import matrixcity_maps
 from surfkit.scene.photos import photo_size
 from surfkit.scene.sparse_ply import read_points
 
@@ -79,7 +79,8 @@ class MatrixCity(Reader):
         held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
         metres, sparse = _metres(read[0][0]), points(data.path, {})
         if not len(sparse[0]):
-            sparse = points_of_depth(train, find_maps(data.path, data.path, [shot.name for shot in train], metres))
+            maps = matrixcity_maps(data.path, [shot.name for shot in train], metres) if metres else {}
+            sparse = points_of_depth(train, maps)
         return replace(_split(train, held, sparse), metres=metres)
 
 
@@ -129,11 +130,15 @@ def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndar
     return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
-def _metres(contents: Mapping[str, Any]) -> float:
+def _metres(contents: Mapping[str, Any]) -> float | None:
     """Metres per unit of MatrixCity's poses: rotations of length 1/100 mean metres, whole ones hundreds of metres."""
-    frame = contents["frames"][0]
-    length = np.linalg.norm(np.array(frame.get("transform_matrix", frame.get("rot_mat")), np.float64)[:3, 0])
-    return 1.0 if length < 0.1 else 100.0
+    for frame in contents["frames"]:
+        try:
+            matrix = np.array(frame.get("transform_matrix", frame.get("rot_mat")), np.float64)
+            return 1.0 if np.linalg.norm(matrix[:3, 0]) < 0.1 else 100.0
+        except (TypeError, ValueError, IndexError):  # damaged, and told of where poses are read
+            continue
+    return None
 
 
 def _name(photo: Path, root: Path) -> str:

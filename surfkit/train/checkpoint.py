@@ -188,22 +188,22 @@ def _digest(tensors: dict[str, Tensor], facts: str) -> str:
 
 def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> None:
     """Every column must have a row per point, every parameter its moments, and the order every view."""
-    count = len(points)
+    count = tuple(points.params["means"].shape[:1])
     for group in GROUPS:
         for name, value in getattr(points, group).items():
-            if value.shape[:1] != (count,):
-                raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {count} points")
+            if not count or value.shape[:1] != count:
+                raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {sum(count)} points")
     kinds = [
         {name: (value.shape, value.dtype) for name, value in group.items()}
         for group in (points.params, points.first, points.second)
     ]
     if kinds[0] != kinds[1] or kinds[0] != kinds[2] or not all(kind.is_floating_point for _, kind in kinds[0].values()):
         raise _unusable(path, "the optimiser's moments do not fit the parameters")
-    whole = torch.arange(facts["views"] if len(order) else 0)
-    ordered = order.dtype == torch.int64 and torch.equal(order.sort().values, whole)
-    if not ordered or not 0 <= facts["shown"] <= len(order):
+    size, views = order.numel(), torch.arange(order.numel())
+    ordered = order.dtype == torch.int64 and order.dim() == 1 and torch.equal(order.sort().values, views)
+    if not ordered or size not in (0, facts["views"]) or not 0 <= facts["shown"] <= len(order):
         raise _unusable(path, f"the order of views does not fit {facts['views']} views")
-    if not set(facts["skipped"]) <= set(range(facts["views"])) or not 0 <= facts["sh_degree"] <= 3:
+    if not all(0 <= at < facts["views"] for at in facts["skipped"]) or not 0 <= facts["sh_degree"] <= 3:
         raise _unusable(path, "it knows of views or degrees of harmonics that do not exist")
     if min(facts[name] for name in ("index", "seconds", "cpu_seconds", "reset_at", "halvings")) < 0:
         raise _unusable(path, "a number in it is below 0")

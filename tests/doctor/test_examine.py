@@ -204,7 +204,7 @@ FAULTS = {
         "warning",
         "'view_003.png'",
     ),
-    "numbers": (shifted_far, "large-coordinates", "warning", "hold positions to 0.5 units only"),
+    "numbers": (shifted_far, "large-coordinates", "note", "point_cloud.ply leaves out an offset"),
     "hole": (
         without_middle,
         "coverage-holes",

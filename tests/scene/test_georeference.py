@@ -66,19 +66,20 @@ def test_moving_changes_no_pixel(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "crs"),
+    ("text", "longitude", "crs"),
     [
-        ("WGS84 UTM 56S\n333000 6247000\n", "EPSG:32756"),
-        ("+proj=utm +zone=7 +datum=WGS84 +units=m +no_defs\n1 2\n", "EPSG:32607"),
-        ("+proj=utm +zone=7 +south +datum=WGS84\n1 2\n", "EPSG:32707"),
-        ("EPSG:32632\n1 2\n", "EPSG:32632"),
-        ("EPSG:2056\n1 2\n", "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
-        ("", "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
+        ("WGS84 UTM 56S\n333000 6247000\n", 151, "EPSG:32756"),
+        ("+proj=utm +zone=7 +datum=WGS84 +units=m +no_defs\n1 2\n", -140, "EPSG:32607"),
+        ("+proj=utm +zone=7 +south +datum=WGS84\n1 2\n", -140, "EPSG:32707"),
+        ("WGS84 UTM 1N\n1 2\n", 179.9, "EPSG:32601"),
+        ("EPSG:32632\n1 2\n", 8.9, "EPSG:32632"),
+        ("EPSG:2056\n1 2\n", 8.9, "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
+        ("", 8.9, "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"),
     ],
 )
-def test_zones_as_opendronemap_writes_them(tmp_path, text, crs):
+def test_zones_as_opendronemap_writes_them(tmp_path, text, longitude, crs):
     with noted() as notes:
-        assert project(tmp_path, text).crs == crs
+        assert project(tmp_path, text, REFERENCE | {"longitude": longitude}).crs == crs
     assert ("is no zone of UTM" in "".join(notes.texts)) == text.startswith("EPSG:2056")
 
 
@@ -90,9 +91,14 @@ def test_without_gps_there_is_no_place(tmp_path):
     ("coords", "reference", "text"),
     [
         ("WGS84 UTM 32N\n1\n", REFERENCE, "coords.txt: line 2 is '1', not two numbers"),
-        ("WGS84 UTM 32N\nnan 1\n", REFERENCE, "coords.txt: line 2 is 'nan 1', not two finite numbers"),
+        ("WGS84 UTM 32N\nnan 1\n", REFERENCE, "coords.txt: line 2 is 'nan 1', not two lengths on Earth"),
+        ("WGS84 UTM 32N\n1e300 1\n", REFERENCE, "coords.txt: line 2 is '1e300 1', not two lengths on Earth"),
+        ("WGS84 UTM 50N\n1 2\n", REFERENCE, "zone 50 of UTM is far from the reconstruction's 47.500000, 8.900000"),
+        ("", [], "reference_lla.json: lacks latitude, longitude or altitude"),
+        ("", REFERENCE | {"altitude": 1e300}, "47.5, 8.9 at 1e+300 m is no place"),
+        ("", REFERENCE | {"longitude": float("nan")}, "47.5, nan at 430 m is no place"),
         ("WGS84 UTM 32N\n1 2\n", {"latitude": 1}, "reference_lla.json: lacks latitude, longitude or altitude"),
-        ("WGS84 UTM 32N\n1 2\n", REFERENCE | {"latitude": 91}, "91, 8.9 is no latitude and longitude"),
+        ("WGS84 UTM 32N\n1 2\n", REFERENCE | {"latitude": 91}, "91, 8.9 at 430 m is no place"),
     ],
 )
 def test_damaged_georeferences(tmp_path, coords, reference, text):
