@@ -5,7 +5,7 @@ PY = $(VENV)/bin/python
 STEPS ?= 1000
 OUT ?= runs/demo
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/surfkit train recipe:2dgs --steps $(STEPS) --out $(OUT)
@@ -20,6 +20,10 @@ bench: $(VENV)/.installed
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/raster.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/dgd.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/survey.py
+
+# Half an hour: damaged files of every kind, through the command line.
+fuzz: $(VENV)/.installed
+	$(PY) bench/fuzz.py --cases 10000
 
 # Reinstalled when what is compiled or declared changes; the Python files are used in place.
 $(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/raster/*.h surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)

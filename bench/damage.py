@@ -171,7 +171,7 @@ def tree(path: Path, damage: Damage) -> None:
 def size(path: Path, damage: Damage) -> None:
     """A PNG that claims to be of another size."""
     content = bytearray(path.read_bytes())
-    if content[:8] != b"\x89PNG\r\n\x1a\n":
+    if content[:8] != b"\x89PNG\r\n\x1a\n" or len(content) < 33:
         return
     by = (0, 1, 2, 1000, 2000, 10_000, 10**8)
     width, height = struct.unpack_from(">II", content, 16)
@@ -186,7 +186,7 @@ def size(path: Path, damage: Damage) -> None:
 def array_header(path: Path, damage: Damage) -> None:
     """An .npy that claims another shape, type or order."""
     content = path.read_bytes()
-    if not content.startswith(b"\x93NUMPY\1\0"):
+    if not content.startswith(b"\x93NUMPY\1\0") or len(content) < 10:
         return
     shapes = (
         "()",
@@ -219,6 +219,8 @@ def resealed(path: Path, damage: Damage) -> None:
         with safe_open(path, framework="pt") as file:
             metadata, tensors = dict(file.metadata() or {}), {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError):  # it is damaged already
+        return
+    if "facts" not in metadata or not tensors:
         return
     names = sorted(tensors)
     name = names[int(damage.at * (len(names) - 1))]

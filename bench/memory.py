@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from machine import save
 from PIL import Image
 
 DISTINCT = 8
@@ -67,7 +68,6 @@ def main() -> int:
         parser.add_argument(f"--{flag}", type=int, default=default)
     parser.add_argument("--limit", default="4GiB")
     parser.add_argument("--words", nargs="*", default=[], help="further words for surfkit train")
-    parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
     limit = cache_bytes(chosen.limit)
     with tempfile.TemporaryDirectory() as place:
@@ -95,8 +95,7 @@ def main() -> int:
     for part, count in report["parts"].items():
         print(f"{part:>12} {count / 1e6:8.0f} MB")
     print(f"{chosen.images} images, {held / 1e6:.0f} MB at most, limit {limit / 1e6:.0f} MB, {seconds:.0f} s")
-    if chosen.out:
-        chosen.out.write_text(json.dumps(report, indent=2) + "\n")
+    print(f"wrote {save('memory', report)}")
     return 0 if held <= limit else 1
 
 

@@ -402,6 +402,12 @@ def test_commands_on_a_run_folder_take_its_lock(data, recipe, tmp_path, monkeypa
     assert main(["evaluate", str(tmp_path / "nowhere")]) == 2 and not (tmp_path / "nowhere").exists()
 
 
+def test_a_folder_that_cannot_be_made_is_one_line(data, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    words = ["train", "recipe:2dgs", "--data", str(data.path), "--out", str(tmp_path / "file" / "run")]
+    assert main(words) == 2 and capsys.readouterr().err == f"surfkit: {tmp_path / 'file' / 'run'}: Not a directory\n"
+
+
 def test_checkpoints_can_be_read_by_whom_the_umask_lets(data, recipe, tmp_path):
     for mask, mode in ((0o022, 0o644), (0o027, 0o640)):
         before = os.umask(mask)

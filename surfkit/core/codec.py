@@ -173,7 +173,7 @@ def _load_scalar(hint: Any, data: Any, at: str) -> Any:
     if hint is Path:
         return Path(_require(str, data, at))
     if hint is int:
-        if isinstance(data, int) and not isinstance(data, bool):
+        if isinstance(data, int) and not isinstance(data, bool) and abs(data) < 2**63:
             return data
         raise _unfit(at, "a whole number", data)
     if hint in (str, bool):

@@ -123,6 +123,10 @@ def shortened(value: object) -> str:
 def library() -> Any:
     """The module pycolmap, loaded after Pillow's PNG writer: the other way round, saving a PNG kills the process."""
     import PIL.PngImagePlugin  # noqa: F401
-    import pycolmap
 
+    try:
+        import pycolmap
+    except (ImportError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise BadInput(f"pycolmap cannot be loaded: {reason}; is it installed, and is there memory for it?") from error
     return pycolmap

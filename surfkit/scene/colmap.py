@@ -153,8 +153,9 @@ def _reconstruction(folder: Path) -> Any:
     binary = not _lacking(folder, ".bin")
     if binary:  # of text files, pycolmap sees by itself that they are cut off
         refuse_cut_off(folder)
+    pycolmap = library()
     try:
-        model = library().Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():
             image.name  # noqa: B018 (is decoded here)
     except UnicodeDecodeError as error:

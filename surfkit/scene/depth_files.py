@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -22,6 +23,7 @@ PHOTOS = ("rgb", "images", "input")
 """Folders of photographs inside a block of MatrixCity, which has none or one of them."""
 FOLDER = "estimated_depths"
 RECORD = "depth.json"
+warnings.filterwarnings("ignore", r"Reading `\.npy`", UserWarning)  # of Python 2, whose arrays are as good
 MILLIMETRE = 1e-3
 """Nerfstudio's `depth_unit_scale_factor`, where a data set does not say another."""
 
@@ -55,8 +57,8 @@ class DepthFile:
             stored = stored.reshape([size for size in stored.shape if size != 1] or [1, 1])
         if stored.ndim != 2:
             raise BadInput(f"has shape {stored.shape}, not (height, width)")
-        values = stored.astype(np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            values = stored.astype(np.float32)
             if self.metric:
                 return np.where(values > 0, 1 / (values * np.float32(self.scale)), np.nan)
             inverse = np.where(np.isfinite(values) & (values != 0), values * self.scale + self.offset, np.nan)

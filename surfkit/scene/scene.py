@@ -82,10 +82,11 @@ class Frame:
             poses: (V, 4, 4) float64 world_to_camera of the training cameras, input frame.
             points: (P, 3) float64 input units; their median distance replaces that of the cameras.
         """
-        centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
-        origin = centres.mean(0)
-        reach = MARGIN * np.linalg.norm(centres - origin, axis=1).max()
-        spread = np.median(np.linalg.norm(points - origin, axis=1)) if len(points) else 0.0
+        with np.errstate(over="ignore", invalid="ignore"):  # what is infinite then is refused below
+            centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+            origin = centres.mean(0)
+            reach = MARGIN * np.linalg.norm(centres - origin, axis=1).max()
+            spread = np.median(np.linalg.norm(points - origin, axis=1)) if len(points) else 0.0
         extent = reach if reach > 1e-6 * spread else spread
         if not 0 < extent < np.inf:
             raise BadInput("all training cameras and points lie in one place; a scene needs views from several places")
