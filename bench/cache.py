@@ -20,6 +20,7 @@ from pathlib import Path
 from machine import save
 from trained import EXAMPLE
 
+from surfkit.blocks import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.pipeline import Every, run, with_steps
 from surfkit.scene.data import Data
@@ -34,7 +35,7 @@ def measure(data: Data, steps: int, budget: str) -> dict[str, object]:
     cache, _, copies = budget.partition("+")
     with tempfile.TemporaryDirectory() as folder:
         recipe, store = with_steps(recipes()["2dgs"], steps), Store(cache, bool(copies))
-        metrics = run(recipe, data, Path(folder), "cpu", Every(pictures=0), store)
+        metrics = run(recipe, data, Path(folder), Hands("cpu"), Every(pictures=0), store)
         points = (Path(folder) / "point_cloud.ply").read_bytes()
     found = {name: metrics[name] for name in TIMES}
     return found | {"psnr": metrics["images"]["psnr"], "points": hashlib.blake2b(points, digest_size=8).hexdigest()}

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from trained import EXAMPLE
 
+from surfkit.blocks import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.doctor.examine import examine
@@ -29,7 +30,7 @@ def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:
     """One run, in a process of its own, so that its peak of memory is its own too."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, "cpu", Every(pictures=0))
+        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, Hands("cpu"), Every(pictures=0))
         disk = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     answer.put({**{key: metrics[key] for key in ("points", "seconds")}, "memory": peak_memory_bytes(), "disk": disk})
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -24,10 +24,11 @@ from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
 from surfkit.scene.scene import Frame, Scene
+from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
-FOLDERS = ("pretrain", "pictures", "progress")
+FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress")
 
 
 @dataclass(frozen=True)
@@ -38,21 +39,30 @@ class Run:
         out: The folder.
         recipe: Part of it as recipe.json.
         data: Part of it in run.json.
+        part: The stage that is spoken of: "pretrain" for the whole scene at once, "tune" for a block, and for all of
+            them when they are merged.
     """
 
     out: Path
     recipe: Recipe
     data: Data
+    part: Literal["pretrain", "tune"] = "pretrain"
+
+    @property
+    def stage(self) -> Stage:
+        """The one that is spoken of."""
+        return getattr(self.recipe, self.part)
 
     @property
     def needs_priors(self) -> bool:
         """Whether a loss of the recipe looks at depth priors."""
-        return any(loss.needs_prior for loss in self.recipe.pretrain.losses.values())
+        stages = [self.recipe.pretrain] + [self.recipe.tune] * (self.recipe.partition is not None)
+        return any(loss.needs_prior for stage in stages for loss in stage.losses.values())
 
     @property
     def checkpoint(self) -> Path:
         """The state of the optimisation."""
-        return self.out / "pretrain" / "checkpoint.safetensors"
+        return self.out / self.part / "checkpoint.safetensors"
 
     @property
     def metrics(self) -> Path:

@@ -17,7 +17,7 @@ from surfkit.folder import (
     Run,
     say,
 )
-from surfkit.primitives.points import Points
+from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.scene.memory import free_bytes
@@ -61,6 +61,7 @@ class Job:
         every: When to write what.
         given: What to look at.
         meter: Sees what memory is taken by.
+        start: The points to begin with; the sparse ones of the scene if None.
     """
 
     this: Run
@@ -69,6 +70,7 @@ class Job:
     every: Every
     given: Material
     meter: Meter
+    start: Callable[[], Columns] | None = None
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -99,14 +101,15 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     When memory gives out, it goes back with a smaller cache, until there is none.
     """
     this, given = job.this, job.given
-    stage, primitive = this.recipe.pretrain, this.recipe.primitive
+    stage, primitive = this.stage, this.recipe.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, job.scene.train, *sources)
     along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
-        return trainer.begin(Points.fresh(primitive.init(job.scene.cloud, generator)), generator)
+        params = job.start() if job.start else primitive.init(job.scene.cloud, generator)
+        return trainer.begin(Points.fresh(params), generator)
 
     if state is not None:
         say(f"{this.out}: going on after step {state.index} of {stage.steps}")
@@ -129,8 +132,8 @@ def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | Non
     """Take the steps that are left, and write checkpoints and pictures on the way."""
     this, every, meter = job.this, job.every, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
-    emit(StageBegan("pretrain", steps, len(state.points), state.index + 1))
-    with graceful() as request, Display("pretrain", steps) as display:
+    emit(StageBegan(this.part, steps, len(state.points), state.index + 1))
+    with graceful() as request, Display(this.part, steps) as display:
         for done in trainer.run(state):
             display.show(done)
             meter.step(state, job.given)
@@ -146,7 +149,7 @@ def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | Non
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
-    emit(StageEnded("pretrain", steps, len(state.points), state.seconds - seconds))
+    emit(StageEnded(this.part, steps, len(state.points), state.seconds - seconds))
     return state
 
 
@@ -172,7 +175,7 @@ def last_good(this: Run, begin: Callable[[], StageState]) -> StageState:
     """The state of the last checkpoint, or a new beginning."""
     found = checkpoint.load_last(this.checkpoint)
     state = found[0] if found else begin()
-    say(f"{this.out}: going on after step {state.index} of {this.recipe.pretrain.steps}")
+    say(f"{this.out}: going on after step {state.index} of {this.stage.steps}")
     return state
 
 
@@ -185,7 +188,7 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
     if halvings >= MOST_HALVINGS:
         raise Fault(
             f"{this.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
-            "and its camera, or lower pretrain.rates in another folder; the last checkpoint is whole"
+            "and its camera, or lower {this.part}.rates in another folder; the last checkpoint is whole"
         ) from error
     found = checkpoint.load_last(this.checkpoint)
     state = found[0] if found else begin()
@@ -198,7 +201,7 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
 
 def drawing(this: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
     """What draws the points of a state, as they are to be looked at."""
-    stage = this.recipe.pretrain
+    stage = this.stage
     splats = this.recipe.primitive.shape(stage.finished(state), state.sh_degree)
     return lambda view: rasterizer.render(splats, view.camera, stage.near, geometry).maps
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from surfkit.blocks import Hands, Site, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit
@@ -38,7 +39,6 @@ from surfkit.mesh.base import Subject
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
-from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.cameras import write_cameras
 from surfkit.scene.data import Data
@@ -70,7 +70,7 @@ def run(
     recipe: Recipe,
     data: Data,
     out: Path,
-    device: Device = "auto",
+    hands: Hands | None = None,
     every: Every | None = None,
     store: Store | None = None,
 ) -> dict[str, Any]:
@@ -80,7 +80,7 @@ def run(
         recipe: What to do.
         data: What to do it with.
         out: Run folder.
-        device: Where to compute.
+        hands: Who computes.
         every: When checkpoints and pictures are written.
         store: Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
 
@@ -91,7 +91,7 @@ def run(
         KeyboardInterrupt: The run was asked to stop, and has saved its state.
     """
     this = Run(out, recipe, replace(data, path=data.path.resolve()))
-    every, store, meter = every or Every(), store or Store(), Meter()
+    hands, every, store, meter = hands or Hands(), every or Every(), store or Store(), Meter()
     if every.pictures is None:
         every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_file(out)
@@ -101,7 +101,7 @@ def run(
         refuse_other(this)
         scene = read(this.data)
         meter.scene_read()
-        rasterizer, backend = drawer(device)
+        rasterizer, backend = drawer(hands.device)
         state = saved(this, scene, repair=True)
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
@@ -113,6 +113,12 @@ def run(
                 discard(this.metrics, this.cloud, this.mesh_record)
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
+            if recipe.partition is not None:
+                there = saved(replace(this, part="tune"), scene)
+                unfinished |= there is None or there.index < recipe.tune.steps
+                this, state = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+            if unfinished:
+                discard(this.metrics, this.cloud, this.mesh_record)
             elif this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
                 return read_metrics(out)
@@ -125,7 +131,7 @@ def run(
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
     """Write the points and the cameras in the frame of the input."""
-    params = this.recipe.pretrain.finished(state)
+    params = this.stage.finished(state)
     write_cameras(this.cameras, scene)
     emit(FileWritten(this.cameras, "cameras"))
     write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
@@ -173,7 +179,7 @@ def evaluate(
             draw,
             timed=colors,
             show=show,
-            correct_color=this.recipe.pretrain.appearance is not None,
+            correct_color=this.stage.appearance is not None,
             masks=mask_cache(scene.held_out, ahead),
             networks=perceptual,
         )
@@ -213,8 +219,12 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     """
     this = opened(out)
     scene = read(this.data)
+    if this.recipe.partition is not None:
+        this = replace(this, part="tune")
     state = saved(this, scene)
-    steps = this.recipe.pretrain.steps
+    steps = this.stage.steps
+    if state is None and this.part == "tune":
+        raise BadInput(f"{out}: not all blocks are tuned; give its surfkit train command again to finish it")
     if state is None or state.index < steps:
         raise BadInput(
             f"{out}: the run stopped after step {state.index if state else 0} of {steps}; "

@@ -10,6 +10,8 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
+from surfkit.partition.assign import Assign, SSIMDifference
+from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.train.stage import Stage
@@ -28,6 +30,18 @@ class Recipe:
     pretrain: Stage = field(default_factory=Stage)
     """Optimisation of the whole scene."""
 
+    partition: Annotated[Partition | None, choice(Partition, optional=True)] = None
+    """How the scene is cut into blocks that are tuned apart, after pretraining; none leaves it whole."""
+
+    assign: Annotated[Assign, choice(Assign)] = SSIMDifference()
+    """Which views a block is tuned on."""
+
+    min_views: Annotated[int, tyro.conf.arg(name="min-views")] = 50
+    """A block with fewer views is joined to a neighbour; in a small scene a quarter of an even share is enough."""
+
+    tune: Stage = field(default_factory=Stage)
+    """Optimisation of each block."""
+
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""
 
@@ -37,3 +51,5 @@ class Recipe:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**63:
             raise BadInput(f"seed is {self.seed}; it must be 0 or more and below 2^63")
+        if self.min_views < 1:
+            raise BadInput(f"min_views is {self.min_views}; a block needs 1 or more")

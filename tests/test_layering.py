@@ -17,6 +17,7 @@ FLOORS = (
     "recipe",
     "folder",
     "optimise",
+    "blocks",
     "surface",
     "pipeline",
     "report doctor",

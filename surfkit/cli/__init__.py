@@ -19,6 +19,7 @@ from surfkit.core.check import BadInput, Fault
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
+    "tune": "Tune one block of a run, in a process or on a machine of its own.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
     "evaluate": "Measure a finished run on photographs it has not seen, or its mesh against true geometry.",
     "doctor": "Examine a data set before training: faults, and what a run takes.",
@@ -36,8 +37,8 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
-    2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, and
-    130 for one that was interrupted.
+    2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, 3
+    for one with blocks that failed, and 130 for one that was interrupted.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -79,7 +80,7 @@ def _guarded(words: list[str]) -> int:
         return _dispatch(words)
     except (BadInput, Fault) as error:
         print(f"surfkit: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 1
+        return 2 if isinstance(error, BadInput) else error.status
     except BrokenPipeError:
         raise
     except OSError as error:  # no permission, a folder in the place of a file, a disk that is gone

@@ -11,12 +11,15 @@ from typing import Annotated, Literal
 import tyro
 
 import surfkit
+from surfkit.blocks import Hands
 from surfkit.cli.data import data_of
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
+from surfkit.core.registry import choice
 from surfkit.folder import Run
 from surfkit.optimise import CHECKPOINT_EVERY, Every
+from surfkit.partition.executor import Executor, Inline
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
@@ -97,6 +100,9 @@ class Train:
     device: Device = "auto"
     """Where to compute."""
 
+    executor: Annotated[Executor, choice(Executor)] = Inline()
+    """Who tunes the blocks, where the recipe cuts the scene into some; `executor:pool` takes several at a time."""
+
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints, of which the last two are kept; there is also one at an interruption."""
 
@@ -132,7 +138,7 @@ class Train:
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
             every, store = Every(self.checkpoint_every, self.pictures_every), Store(self.cache, self.resized_copies)
-            metrics = run(recipe, data, out, self.device, every, store)
+            metrics = run(recipe, data, out, Hands(self.device, self.executor), every, store)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -21,6 +21,9 @@ class Fault(RuntimeError):
     The message says where, what happened, what is still there and what to do.
     """
 
+    status = 1
+    """Exit status of the command line."""
+
 
 _KEPT: ContextVar[list[BadInput] | None] = ContextVar("kept", default=None)
 

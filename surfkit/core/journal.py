@@ -61,14 +61,17 @@ class Journal:
 
 @contextmanager
 def kept(folder: Path) -> Iterator[None]:
-    """Within, events are written into the journal of a run folder."""
-    journal = Journal(folder)
-    plugins().register(journal, "journal of the run")
+    """Within, events are written into the journal of a run folder, and not into that of a run around it."""
+    journal, name = Journal(folder), "journal of the run"
+    around = plugins().unregister(name=name) if plugins().has_plugin(name) else None
+    plugins().register(journal, name)
     try:
         yield
     finally:
         plugins().unregister(journal)
         journal.close()
+        if around is not None:
+            plugins().register(around, name)
 
 
 def read(path: Path) -> list[dict[str, Any]]:

@@ -59,6 +59,11 @@ class Ended:
 class Executor(Component):
     """A way to get jobs done. What they leave on disk is the same whoever did them."""
 
+    @property
+    @abstractmethod
+    def at_once(self) -> int:
+        """How many jobs share this machine at a time."""
+
     @abstractmethod
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """Do the jobs and tell of each as it ends. On the way out, nothing is left running.
@@ -71,6 +76,11 @@ class Executor(Component):
 @dataclass(frozen=True)
 class Inline(Executor):
     """One block after the other, in this process."""
+
+    @property
+    def at_once(self) -> int:
+        """See `Executor.at_once`."""
+        return 1
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""
@@ -96,6 +106,11 @@ class Pool(Executor):
             raise BadInput(f"executor: pool.workers {self.workers}, threads {self.threads}: give 1 or more, 0 or more")
         if not 0 < self.memory_share <= 1:
             raise BadInput(f"executor: pool.memory_share is {self.memory_share}; it must lie in 0 to 1")
+
+    @property
+    def at_once(self) -> int:
+        """See `Executor.at_once`."""
+        return self.workers
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""

@@ -48,15 +48,17 @@ class Plan:
 
 @dataclass(frozen=True)
 class Fewest:
-    """How many views a block needs.
+    """How many views and points a block needs.
 
     Attributes:
         views: In a large scene.
         share: In a small one: of the views that each block would get if they were divided among the blocks.
+        points: Share of the points that each block would get.
     """
 
     views: int = 50
     share: float = 0.25
+    points: float = 0.05
 
     def of(self, views: int, blocks: int) -> int:
         """The number for a scene."""
@@ -76,9 +78,9 @@ def plan(sight: Sight, partition: Partition, assign: Assign, fewest: Fewest | No
     joins = inside | (measure > assign.least)
     if not joins.any():
         raise BadInput("partition: no view shows any block; lower the threshold of the assignment")
-    cells, joins, inside = with_enough_views(
-        cells, joins, inside, (fewest or Fewest()).of(len(sight.views), cells.count)
-    )
+    fewest = fewest or Fewest()
+    poor = torch.bincount(owner, minlength=cells.count) < fewest.points * len(owner) / cells.count
+    cells, joins, inside = with_enough(cells, joins, inside, fewest.of(len(sight.views), cells.count), poor)
     return Plan(cells, blocks_of(sight, cells, joins, inside))
 
 
@@ -100,14 +102,15 @@ def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tupl
     )
 
 
-def with_enough_views(cells: Cells, joins: Tensor, inside: Tensor, fewest: int) -> tuple[Cells, Tensor, Tensor]:
-    """Join each block with fewer than `fewest` views to the touching one that shares the most of them.
+def with_enough(cells: Cells, joins: Tensor, inside: Tensor, fewest: int, poor: Tensor) -> tuple[Cells, Tensor, Tensor]:
+    """Join each block with too few views or points to the touching one that shares the most of its views.
 
     Args:
         cells: As cut.
         joins: (V, B) bool, the views of each block.
         inside: (V, B) bool, the cameras in each.
-        fewest: Views.
+        fewest: Views that a block needs.
+        poor: (B,) bool, blocks with too few points.
 
     Returns:
         Cells, joins and inside of the blocks that are left.
@@ -115,15 +118,16 @@ def with_enough_views(cells: Cells, joins: Tensor, inside: Tensor, fewest: int) 
     groups = [{block} for block in range(cells.count)]
     while len(groups) > 1:
         views = [joins[:, sorted(group)].any(1) for group in groups]
-        poor = min(range(len(groups)), key=lambda at: int(views[at].sum()))
-        if int(views[poor].sum()) >= fewest:
+        least = min(range(len(groups)), key=lambda at: (not poor[sorted(groups[at])].all(), int(views[at].sum()), at))
+        few_points = bool(poor[sorted(groups[least])].all())
+        if int(views[least].sum()) >= fewest and not few_points:
             break
-        touching = [at for at in range(len(groups)) if at != poor and touch(cells, groups[poor], groups[at])]
-        partner = max(touching, key=lambda at: (int((views[at] & views[poor]).sum()), int(views[at].sum()), -at))
-        told = f"a block with {int(views[poor].sum())} views, fewer than {fewest}, is joined to its neighbour"
-        emit(Warned(f"partition: {told}"))
-        groups[partner] |= groups[poor]
-        del groups[poor]
+        touching = [at for at in range(len(groups)) if at != least and touch(cells, groups[least], groups[at])]
+        partner = max(touching, key=lambda at: (int((views[at] & views[least]).sum()), int(views[at].sum()), -at))
+        lack = "hardly any points" if few_points else f"{int(views[least].sum())} views, fewer than {fewest},"
+        emit(Warned(f"partition: a block with {lack} is joined to its neighbour"))
+        groups[partner] |= groups[least]
+        del groups[least]
     groups.sort(key=min)
     number = {block: at for at, group in enumerate(groups) for block in group}
     joined = replace(cells, blocks=tuple(number[block] for block in cells.blocks))

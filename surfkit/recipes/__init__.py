@@ -1,6 +1,7 @@
 """Recipes by name."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from surfkit.core.registry import hookimpl
 from surfkit.densify.adc import ADC
@@ -12,11 +13,13 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
+from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
-from surfkit.train.stage import Stage
+from surfkit.train.adam import Rate
+from surfkit.train.stage import RATES, Stage
 
 GAUSSIANS = Recipe(
     about="3D Gaussian splatting (Kerbl et al. 2023): the sharpest pictures, no usable surface",
@@ -94,6 +97,20 @@ COARSE = Recipe(
 )
 
 
+CITY = replace(
+    COARSE,
+    about="CityGaussianV2 (Liu et al. 2024): pretraining, then blocks that are tuned apart and trimmed, then merged",
+    partition=ContractedGrid(blocks=(2, 2)),
+    tune=replace(
+        COARSE.pretrain,
+        losses=COARSE.pretrain.losses | {"normal": NormalConsistency(weight=0.0125, start=0, depth="median")},
+        prune=(Trim(ratio=0.025, score="peak"),),
+        rates=RATES | {"means": Rate(6.4e-5, 6.4e-7), "scales": Rate(4e-3)},
+        sh_every=1,
+    ),
+)
+
+
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
     """The recipes of surfkit."""
@@ -105,4 +122,5 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "trim2dgs": TRIMMED,
         "lightgaussian": LIGHT,
         "citygs2-coarse": COARSE,
+        "citygs2": CITY,
     }

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import torch
 
 from surfkit import pipeline
+from surfkit.blocks import Hands
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
@@ -169,7 +170,7 @@ def attempt(trial: Trial, plan: Plan) -> Outcome:
     """Run one recipe, or go on with it; what goes wrong becomes its outcome."""
     trace = trial.folder / TRACE
     try:
-        metrics = pipeline.run(trial.recipe, plan.data, trial.folder, plan.device)
+        metrics = pipeline.run(trial.recipe, plan.data, trial.folder, Hands(plan.device))
     except (BadInput, Fault) as error:
         return Outcome(failed=" ".join(str(error).split()))
     except Exception as error:

@@ -1,7 +1,7 @@
 """Cells, views and merging, on a flat city of discs seen from a grid of cameras."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ from surfkit.partition import (
 )
 from surfkit.partition.base import Contraction, Ground
 from surfkit.partition.merge import merge
-from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough_views
+from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
@@ -198,11 +198,35 @@ def test_blocks_with_few_views_join_the_neighbour_that_shares_them():
     boxes = ((None, None, 0.0, None), (0.0, None, 1.0, None), (1.0, None, None, None))
     cells = Cells(FLAT, boxes, (0, 1, 2))
     joins = torch.tensor([[1, 0, 0], [1, 0, 0], [1, 0, 0], [0, 1, 1], [0, 0, 1]]).bool()
-    found, views, _ = with_enough_views(cells, joins, joins, 2)
+    found, views, _ = with_enough(cells, joins, joins, 2, torch.zeros(3).bool())
     assert found.blocks == (0, 1, 1) and found.count == 2
     assert views.tolist() == [[True, False]] * 3 + [[False, True]] * 2
-    assert with_enough_views(cells, joins, joins, 100)[0].blocks == (0, 0, 0)
+    assert with_enough(cells, joins, joins, 100, torch.zeros(3).bool())[0].blocks == (0, 0, 0)
     assert touch(cells, {0}, {1}) and not touch(cells, {0}, {2})
+
+
+def test_blocks_with_hardly_any_points_join_too():
+    boxes = ((None, None, 0.0, None), (0.0, None, 1.0, None), (1.0, None, None, None))
+    cells = Cells(FLAT, boxes, (0, 1, 2))
+    joins = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 1]]).bool()
+    found, views, _ = with_enough(cells, joins, joins, 1, torch.tensor([False, True, False]))
+    assert found.blocks == (0, 0, 1) and views.tolist() == [[True, False], [True, False], [True, True]]
+    sight = city()
+    far = replace(sight.splats, means=sight.splats.means.clone())
+    far.means[0] = torch.tensor([40.0, 40.0, 0.0])
+    lonely = Cells(FLAT, ((None, None, 20.0, None), (20.0, None, None, None)), (0, 1))
+    made = plan(replace(sight, splats=far), Fixed(lonely), PictureShare())
+    assert [block.points for block in made.blocks] == [len(far)]
+
+
+@dataclass(frozen=True)
+class Fixed(Partition):
+    """Cells as given."""
+
+    given: Cells
+
+    def cells(self, sight):
+        return self.given
 
 
 def test_corners_do_not_touch():

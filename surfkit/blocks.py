@@ -1,0 +1,385 @@
+"""The blocks of a large scene: planned, tuned apart by whoever has hands free, and merged (CityGaussianV2, sec. 3.3).
+
+The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NN/` holds what one block has
+come to, and whoever comes back to it goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surfkit.core.check import BadInput, Fault
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import FileWritten, StepDone, Warned, emit
+from surfkit.core.journal import kept
+from surfkit.core.lock import held
+from surfkit.core.registry import hookimpl, plugins
+from surfkit.folder import Run, say
+from surfkit.optimise import Every, Job, optimise, saved
+from surfkit.partition import executor
+from surfkit.partition.base import Sight
+from surfkit.partition.executor import Executor, Inline
+from surfkit.partition.merge import Share, merge
+from surfkit.partition.picture import plan_picture
+from surfkit.partition.plan import Fewest, Plan, plan
+from surfkit.partition.state import read_state, write_state
+from surfkit.primitives.points import Columns, Points
+from surfkit.raster.api import Rasterizer
+from surfkit.raster.select import Device
+from surfkit.scene.scene import Scene
+from surfkit.train import checkpoint
+from surfkit.train.material import Store, read_ahead
+from surfkit.train.meter import Meter
+from surfkit.train.stage import StageState
+from surfkit.train.views import Order
+
+ATTEMPTS = 3
+"""How often a block is begun in one command before it counts as failed."""
+ALIVE_S = 5.0
+"""Seconds between signs of life of a block."""
+LEAVE_S = 20.0
+"""How long workers of a driver that is gone may take to notice."""
+
+
+@dataclass(frozen=True)
+class Hands:
+    """Who computes.
+
+    Attributes:
+        device: Where.
+        workers: Who tunes the blocks, where the recipe cuts the scene into some.
+    """
+
+    device: Device = "auto"
+    workers: Executor = Inline()
+
+
+class Unfinished(Fault):
+    """Some blocks are not tuned; the others are, and stay so."""
+
+    status = 3
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where blocks are worked on.
+
+    Attributes:
+        this: The run.
+        scene: Its data.
+        rasterizer: What draws.
+        every: When a block writes what.
+        store: Where its photographs are kept at hand.
+    """
+
+    this: Run
+    scene: Scene
+    rasterizer: Rasterizer
+    every: Every
+    store: Store
+
+    @property
+    def folder(self) -> Path:
+        """Of all blocks."""
+        return self.this.out / "blocks"
+
+    def place(self, index: int) -> Path:
+        """The folder of one block."""
+        return self.folder / f"{index:03}"
+
+    def block(self, index: int) -> Run:
+        """One block as a run of its own."""
+        return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+
+
+@dataclass(frozen=True)
+class Record:
+    """The plan on disk.
+
+    Attributes:
+        coarse_steps: Of the coarse model that it was made for.
+        plan: Cells and blocks.
+    """
+
+    coarse_steps: int
+    plan: Plan
+
+
+def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState]:
+    """The run with the state of all blocks together; what is done already is not done again.
+
+    Args:
+        site: Run, data and means.
+        coarse: The state after pretraining.
+        hands: Who tunes the blocks.
+
+    Raises:
+        Unfinished: Blocks failed, also when they were tried again.
+        KeyboardInterrupt: Someone asked to stop; every block has saved its state.
+    """
+    final = replace(site.this, part="tune")
+    record = planned(site, coarse)
+    state = merged(site, record)
+    if state is not None:
+        return final, state
+    await_workers(site, record.plan)
+    work(site, record.plan, hands)
+    state = put_together(site, record.plan, coarse)
+    checkpoint.save(final.checkpoint, state)
+    emit(FileWritten(final.checkpoint, "merged blocks"))
+    return final, state
+
+
+def planned(site: Site, coarse: StageState) -> Record:
+    """The plan in the folder, or a new one; blocks of another coarse model are put aside."""
+    path = site.folder / "plan.json"
+    if path.exists():
+        record = read_json(path, Record)
+        if record.coarse_steps == coarse.index:
+            return record
+        aside = site.this.out / "blocks-before"
+        shutil.rmtree(aside, ignore_errors=True)
+        os.replace(site.folder, aside)
+        checkpoint.discard(replace(site.this, part="tune").checkpoint)
+        emit(Warned(f"the coarse model has changed, so all blocks are tuned anew; the ones before are in {aside}"))
+    recipe = site.this.recipe
+    sight = sight_of(site, coarse)
+    made = Record(coarse.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
+    picture = site.folder / "plan.png"
+    plan_picture(picture, sight, made.plan)
+    emit(FileWritten(picture, "picture of the blocks"))
+    write_json(path, made)
+    emit(FileWritten(path, "plan of the blocks"))
+    for block in made.plan.blocks:
+        say(
+            f"block {block.index}: {len(block.views)} views, {block.cameras} of them inside; {block.points:,} points; "
+            f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
+        )
+    return made
+
+
+def sight_of(site: Site, coarse: StageState) -> Sight:
+    """The coarse model, to be looked at."""
+    stage = site.this.recipe.pretrain
+    splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
+    splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})
+    return Sight(splats, site.scene.train, site.rasterizer, stage.near)
+
+
+def merged(site: Site, record: Record) -> StageState | None:
+    """The state of all blocks together, if it was made and none has been tuned for longer since."""
+    found = checkpoint.load_last(replace(site.this, part="tune").checkpoint)
+    if found is None or found[0].index < site.this.recipe.tune.steps or not done(site, record.plan):
+        return None
+    return found[0]
+
+
+def done(site: Site, blocks: Plan) -> bool:
+    """Whether every block has all its steps."""
+    return not left(site, blocks)
+
+
+def left(site: Site, blocks: Plan) -> list[int]:
+    """Blocks that still have steps to make."""
+    steps = site.this.recipe.tune.steps
+    found = []
+    for block in blocks.blocks:
+        state = read_state(site.place(block.index))
+        if block.views and not (state.status == "done" and state.step >= steps):
+            found.append(block.index)
+    return found
+
+
+def await_workers(site: Site, blocks: Plan) -> None:
+    """Wait for workers of an earlier driver, which stop when they notice that it is gone."""
+    until = time.monotonic() + LEAVE_S
+    while busy := [block.index for block in blocks.blocks if read_state(site.place(block.index)).running_now()]:
+        if time.monotonic() > until:
+            raise BadInput(f"{site.place(busy[0])}: block {busy[0]} is being worked on; wait for its end, or stop it")
+        time.sleep(0.2)
+
+
+def work(site: Site, blocks: Plan, hands: Hands) -> None:
+    """Have all blocks tuned that are not; one that crashes is tried again."""
+    attempts = dict.fromkeys(left(site, blocks), 0)
+    waiting = list(attempts)
+    failed: dict[int, str] = {}
+    while waiting:
+        jobs = [job_of(site, blocks, index, hands) for index in waiting]
+        say(f"{len(jobs)} of {len(blocks.blocks)} blocks to tune")
+        waiting = []
+        for ended in hands.workers.run(jobs):
+            index = ended.job.index
+            attempts[index] += 1
+            if ended.status == 0:
+                say(f"block {index} is done")
+                continue
+            if ended.status == 130:
+                raise KeyboardInterrupt
+            reason = told(site, index, ended.status)
+            again = ended.status not in (1, 2) and attempts[index] < ATTEMPTS
+            emit(Warned(f"block {index} {reason}" + ("; it is tried again" if again else "")))
+            if again:
+                waiting.append(index)
+            else:
+                failed[index] = reason
+    if failed:
+        what = "; ".join(f"block {index} {reason}" for index, reason in sorted(failed.items()))
+        raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
+
+
+def told(site: Site, index: int, status: int) -> str:
+    """What became of a block, in a few words; also noted in its state."""
+    state = read_state(site.place(index))
+    if status < 0:
+        name = signal.Signals(-status).name
+        write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}", pid=None)
+        return f"was ended by {name}"
+    if state.status != "failed":
+        log = site.place(index) / executor.LOG
+        write_state(site.place(index), status="failed", kind="crash", error=f"exit status {status}", pid=None)
+        return f"ended with status {status}; see {log}"
+    return f"failed: {state.error}"
+
+
+def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
+    """The work on one block."""
+    block = blocks.blocks[index]
+    share = site.store.bytes() // hands.workers.at_once
+    command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
+    command += ["--cache", f"{share}", "--checkpoint-every", f"{site.every.checkpoint}"]
+    command += ["--resized-copies"] * site.store.copies
+    return executor.Job(
+        index=index,
+        folder=site.place(index),
+        call=lambda: guarded(site, blocks, index),
+        command=tuple(command),
+        cost=block.work,
+    )
+
+
+def guarded(site: Site, blocks: Plan, index: int) -> int:
+    """Tune a block and return an exit status; what goes wrong is in its state."""
+    folder = site.place(index)
+    try:
+        tune(site, blocks, index)
+    except (BadInput, Fault) as error:
+        kind = "data" if isinstance(error, BadInput) else "numbers"
+        write_state(folder, status="failed", kind=kind, error=" ".join(str(error).split()), pid=None)
+        return 2 if isinstance(error, BadInput) else 1
+    except KeyboardInterrupt:
+        write_state(folder, status="failed", kind="interrupted", error="interrupted", pid=None)
+        return 130
+    except BaseException as error:
+        write_state(folder, status="failed", kind="crash", error=f"{type(error).__name__}: {error}", pid=None)
+        raise
+    return 0
+
+
+def tune(site: Site, blocks: Plan, index: int) -> None:
+    """Tune one block in this process, from where it stands to its end."""
+    block = site.block(index)
+    wanted = set(blocks.blocks[index].views)
+    views = tuple(view for view in site.scene.train if view.name in wanted)
+    scene = replace(site.scene, train=views, held_out=())
+    steps, folder = block.stage.steps, block.out
+    with held(folder), kept(folder), signs(folder):
+        state = saved(block, scene, repair=True)
+        write_state(folder, status="running", step=state.index if state else 0, steps=steps, error=None, kind=None)
+        if state is None or state.index < steps:
+            given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
+            start = lambda: surroundings(site, blocks, index, views)  # noqa: E731
+            every = replace(site.every, pictures=0)
+            state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
+        write_state(folder, status="done", step=state.index, steps=steps, pid=None)
+
+
+def surroundings(site: Site, blocks: Plan, index: int, views: Sequence[Any]) -> Columns:
+    """The points that a block owns, and those that its views show, as they are in the coarse model.
+
+    The latter are drawn and tuned with the block, so that it need not explain what others own; they are not merged.
+    """
+    found = checkpoint.load_last(replace(site.this, part="pretrain").checkpoint)
+    assert found is not None
+    coarse = found[0]
+    params = site.this.recipe.pretrain.finished(coarse)
+    wanted = blocks.cells.owner(params["means"]) == index
+    sight = sight_of(site, coarse)
+    for view in views:
+        wanted |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+    return {name: value[wanted].clone() for name, value in params.items()}
+
+
+def put_together(site: Site, blocks: Plan, coarse: StageState) -> StageState:
+    """All blocks as one state, each point from its owner; where nothing was tuned, from the coarse model."""
+    recipe = site.this.recipe
+    tune_stage, params = recipe.tune, recipe.pretrain.finished(coarse)
+    skipped = frozenset(block.index for block in blocks.blocks if not block.views)
+    states, results = [], {}
+    for block in blocks.blocks:
+        if block.index in skipped:
+            continue
+        found = checkpoint.load_last(site.block(block.index).checkpoint)
+        if found is None:
+            raise BadInput(f"{site.place(block.index)}: no result, though it should be done; delete that folder")
+        states.append(found[0])
+        results[block.index] = tune_stage.finished(found[0])
+    whole, shares = merge(blocks.cells, params, results, skipped)
+    note(site, shares)
+    state = StageState(Points.fresh(whole), Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed))
+    state.index = tune_stage.steps
+    state.seconds = coarse.seconds + sum(part.seconds for part in states)
+    state.cpu_seconds = coarse.cpu_seconds + sum(part.cpu_seconds for part in states)
+    state.peak_memory_bytes = max(part.peak_memory_bytes for part in (coarse, *states))
+    state.sh_degree = max(part.sh_degree for part in (coarse, *states))
+    return state
+
+
+def note(site: Site, shares: Sequence[Share]) -> None:
+    """Write down what each block gave, and say where the coarse model had to fill in."""
+    write_json(site.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
+    if filled := [str(share.index) for share in shares if share.filled]:
+        emit(Warned(f"blocks {', '.join(filled)} have no views, and are as they were in the coarse model"))
+
+
+@contextmanager
+def signs(folder: Path) -> Iterator[None]:
+    """Within, steps become signs of life of a block; and a worker whose driver is gone stops as if it were asked to."""
+    watch = Watch(folder)
+    plugins().register(watch, f"signs of {folder}")
+    try:
+        yield
+    finally:
+        plugins().unregister(watch)
+
+
+class Watch:
+    """Writes where a block stands, every few seconds."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.parent = os.getppid()
+        self.next = -math.inf
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if not isinstance(event, StepDone):
+            return
+        if os.getppid() != self.parent:
+            self.parent = os.getppid()
+            os.kill(os.getpid(), signal.SIGTERM)
+        if time.monotonic() >= self.next:
+            self.next = time.monotonic() + ALIVE_S
+            write_state(self.folder, step=event.index)

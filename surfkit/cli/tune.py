@@ -1,0 +1,67 @@
+"""`surfkit tune`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.blocks import Record, Site, guarded
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.folder import noted
+from surfkit.optimise import CHECKPOINT_EVERY, Every, drawer
+from surfkit.pipeline import opened
+from surfkit.raster.select import Device
+from surfkit.scene.read import read
+from surfkit.train.bars import bars
+from surfkit.train.faults import in_one_line
+from surfkit.train.material import Store
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Tune one block of a run to its end, from where it stands.
+
+    `surfkit train` does this for all blocks, with `executor:pool` several at a time. By hand it serves to share the
+    work among machines that see the same folder: then give the `surfkit train` command once more, to merge them.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder of the run, with its blocks planned."""
+
+    block: Annotated[int, tyro.conf.Positional, tyro.conf.arg(metavar="BLOCK")]
+    """Number of the block, counted from 0."""
+
+    device: Device = "auto"
+    """Where to compute."""
+
+    cache: str = "auto"
+    """Memory for photographs, masks and depth priors, such as 4GB; auto takes half of what is free."""
+
+    resized_copies: bool = False
+    """Keep photographs that do not fit into the cache on disk too, at the size they are used."""
+
+    checkpoint_every: int = CHECKPOINT_EVERY
+    """Steps between checkpoints."""
+
+    def run(self) -> int:
+        """Tune; the exit status is that of `surfkit train`."""
+        this, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
+        if not path.exists():
+            raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
+        plan = read_json(path, Record).plan
+        if not 0 <= self.block < len(plan.blocks):
+            raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
+        if not plan.blocks[self.block].views:
+            raise BadInput(f"block {self.block} has no views; it stays as it is in the coarse model")
+        store, every = Store(self.cache, self.resized_copies), Every(self.checkpoint_every, 0)
+        store.bytes()
+        with noted(), in_one_line(self.run_folder), bars():
+            rasterizer, _ = drawer(self.device)
+            return guarded(Site(this, read(this.data), rasterizer, every, store), plan, self.block)
+
+
+COMMAND = Tune
