@@ -269,7 +269,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are."""
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
-    perceptual, lacking = networks(lpips_weights, min(sides, default=0))
+    perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
