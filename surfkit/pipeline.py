@@ -165,7 +165,7 @@ def evaluate(
         lpips_weights: See `surfkit.evaluate.lpips.load_perceptual`; or "none".
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
-    perceptual, lacking = networks(lpips_weights, min(sides, default=0))
+    perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)
     draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 

@@ -69,15 +69,13 @@ class Perceptual:
         Args:
             a: (3, H, W) in [0, 1].
             b: Likewise.
-            mask: (H, W) bool, False where pixels do not count; there the images are alike to the network.
+            mask: (H, W) bool, False where pixels of `b` do not count: they are those of `a` then, and weigh nothing.
             unscaled: Give the network [0, 1] in place of the [-1, 1] that it was made for, as the published tables of
                 Gaussian splatting do; the distances are smaller.
         """
         total = 0.0
         with torch.inference_mode():
-            if mask is not None:
-                b = torch.where(mask, b, a)
-            pair = torch.stack([a, b]).to(self.heads[0])
+            pair = torch.stack([a, b if mask is None else torch.where(mask, b, a)]).to(self.heads[0])
             for head, (one, two) in zip(self.heads, self._features(pair if unscaled else 2 * pair - 1), strict=True):
                 apart = ((one - two).square() * head[:, None, None]).sum(0)
                 total += float(apart.mean() if mask is None else _mean_where(apart, mask))
@@ -227,7 +225,7 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
 
     Args:
         where: See `load_perceptual`.
-        smallest_px: Least side of the images to come; 0 where none come.
+        smallest_px: Least side of the images to come.
 
     Raises:
         BadInput: A folder that was named has no weights, or damaged ones.
@@ -235,7 +233,7 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
     if where == "none":
         return (), "left out, by --lpips-weights none"
     if smallest_px < SMALLEST_PX:
-        return (), f"no photographs are held out, or one has a side of less than {SMALLEST_PX} pixels"
+        return (), f"a photograph has a side of less than {SMALLEST_PX} pixels"
     found, lacking = [], None
     for net in PLANS:
         try:
