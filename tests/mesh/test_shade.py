@@ -1,0 +1,78 @@
+"""Pictures of meshes show what a ray would meet."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.shade import draw_faces, draw_in_numpy, from_above, shaded, up_of
+from surfkit.raster.native import module
+
+from .shapes import around, look_at, seen, sphere
+
+
+def triangles(count=300, seed=0):
+    draw = np.random.default_rng(seed)
+    middles = draw.uniform([-10, -10, 1], [110, 80, 9], (count, 1, 3))
+    corners = middles + draw.normal(size=(count, 3, 3)) * [12, 12, 0.5] * draw.uniform(0, 1, (count, 1, 1))
+    return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+
+@pytest.mark.skipif(module() is None, reason="surfkit was built without a compiler")
+def test_compiled_and_numpy_agree():
+    vertices, faces = triangles()
+    vertices[5, 2] = -1
+    vertices[9, 0] = np.nan
+    depth, face = draw_faces(vertices, faces, 100, 70)
+    plain = np.full((70, 100), np.inf, np.float32), np.full((70, 100), -1, np.int32)
+    draw_in_numpy(vertices, faces, *plain)
+    assert np.array_equal(depth, plain[0]) and np.array_equal(face, plain[1])
+    assert (face >= 0).mean() > 0.5 and not {1, 3} & set(face.ravel().tolist())
+
+
+def test_depth_is_that_of_the_solid():
+    camera = look_at((1.2, -1.0, 0.8))
+    solid = trimesh.creation.icosphere(5, radius=0.5)
+    pose = camera.world_to_camera.numpy()
+    local = solid.vertices @ pose[:3, :3].T + pose[:3, 3]
+    places = np.stack([local[:, 0] / local[:, 2] * 90 + camera.cx, local[:, 1] / local[:, 2] * 90 + camera.cy], 1)
+    depth, face = draw_faces(np.concatenate([places, local[:, 2:]], 1), solid.faces, 96, 72)
+    truth, _ = seen(camera, sphere)
+    both = (truth > 0) & (face >= 0)
+    assert ((truth > 0) != (face >= 0)).mean() < 0.01 and np.abs(depth[both] - truth[both]).max() < 0.02
+    assert np.abs(depth[both] - truth[both]).mean() < 0.002
+
+
+def test_a_ball_is_grey_where_it_is_seen_from_outside_and_blue_from_inside():
+    solid = trimesh.creation.icosphere(3, radius=0.5)
+    camera = look_at((1.5, 0.3, 0.2))
+    for faces, blue in ((solid.faces, False), (solid.faces[:, ::-1], True)):
+        mesh = Mesh(solid.vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32))
+        for image in (shaded(mesh, camera), from_above(mesh, np.array([0, 0, 1.0]), 60)):
+            there = (image < 1).any(0)
+            assert 0.1 < there.float().mean() < 0.85
+            assert bool((image[2] > image[0] + 0.05)[there].float().mean() > 0.9) == blue
+    assert from_above(mesh, np.array([0, 0, 1.0]), 60).shape == (3, 60, 60)
+
+
+def test_from_above_is_not_mirrored():
+    """A flat letter L: seen from above, its foot points to the same side of its stem as on the ground."""
+    quad = np.array([[0, 0], [1, 0], [1, 4], [0, 4], [1, 0], [3, 0], [3, 1], [1, 1]])
+    vertices = np.concatenate([quad, np.zeros((8, 1))], 1).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    image = (from_above(Mesh(vertices, faces), np.array([0, 0, 1.0]), 40) < 1).any(0).numpy()
+    ground = np.zeros((4, 3), bool)
+    ground[:, 0] = ground[3, :] = True  # rows are from the far end of y down
+    small = image[5::10, 5::10][:4, :3] if image.shape[0] > image.shape[1] else image[5::10, 5::10][:3, :4]
+    turns = [np.rot90(ground, k) for k in range(4)]
+    assert any(turn.shape == small.shape and np.array_equal(turn, small) for turn in turns)
+
+
+def test_up_is_across_the_plane_of_the_cameras():
+    flight = [look_at((x, y, 5), (x + 0.3, y, 0)) for x in range(3) for y in range(3)]
+    assert up_of(flight) @ [0, 0, 1] > 0.999
+    line = [look_at((x, 0, 5), (x, 3, 0)) for x in range(5)]
+    assert up_of(line) @ [0, 0, 1] > 0.7
+    assert up_of(around(1, above=True)) @ around(1, above=True)[0].centre.numpy() > 0
+    assert torch.isfinite(torch.from_numpy(up_of(flight[:1]))).all()
