@@ -19,6 +19,7 @@ _HOME = {
         "Measured",
         "PhotoSkipped",
         "PointsEdited",
+        "Progress",
         "StageBegan",
         "StageEnded",
         "StepDone",
@@ -28,6 +29,7 @@ _HOME = {
     "surfkit.primitives.points": ("Edit", "Points"),
     "surfkit.losses.base": ("Loss",),
     "surfkit.densify.base": ("Densify", "Filter", "Policy", "Prune", "Signal", "Step", "Views"),
+    "surfkit.mesh.base": ("Mesh", "Mesher", "Subject"),
     "surfkit.train.stage": ("Stage",),
     "surfkit.recipe": ("Recipe",),
 }
