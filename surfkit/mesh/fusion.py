@@ -18,6 +18,8 @@ from surfkit.mesh.native import grid
 from surfkit.mesh.tiles import Box, join
 from surfkit.scene.camera import Camera
 
+TILES = ".tiles-*"
+"""Name of the folder for what the views see."""
 PIXEL_BYTES = 8
 """Of a view on disk."""
 
@@ -143,7 +145,7 @@ def _corner(at: np.ndarray) -> Corner:
 def spooled(task: Task) -> Iterator[Task]:
     """The task with what every view sees on disk, so that it is drawn once however many tiles there are."""
     needed = PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
-    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=".tiles-") as name:
+    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=TILES.rstrip("*")) as name:
         folder = Path(name)
         if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
             raise BadInput(
