@@ -132,7 +132,8 @@ def in_sight(camera: Camera, task: Task) -> Box:
     y = (np.array([0, camera.height]) - camera.cy) / camera.fy
     rays = np.array([[0, 0, 0], *([a, b, 1] for a in x for b in y)]) * task.limit
     corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * SIDE)
-    low, high = np.floor(corners.min(0)) - 1, np.floor(corners.max(0)) + 2
+    margin = 1 + np.ceil(task.lattice.truncation / (task.lattice.voxel * SIDE))
+    low, high = np.floor(corners.min(0)) - margin, np.floor(corners.max(0)) + 1 + margin
     return Box(_corner(low), _corner(high))
 
 

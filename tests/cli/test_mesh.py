@@ -103,6 +103,13 @@ def test_mistakes_are_one_line_and_change_nothing(finished, capsys, words, messa
     assert record(out) == before and not list(out.glob(".*"))
 
 
+def test_a_refused_recipe_leaves_the_mesh(finished):
+    out, where = finished
+    before = record(out)
+    assert main(["train", *TRAIN, "mesh:tsdf", "--mesh.depth", "expected", "--seed", "7", *where]) == 2
+    assert record(out) == before
+
+
 def test_a_folder_without_a_run(tmp_path, capsys):
     assert main(["mesh", str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
