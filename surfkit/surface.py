@@ -143,7 +143,7 @@ def look(this: Run, mesh: Mesh, subject: Subject) -> None:
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
     path = this.mesh_pictures / "above.png"
-    write_picture(path, from_above(mesh, up_of(cameras), LONGEST))
+    write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
     emit(FileWritten(path, "picture"))
     for at, view in enumerate(views):
         camera = view.camera.fitted(LONGEST)
