@@ -20,6 +20,7 @@ _HOME = {
         "MemoryTaken",
         "PhotoSkipped",
         "PointsEdited",
+        "Progress",
         "StageBegan",
         "StageEnded",
         "StepDone",
@@ -29,6 +30,7 @@ _HOME = {
     "surfkit.primitives.points": ("Edit", "Points"),
     "surfkit.losses.base": ("Loss",),
     "surfkit.densify.base": ("Densify", "Filter", "Policy", "Prune", "Signal", "Step", "Views"),
+    "surfkit.mesh.base": ("Mesh", "Mesher", "Subject"),
     "surfkit.train.stage": ("Stage",),
     "surfkit.recipe": ("Recipe",),
 }

@@ -159,8 +159,9 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
     there = read_json(this.out / "recipe.json", Any) if (this.out / "recipe.json").exists() else None
-    if isinstance(there, dict) and there.get("mesh") != (mesh := dump(this.recipe.mesh)):
-        this.mesh_record.unlink(missing_ok=True)  # training is the same; the mesh is to be made again
+    mesh = dump(this.recipe.mesh)
+    remesh = isinstance(there, dict) and there.get("mesh") != mesh
+    if remesh:  # training is the same
         there |= {"mesh": mesh}
     found = None if there is None else difference(there, dump(this.recipe))
     if found and not (found := longer(this, there)):
@@ -180,6 +181,8 @@ def refuse_other(this: Run) -> None:
             f"--out {this.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
             "name another folder, or delete that one"
         )
+    if remesh:
+        this.mesh_record.unlink(missing_ok=True)
 
 
 def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.crop import Prism, box, read_crop
 from surfkit.mesh.files import Format, write_mesh
+from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require, simplified
 from surfkit.raster.api import Rasterizer
@@ -107,6 +109,8 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
         BadInput: There is no surface, or nothing is left of it.
     """
     began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
+    for left in this.out.glob(TILES):
+        shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
     inside = None if volume is None else lambda local: volume.contains(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside)
@@ -162,7 +166,7 @@ def look(this: Run, mesh: Mesh, subject: Subject) -> None:
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
     path = this.mesh_pictures / "above.png"
-    write_picture(path, from_above(mesh, up_of(cameras), LONGEST))
+    write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
     emit(FileWritten(path, "picture"))
     for at, view in enumerate(views):
         camera = view.camera.fitted(LONGEST)

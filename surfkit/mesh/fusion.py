@@ -18,6 +18,8 @@ from surfkit.mesh.native import grid
 from surfkit.mesh.tiles import Box, join
 from surfkit.scene.camera import Camera
 
+TILES = ".tiles-*"
+"""Name of the folder for what the views see."""
 PIXEL_BYTES = 8
 """Of a view on disk."""
 
@@ -130,7 +132,8 @@ def in_sight(camera: Camera, task: Task) -> Box:
     y = (np.array([0, camera.height]) - camera.cy) / camera.fy
     rays = np.array([[0, 0, 0], *([a, b, 1] for a in x for b in y)]) * task.limit
     corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * SIDE)
-    low, high = np.floor(corners.min(0)) - 1, np.floor(corners.max(0)) + 2
+    margin = 1 + np.ceil(task.lattice.truncation / (task.lattice.voxel * SIDE))
+    low, high = np.floor(corners.min(0)) - margin, np.floor(corners.max(0)) + 1 + margin
     return Box(_corner(low), _corner(high))
 
 
@@ -143,7 +146,7 @@ def _corner(at: np.ndarray) -> Corner:
 def spooled(task: Task) -> Iterator[Task]:
     """The task with what every view sees on disk, so that it is drawn once however many tiles there are."""
     needed = PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
-    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=".tiles-") as name:
+    with tempfile.TemporaryDirectory(dir=task.scratch, prefix=TILES.rstrip("*")) as name:
         folder = Path(name)
         if (free := shutil.disk_usage(folder).free) < 1.05 * needed:
             raise BadInput(

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from surfkit.mesh.lattice import FULL, Picture
 from surfkit.raster.api import Maps
+from surfkit.raster.native import module
 from surfkit.scene.camera import Camera
 
+F = np.float32
 Which = Literal["median", "expected"]
 OPAQUE = 0.5
 """Least alpha of a pixel whose expected depth counts; the median depth has the same bound of its own."""
@@ -35,13 +37,34 @@ def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float) -> Picture:
         camera: Of the view.
         voxel: Local units.
     """
-    weight = (voxel * min(camera.fx, camera.fy) / depth.clamp_min(1e-20)).clamp(max=1) ** 2
-    if maps.normal is not None:
-        rays = camera.rays()
-        length = maps.normal.norm(dim=0) * rays.norm(dim=0)
-        weight = weight * (-(maps.normal * rays).sum(0) / length.clamp_min(1e-10)).clamp(0, 1)
-    weight = torch.where(weight > 0, (FULL * weight).round().clamp(1, FULL), 0.0).nan_to_num(0)
-    color = (maps.color.clamp(0, 1) * 255).round().nan_to_num(0)
-    planes = [*color, torch.where(depth > 0, weight, 0.0)]
-    shade = torch.stack([plane.to(torch.uint8) for plane in planes], dim=-1).contiguous()
-    return Picture(depth.float().contiguous().numpy(), shade.numpy().view(np.uint32)[..., 0], camera)
+    planes = [None if plane is None else plane.float().contiguous().numpy() for plane in (maps.color, maps.normal)]
+    near, plain = voxel * min(camera.fx, camera.fy), depth.float().contiguous().numpy()
+    if module() is None:
+        return Picture(plain, shade(plain, planes[0], planes[1], camera, near), camera)
+    made = np.empty(plain.shape, np.uint32)
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy]
+    module().shade(plain, *planes, lens, near, made, module().kernels_in_use(), torch.get_num_threads())
+    return Picture(plain, made, camera)
+
+
+def shade(depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camera: Camera, near: float) -> np.ndarray:
+    """(H, W) uint32 colours and weights in numpy, with the bits of surfkit/mesh/cpu.
+
+    `near` is the depth at which a pixel is as large as a voxel.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        share = F(near) / np.maximum(depth, F(1e-20))
+        size = np.minimum(share, F(1))
+        upright = F(1)
+        if normal is not None:
+            x = (np.arange(depth.shape[1], dtype=F) + F(0.5) - F(camera.cx)) / F(camera.fx)
+            y = ((np.arange(depth.shape[0], dtype=F) + F(0.5) - F(camera.cy)) / F(camera.fy))[:, None]
+            along = -(normal[0] * x + normal[1] * y + normal[2])
+            squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+            length = np.sqrt(squares * (x * x + y * y + F(1)))
+            upright = np.fmax(np.fmin(along / np.fmax(length, F(1e-10)), F(1)), F(0))
+        weight = size * size * upright
+        whole = np.maximum((weight * F(FULL) + F(0.5)).astype(np.uint32), 1)
+        planes = (np.fmin(np.fmax(color, F(0)), F(1)) * F(255) + F(0.5)).astype(np.uint32)
+    counted = np.where((weight > 0) & (depth > 0), whole, 0).astype(np.uint32)
+    return planes[0] | planes[1] << np.uint32(8) | planes[2] << np.uint32(16) | counted << np.uint32(24)

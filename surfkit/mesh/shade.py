@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,8 +15,8 @@ from surfkit.scene.camera import Camera
 BACKGROUND = 1.0
 LIGHT = np.array([-0.4, -0.5, -0.77])
 """Towards the light, in the camera's frame: from above the left shoulder."""
-LARGEST = 64
-"""Pixels along a triangle that are drawn at once without the compiled part."""
+OPEN = 0.1
+"""Share of the area of a mesh that faces one way, on the whole, from which it is open ground."""
 
 
 def draw_faces(vertices: np.ndarray, faces: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +43,7 @@ def draw_in_numpy(vertices: np.ndarray, faces: np.ndarray, depth: np.ndarray, fa
     height, width = depth.shape
     with np.errstate(invalid="ignore"):
         corners = vertices[faces].astype(np.float64)  # (F, 3, 3)
-        low = np.ceil(corners[:, :, :2].min(1) - 0.5).clip(0, [width, height])
+        low = np.nan_to_num(np.ceil(corners[:, :, :2].min(1) - 0.5).clip(0, [width, height]))
         high = (np.floor(corners[:, :, :2].max(1) - 0.5) + 1).clip(0, [width, height])
         size = (high - low).max(1)
         drawn = (corners[:, :, 2] > 0).all(1) & ((high - low).min(1) > 0)
@@ -126,14 +128,13 @@ def _lit(mesh: Mesh, local: np.ndarray, drawn: tuple[np.ndarray, int, int]) -> T
     return torch.from_numpy(image).float().permute(2, 0, 1)
 
 
-def up_of(cameras: list[Camera]) -> np.ndarray:
-    """(3,) the direction that is up for these cameras: across the plane that they stand in, against where they look."""
-    centres = np.stack([camera.centre.numpy() for camera in cameras])
-    looks = np.stack([camera.world_to_camera[2, :3].numpy() for camera in cameras])
-    heads = np.stack([-camera.world_to_camera[1, :3].numpy() for camera in cameras])
-    spread = np.linalg.svd(centres - centres.mean(0), full_matrices=True)
-    normal = spread[2][2]
-    if len(centres) < 3 or spread[1][1] < 0.05 * spread[1][0]:  # all in one line
-        normal = heads.mean(0) - looks.mean(0)
-    normal = normal / np.linalg.norm(normal)
-    return normal if normal @ (heads.mean(0) - looks.mean(0)) >= 0 else -normal
+def up_of(mesh: Mesh, cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) the direction that is up: where open ground faces on the whole; for closed bodies, that of photographs."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    areas = np.cross(b - a, c - a)
+    whole, sizes = areas.sum(0), np.linalg.norm(areas, axis=1).sum()
+    if np.linalg.norm(whole) > OPEN * sizes:
+        return whole / np.linalg.norm(whole)
+    poses = np.stack([camera.world_to_camera.numpy() for camera in cameras])
+    heads = -poses[:, 1, :3].mean(0)
+    return heads / max(np.linalg.norm(heads), 1e-12) if np.linalg.norm(heads) > 1e-3 else np.array([0.0, 0.0, 1.0])

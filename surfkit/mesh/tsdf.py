@@ -92,7 +92,7 @@ class TSDF(Mesher):
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
         found = estimate(subject.splats, lengths.voxel, within)
-        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, subject.budget_bytes // MESH_BYTES)
+        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, for_mesh(subject) // MESH_BYTES)
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(
@@ -136,13 +136,18 @@ def refuse_too_fine(lengths: Lengths, subject: Subject, farthest: float) -> None
         )
 
 
+def for_mesh(subject: Subject) -> int:
+    """Bytes of the budget that are not the grid's."""
+    return int((1 - SHARE) * subject.budget_bytes)
+
+
 def refuse_too_large(lengths: Lengths, subject: Subject, blocks: int) -> None:
     """BadInput if the triangles alone would not fit into the memory."""
-    needed = blocks * MESH_BYTES
-    if needed > subject.budget_bytes:
-        least = lengths.voxel * (needed / subject.budget_bytes) ** 0.5
+    needed, most = blocks * MESH_BYTES, for_mesh(subject)
+    if needed > most:
+        least = lengths.voxel * (needed / most) ** 0.5
         raise BadInput(
             f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million "
-            f"triangles, which take {needed / 1e9:.1f} GB, and {subject.budget_bytes / 1e9:.1f} GB may be used; give "
+            f"triangles, which take {needed / 1e9:.1f} GB, and {most / 1e9:.1f} GB may be used; give "
             f"--mesh.voxel {told(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more --memory"
         )

@@ -203,6 +203,21 @@ def test_what_cannot_be_meshed_is_said():
             TSDF(**wrong)
 
 
+@pytest.mark.skipif(native.module() is None, reason="surfkit was built without a compiler")
+def test_compiled_shades_are_those_of_numpy(monkeypatch):
+    from surfkit.mesh import picture
+
+    maps, camera = maps_of(around(1)[0], sphere), around(1)[0]
+    noisy = replace(maps, color=maps.color + torch.randn(3, 72, 96), normal=maps.normal + 0.3 * torch.randn(3, 72, 96))
+    noisy.color[0, 3, 4], noisy.normal[:, 36, 50] = torch.nan, 0
+    for some in (noisy, replace(noisy, normal=None)):
+        one = picture.picture(maps.depth, some, camera, 0.015).shade
+        monkeypatch.setattr(picture, "module", lambda: None)
+        other = picture.picture(maps.depth, some, camera, 0.015).shade
+        monkeypatch.undo()
+        assert np.array_equal(one, other) and len(np.unique(one >> 24)) > 5
+
+
 def test_one_view_alone_counts_if_it_may():
     mesh = TSDF(voxel=0.5, least_views=0.1).mesh(subject(around(1, above=True), slope))
     assert len(mesh.faces) > 100

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from surfkit import Component, Recipe, Stage, hookimpl
 from surfkit.losses import L1, SSIM, MeanOpacity, MeanScale, NormalConsistency
+from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit_mcmc.relocation import Relocation
 
@@ -32,5 +33,6 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
             about="2DGS with a fixed number of points that are relocated, as in 3DGS-MCMC",
             primitive=Surfel2D(),
             pretrain=Stage(losses=surface, densify=Relocation(), regularizers=REGULARIZERS),
+            mesh=TSDF(),
         ),
     }

@@ -1,13 +1,16 @@
 // What Python sees of the grid: arrays are checked in mesh/native.py, which alone calls this.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <cstring>
+#include <optional>
 #include <string>
 
+#include "../../raster/cpu/pool.h"
 #include "bind.h"
 #include "grid.h"
 #include "shade.h"
@@ -99,6 +102,25 @@ void add_mesh(nb::module_& m) {
         .def_prop_ro("blocks", &Grid::blocks)
         .def_prop_ro("bytes", &Grid::bytes);
 
+    m.def(
+        "shade",
+        [](Floats depth, Floats color, std::optional<Floats> normal, std::vector<double> lens, double near,
+           nb::ndarray<uint32_t, nb::c_contig, nb::device::cpu> shade, const std::string& kernels, int threads) {
+            ShadeJob job{depth.data(),         color.data(),          normal ? normal->data() : nullptr,
+                         (int)depth.shape(1),  (int)depth.shape(0),   (float)lens.at(0),
+                         (float)lens.at(1),    (float)lens.at(2),     (float)lens.at(3),
+                         (float)near};
+            uint32_t* out = shade.data();
+            const FuseKernels& k = named(kernels);
+            const int rows = 16;
+            nb::gil_scoped_release free;
+            parallel((job.height + rows - 1) / rows, threads, [&](int64_t piece) {
+                for (int row = (int)piece * rows; row < std::min(job.height, (int)(piece + 1) * rows); row++)
+                    k.shade(job, row, out + (int64_t)row * job.width);
+            });
+        },
+        nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
+        nb::arg("shade"), nb::arg("kernels"), nb::arg("threads"));
     m.def("draw_faces", [](Floats vertices, Whole faces, nb::ndarray<float, nb::c_contig, nb::device::cpu> depth,
                            nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
         FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),

@@ -52,9 +52,24 @@ inline bool project(const FuseJob& job, const float* first, int layer, Samples& 
     return some != 0;
 }
 
-inline void gather(const FuseJob& job, Samples& s) {
+// The depth of the pixel that each voxel falls on. Neighbours are asked only where they can matter: interpolation
+// changes a depth by no more than the jump, which moves nothing that lies further in front of or behind the band.
+inline void gather(const FuseJob& job, Samples& s, bool& some, bool& close) {
     for (int i = 0; i < kLayer; i++) s.depth[i] = job.depth[s.pixel[i]];
-    for (int i = 0; i < kLayer; i++) s.shade[i] = job.shade[s.pixel[i]];
+    const float reach = job.truncation + job.jump;
+    int32_t before = 0, near = 0;
+    for (int i = 0; i < kLayer; i++) {
+        const float sdf = s.depth[i] - s.z[i];
+        const int32_t counts = s.inside[i] & (s.depth[i] > 0 ? 1 : 0) & (sdf > -reach ? 1 : 0);
+        s.inside[i] = counts;
+        before |= counts;
+        near |= counts & (sdf < reach ? 1 : 0);
+    }
+    some = before != 0;
+    close = near != 0;
+}
+
+inline void gather_neighbours(const FuseJob& job, Samples& s) {
     for (int i = 0; i < kLayer; i++) s.corner[0][i] = job.depth[s.above[i] + s.left[i]];
     for (int i = 0; i < kLayer; i++) s.corner[1][i] = job.depth[s.above[i] + s.right[i]];
     for (int i = 0; i < kLayer; i++) s.corner[2][i] = job.depth[s.below[i] + s.left[i]];
@@ -92,8 +107,14 @@ void fuse_block(const FuseJob& job, const float* first, uint32_t seed, Block& bl
     const float per_fade = 1.0f / (job.truncation - job.fade);
     for (int layer = 0; layer < kSide; layer++) {
         if (!project(job, first, layer, s)) continue;
-        gather(job, s);
-        interpolate(job, s);
+        bool some_before, close;
+        gather(job, s, some_before, close);
+        if (!some_before) continue;
+        if (close) {
+            gather_neighbours(job, s);
+            interpolate(job, s);
+        }
+        for (int i = 0; i < kLayer; i++) s.shade[i] = job.shade[s.pixel[i]];
         int16_t* const d = block.distance + layer * kLayer;
         uint16_t* const w = block.weight + layer * kLayer;
         for (int i = 0; i < kLayer; i++) {
@@ -182,10 +203,36 @@ void reach_row(const RowJob& job, uint64_t* low, uint64_t* high) {
         reach_piece(job, at, std::min(kPiece, job.width - at), low + at, high + at);
 }
 
+inline uint32_t byte_of(float x) {
+    const float low = x > 0 ? x : 0.0f, clamped = low < 1 ? low : 1.0f;
+    return (uint32_t)(int32_t)(clamped * 255.0f + 0.5f);
+}
+
+void shade_row(const ShadeJob& job, int row, uint32_t* shade) {
+    const int64_t plane = (int64_t)job.width * job.height, from = (int64_t)row * job.width;
+    const float *d = job.depth + from, *r = job.color + from, *g = r + plane, *b = g + plane;
+    const float ray_y = ((float)row + 0.5f - job.cy) / job.fy;
+    const bool turned = job.normal != nullptr;
+    const float *nx = turned ? job.normal + from : d, *ny = turned ? nx + plane : d, *nz = turned ? ny + plane : d;
+    for (int i = 0; i < job.width; i++) {
+        const float share = job.near / (d[i] > 1e-20f ? d[i] : 1e-20f), size = share < 1 ? share : 1.0f;
+        const float ray_x = ((float)i + 0.5f - job.cx) / job.fx;
+        const float along = -(nx[i] * ray_x + ny[i] * ray_y + nz[i]);
+        const float square = (nx[i] * nx[i] + ny[i] * ny[i] + nz[i] * nz[i]) * (ray_x * ray_x + ray_y * ray_y + 1.0f);
+        const float length = __builtin_sqrtf(square), cosine = along / (length > 1e-10f ? length : 1e-10f);
+        const float upright = turned ? (cosine < 1 ? cosine : 1.0f) : 1.0f;
+        const float weight = size * size * (upright > 0 ? upright : 0.0f);
+        const int32_t whole = (int32_t)(weight * kFullWeight + 0.5f);
+        const uint32_t counted = (uint32_t)(whole > 1 ? whole : 1);
+        const uint32_t color = byte_of(r[i]) | byte_of(g[i]) << 8 | byte_of(b[i]) << 16;
+        shade[i] = color | (((weight > 0) & (d[i] > 0)) ? counted << 24 : 0u);
+    }
+}
+
 }  // namespace
 
 const FuseKernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
-    static const FuseKernels table{fuse_block, reach_row};
+    static const FuseKernels table{fuse_block, reach_row, shade_row};
     return table;
 }
 

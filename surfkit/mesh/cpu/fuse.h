@@ -39,11 +39,22 @@ struct RowJob {
     int32_t low[3], high[3];           // blocks that may be made, both ends included
 };
 
+constexpr float kFullWeight = 32;
+
+// The maps of a view, from which the shade of its pixels is made.
+struct ShadeJob {
+    const float *depth, *color, *normal;  // (height, width), (3, height, width), the same or null
+    int width, height;
+    float fx, fy, cx, cy, near;  // near: depth at which a pixel is as large as a voxel
+};
+
 struct FuseKernels {
     // Fuse a view into a block whose first voxel lies at `first` in the camera's frame.
     void (*block)(const FuseJob& job, const float* first, uint32_t seed, Block& block);
     // Keys of the first and the last block within reach of what each pixel shows; kNoKey for none.
     void (*row)(const RowJob& job, uint64_t* low, uint64_t* high);
+    // Colour and weight of a row of pixels.
+    void (*shade)(const ShadeJob& job, int row, uint32_t* shade);
 };
 
 const FuseKernels& fuse_kernels_baseline();

@@ -1,0 +1,135 @@
+"""`surfkit mesh`, and the mesh at the end of `surfkit train`."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from surfkit.cli import main
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+TRAIN = ["recipe:2dgs", "--steps", "60", "--pictures-every", "0", "--primitive.sh-degree", "0"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mesh")
+    write_colmap(folder / "data", photograph(Flight(width=64, height=48, points=400)))
+    where = ["--data", str(folder / "data"), "--out", str(folder / "run")]
+    assert main(["train", *TRAIN, *where]) == 0
+    return folder / "run", where
+
+
+def record(out):
+    return json.loads((out / "mesh.json").read_text())
+
+
+def test_training_ends_with_a_mesh(finished, capsys):
+    out, _ = finished
+    facts = record(out)
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    assert len(mesh.faces) == facts["cleaning"]["triangles"] > 100 and facts["steps"] == 60
+    assert facts["mesher"]["use"] == "tsdf" and facts["lengths"]["voxel"] > 0
+    # The ground is at z = 0 in the frame of the input, and the box and the ball are below 5 m.
+    assert abs(np.median(mesh.vertices[:, 2])) < 2 and mesh.vertices[:, 2].max() < 30
+    pictures = sorted(path.name for path in (out / "mesh_pictures").iterdir())
+    assert pictures == ["above.png", "view-1.png", "view-2.png", "view-3.png", "view-4.png"]
+    with Image.open(out / "mesh_pictures" / "view-1.png") as picture:
+        assert picture.size == (2 * 64, 48) and np.asarray(picture)[:, 64:].min() < 200
+    events = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+    progress = [event for event in events if event["event"] == "Progress"]
+    assert len(progress) == 1 and progress[0]["done"] == progress[0]["total"] == 10, "the way there is not written down"
+
+
+def test_the_same_command_again_makes_nothing_and_another_mesher_only_the_mesh(finished, capsys):
+    out, where = finished
+    before, checkpoint = record(out), (out / "pretrain" / "checkpoint.safetensors").stat().st_mtime_ns
+    assert main(["train", *TRAIN, *where]) == 0
+    assert record(out) == before and "is finished" in capsys.readouterr().err
+    assert main(["train", *TRAIN, "mesh:tsdf", "--mesh.depth", "expected", *where]) == 0
+    assert record(out)["mesher"]["depth"] == "expected"
+    assert (out / "pretrain" / "checkpoint.safetensors").stat().st_mtime_ns == checkpoint
+    assert main(["train", *TRAIN, *where]) == 0
+    assert record(out)["mesher"] == before["mesher"]
+
+
+def test_another_mesh_of_the_same_run(finished, tmp_path, capsys):
+    out, _ = finished
+    pytest.importorskip("open3d")
+    words = ["mesh:tsdf", "--mesh.voxel", "0.5", "--mesh.least-views", "0.5", "--metres-per-unit", "1"]
+    words += ["--formats", "ply", "obj", "glb", "--lods", "0.5", "--least-triangles", "20", "--crop-box"]
+    assert main(["mesh", str(out), *words, "-50", "-50", "-2", "50", "50", "3"]) == 0
+    facts = record(out)
+    assert facts["lengths"]["voxel_m"] == pytest.approx(0.5) and facts["metres_per_unit"] == 1
+    assert sorted(facts["files"]) == sorted(
+        ["mesh.ply", "mesh.obj", "mesh.glb", "mesh.glb.json"]
+        + [f"mesh-lod1.{end}" for end in ("ply", "obj", "glb", "glb.json")]
+    )
+    assert all((out / name).stat().st_size > 100 for name in facts["files"])
+    whole, less = (trimesh.load(out / f"{name}.ply", process=False) for name in ("mesh", "mesh-lod1"))
+    assert len(less.faces) <= 0.55 * len(whole.faces)
+    assert -2.5 < whole.vertices[:, 2].min() and whole.vertices[:, 2].max() < 3.5
+    shown = capsys.readouterr().out
+    assert f"{len(whole.faces):,}" in shown and "mesh-lod1.obj" in shown
+    assert main(["mesh", str(out), "--formats", "ply"]) == 0
+    assert not list(out.glob("mesh-lod*")) and not (out / "mesh.obj").exists(), "what was there before is gone"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["mesh:tsdf", "--mesh.voxel", "0"], "mesh.voxel is 0; it must be more than 0 metres, or auto"),
+        (["mesh:tsdf", "--mesh.voxel", "1"], "--metres-per-unit (1 if its coordinates are metres)"),
+        (["--metres-per-unit", "-1"], "--metres-per-unit -1"),
+        (["--lods", "2"], "--lods 2: a share of the triangles lies between 0 and 1"),
+        (["--least-triangles", "0"], "--least-triangles 0: give 1 or more"),
+        (["--memory", "much"], "--memory much: give a size"),
+        (["--memory", "1MB"], "too little to mesh in"),
+        (["--crop-box", "0", "0", "0", "1", "1", "1", "--crop", "x.json"], "give one of the two"),
+        (["--crop", "none.json"], "--crop none.json: cannot be read"),
+        (["--crop-box", "900", "900", "900", "901", "901", "901"], "outside the crop"),
+        (["mesh:tsdf", "--mesh.least-views", "999"], "no surface"),
+        (["mesh:tsfd"], "tsdf"),
+    ],
+)
+def test_mistakes_are_one_line_and_change_nothing(finished, capsys, words, message):
+    out, _ = finished
+    before = record(out)
+    assert main(["mesh", str(out), *words]) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("surfkit:")]
+    assert len(lines) == 1 and message in lines[0]
+    assert record(out) == before and not list(out.glob(".*"))
+
+
+def test_a_refused_recipe_leaves_the_mesh(finished):
+    out, where = finished
+    before = record(out)
+    assert main(["train", *TRAIN, "mesh:tsdf", "--mesh.depth", "expected", "--seed", "7", *where]) == 2
+    assert record(out) == before
+
+
+def test_a_folder_without_a_run(tmp_path, capsys):
+    assert main(["mesh", str(tmp_path)]) == 2
+    assert "no run folder" in capsys.readouterr().err
+
+
+def test_without_a_mesher_there_is_no_mesh(finished, tmp_path, capsys):
+    _, where = finished
+    assert (
+        main(["train", "recipe:2dgs", "--steps", "1", "mesh:none", "--data", where[1], "--out", str(tmp_path / "a")])
+        == 0
+    )
+    assert not (tmp_path / "a" / "mesh.json").exists() and "fusing" not in capsys.readouterr().err
+    assert main(["train", "recipe:3dgs", "--steps", "1", "--data", where[1], "--out", str(tmp_path / "b")]) == 0
+    assert not (tmp_path / "b" / "mesh.json").exists()
+
+
+def test_a_mesh_that_cannot_be_made_does_not_cost_the_measurements(finished, tmp_path, capsys):
+    _, where = finished
+    words = ["recipe:2dgs", "--steps", "1", "mesh:tsdf", "--mesh.least-views", "999"]
+    assert main(["train", *words, "--data", where[1], "--out", str(tmp_path / "run")]) == 0
+    assert (tmp_path / "run" / "metrics.json").exists() and not (tmp_path / "run" / "mesh.ply").exists()
+    notes = json.loads((tmp_path / "run" / "run.json").read_text())["notes"]
+    assert any("there is no mesh: no surface" in note for note in notes)
