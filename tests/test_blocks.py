@@ -1,0 +1,235 @@
+"""Whole runs with blocks: who works on them, and how they are interrupted, changes nothing."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from surfkit import blocks
+from surfkit.blocks import Hands, Unfinished
+from surfkit.cli import main
+from surfkit.core.check import BadInput, Fault
+from surfkit.core.codec import read_json
+from surfkit.optimise import Every
+from surfkit.partition import Inline, PictureShare, Pool, QuantileGrid
+from surfkit.partition.state import read_state
+from surfkit.pipeline import load_run, run
+from surfkit.recipe import Recipe
+from surfkit.scene.data import Data
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train.stage import Stage
+
+STEPS = 12
+EVERY = Every(checkpoint=4, pictures=0)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Data:
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(views=16, width=32, height=24, points=200)))
+    return Data(folder)
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """Two blocks, half of the points each."""
+    stage = Stage(steps=STEPS)
+    return Recipe(
+        pretrain=stage, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=replace(stage, sh_every=1)
+    )
+
+
+@pytest.fixture(scope="module")
+def undisturbed(data, recipe, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed") / "run"
+    run(recipe, data, out, Hands("cpu"), EVERY)
+    return out
+
+
+def params(out: Path) -> dict[str, torch.Tensor]:
+    """Raw parameters of the merged model."""
+    return checkpoint.load_last(out / "tune" / "checkpoint.safetensors")[0].points.params
+
+
+def same(a: Path, b: Path) -> bool:
+    one, other = params(a), params(b)
+    cloud = (a / "point_cloud.ply").read_bytes() == (b / "point_cloud.ply").read_bytes()
+    return cloud and all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+def test_what_a_run_leaves(undisturbed, data, recipe):
+    plan = json.loads((undisturbed / "blocks" / "plan.json").read_text())["plan"]
+    assert [block["points"] for block in plan["blocks"]] == [100, 100]
+    assert (undisturbed / "blocks" / "plan.png").stat().st_size > 1_000
+    assert all(read_state(undisturbed / "blocks" / name).status == "done" for name in ("000", "001"))
+    gave = json.loads((undisturbed / "blocks" / "merge.json").read_text())
+    assert gave["points"] == sum(block["kept"] for block in gave["blocks"]) == len(params(undisturbed)["means"])
+    metrics = json.loads((undisturbed / "metrics.json").read_text())
+    assert metrics["points"] == gave["points"] and metrics["images"]["psnr"] > 8
+    stages = map(json.loads, (undisturbed / "events.jsonl").read_text().splitlines())
+    assert sum(line["event"] == "StepDone" for line in stages) == STEPS, "blocks have journals of their own"
+    this, state, _ = load_run(undisturbed)
+    assert this.part == "tune" and state.index == STEPS
+
+
+def test_merged_points_lie_in_their_block(undisturbed):
+    """Counted from the blocks' own results: what each owns of what it has come to, in their order."""
+    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    parts = []
+    for index in range(2):
+        state, _ = checkpoint.load_last(undisturbed / "blocks" / f"{index:03}" / "tune" / "checkpoint.safetensors")
+        flat = plan.cells.ground.flat(state.points.params["means"])
+        border = plan.cells.boxes[0][2]
+        parts.append(state.points.params["means"][(flat[:, 0] < border) == (index == 0)])
+    assert torch.equal(torch.cat(parts), params(undisturbed)["means"])
+
+
+def test_tuning_changes_what_it_should(undisturbed):
+    coarse = checkpoint.load_last(undisturbed / "pretrain" / "checkpoint.safetensors")[0].points.params
+    assert coarse["means"].shape == params(undisturbed)["means"].shape
+    assert not torch.equal(coarse["sh0"], params(undisturbed)["sh0"])
+
+
+def test_a_pool_comes_to_the_same_bits(undisturbed, data, recipe, tmp_path):
+    run(recipe, data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+    assert same(tmp_path, undisturbed)
+    again = run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert again["points"] == len(params(undisturbed)["means"])
+
+
+def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_path, monkeypatch):
+    """Ctrl-C between two steps of the second block; then another executor finishes."""
+    guarded = blocks.guarded
+
+    def stopped(site, plan, index):
+        if index == 1:
+            site = replace(site, every=Every(checkpoint=4, pictures=0))
+            monkeypatch.setattr(blocks, "optimise", stop_after(blocks.optimise, 6))
+        return guarded(site, plan, index)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(blocks, "guarded", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    monkeypatch.undo()
+    state = read_state(tmp_path / "blocks" / "001")
+    assert (state.status, state.kind) == ("failed", "interrupted") and not (tmp_path / "metrics.json").exists()
+    with pytest.raises(BadInput, match="not all blocks are tuned"):
+        load_run(tmp_path)
+    run(recipe, data, tmp_path, Hands("cpu", Pool(workers=1)), EVERY)
+    assert same(tmp_path, undisturbed)
+
+
+def stop_after(optimise, step):
+    """An `optimise` during which SIGINT comes after a step."""
+    from surfkit import optimise as module
+
+    def stopping(job, state):
+        display = module.Display
+
+        class Interrupting(display):
+            def show(self, done):
+                super().show(done)
+                if done.index == step:
+                    os.kill(os.getpid(), signal.SIGINT)
+
+        module.Display = Interrupting
+        try:
+            return optimise(job, state)
+        finally:
+            module.Display = display
+
+    return stopping
+
+
+def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_path, capsys):
+    """The first process of block 0 kills itself in the middle of its steps; the next one goes on."""
+    command = blocks.job_of
+
+    def deadly(site, plan, index, hands):
+        job = command(site, plan, index, hands)
+        if index == 0 and not (tmp_path / "killed").exists():
+            code = (
+                "import os, sys, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+                "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
+                f"            Path({str(tmp_path / 'killed')!r}).touch(); os.kill(os.getpid(), 9)\n"
+                f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"
+            )
+            job = replace(job, command=("-c", code))
+        return job
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocks, "job_of", deadly)
+        run(recipe, data, tmp_path / "run", Hands("cpu", Pool(workers=2)), EVERY)
+    assert (
+        tmp_path / "killed"
+    ).exists() and "block 0 was ended by SIGKILL; it is tried again" in capsys.readouterr().err
+    assert same(tmp_path / "run", undisturbed)
+
+
+def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, tmp_path):
+    optimise = blocks.optimise
+
+    def failing(job, state):
+        if job.this.out.name == "001":
+            raise Fault("numbers are not finite")
+        return optimise(job, state)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocks, "optimise", failing)
+        with pytest.raises(Unfinished, match="block 1 failed: numbers are not finite; the others are done") as told:
+            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert told.value.status == 3
+    assert read_state(tmp_path / "blocks" / "000").status == "done"
+    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert same(tmp_path, undisturbed)
+
+
+def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_path):
+    """Its workers notice, save and leave; the same command finishes to the same bits."""
+    recipe_file = undisturbed / "recipe.json"
+    words = [
+        "train",
+        f"recipe:{recipe_file}",
+        "--data",
+        str(data.path),
+        "--out",
+        str(tmp_path / "run"),
+        "--device",
+        "cpu",
+    ]
+    words += ["executor:pool", "--executor.workers", "2", "--checkpoint-every", "4", "--pictures-every", "0"]
+    driver = subprocess.Popen([sys.executable, "-m", "surfkit.cli", *words], stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 60
+    while not any((tmp_path / "run" / "blocks").glob("00*/state.json")) and time.monotonic() < until:
+        time.sleep(0.01)
+    driver.kill()
+    driver.wait()
+    assert main(words) == 0
+    assert same(tmp_path / "run", undisturbed)
+
+
+def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
+    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 4))
+    run(longer, data, tmp_path, Hands("cpu"), EVERY)
+    assert (tmp_path / "blocks-before" / "000").is_dir()
+    assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
+
+
+def test_tune_by_hand(undisturbed, tmp_path, capsys):
+    assert main(["tune", str(undisturbed), "0"]) == 0  # it is done
+    assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
+    assert main(["tune", str(tmp_path), "0"]) == 2
+
+
+def test_an_inline_executor_is_the_default(recipe):
+    assert Hands().workers == Inline() and Hands().device == "auto"
