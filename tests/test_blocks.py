@@ -175,7 +175,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
     assert same(tmp_path / "run", undisturbed)
 
 
-def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, tmp_path):
+def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, tmp_path, capsys):
     optimise = blocks.optimise
 
     def failing(job, state):
@@ -189,6 +189,9 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
             run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert told.value.status == 3
     assert read_state(tmp_path / "blocks" / "000").status == "done"
+    assert main(["status", str(tmp_path)]) == 3
+    said = capsys.readouterr().out
+    assert "1 of 2 done" in said and "failed: numbers are not finite, step 0 of 12" in said
     run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert same(tmp_path, undisturbed)
 

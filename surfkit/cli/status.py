@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.cli.table import print_table
-from surfkit.report.status import Status, as_json, status
+from surfkit.report.status import Block, Status, as_json, status
 
 UNFINISHED = 3
 
@@ -57,8 +57,19 @@ def rows(found: Status) -> list[tuple[str, str]]:
     if found.metrics and found.metrics["psnr"] is not None:
         when = f" after step {found.metrics['step']:,}" if "step" in found.metrics else ""
         told.append(("PSNR", f"{found.metrics['psnr']:.2f} dB of {found.metrics['views']} views{when}"))
+    if found.blocks:
+        done = sum(block.status == "done" for block in found.blocks)
+        told.append(("blocks", f"{done} of {sum(block.views > 0 for block in found.blocks)} done"))
+        told += [(f"block {block.index}", _where(block)) for block in found.blocks]
     told += [("skipped", name) for name in found.skipped]
     return told + [("warning", text) for text in found.warnings]
+
+
+def _where(block: Block) -> str:
+    if not block.views:
+        return "no views; stays as it is in the coarse model"
+    reason = f": {block.error}" if block.error else ""
+    return f"{block.status}{reason}, step {block.step:,} of {block.steps:,}, {block.views} views"
 
 
 COMMAND = StatusOf

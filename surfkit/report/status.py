@@ -20,6 +20,27 @@ PACE_OVER = 100
 
 
 @dataclass(frozen=True)
+class Block:
+    """Where one block stands.
+
+    Attributes:
+        index: Counted from 0.
+        views: It is tuned on; 0 for one that stays as it is.
+        status: planned, running, done or failed, as last heard of.
+        step: Done.
+        steps: To make.
+        error: Why it failed.
+    """
+
+    index: int
+    views: int
+    status: str = "planned"
+    step: int = 0
+    steps: int = 0
+    error: str | None = None
+
+
+@dataclass(frozen=True)
 class Status:
     """Where a run stands.
 
@@ -38,6 +59,7 @@ class Status:
         metrics: PSNR and SSIM of held-out photographs, at the end or when they were last looked at.
         warnings: Notes of the run.
         skipped: Photographs that could not be read.
+        blocks: Where each block stands, once they are planned.
     """
 
     state: str
@@ -54,6 +76,7 @@ class Status:
     metrics: dict[str, Any] | None = None
     warnings: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
+    blocks: tuple[Block, ...] = ()
 
 
 def status(out: Path) -> Status:
@@ -86,7 +109,27 @@ def status(out: Path) -> Status:
         metrics=metrics,
         warnings=_texts(record, kept, "notes"),
         skipped=_texts(record, kept, "skipped"),
+        blocks=_blocks(out / "blocks"),
     )
+
+
+def _blocks(folder: Path) -> tuple[Block, ...]:
+    """Where the blocks of a run stand, by what lies in their folders."""
+    path = folder / "plan.json"
+    if not path.exists():
+        return ()
+    try:
+        planned = read_json(path, dict[str, Any])["plan"]["blocks"]
+        views = [len(block["views"]) for block in planned]
+    except (KeyError, TypeError) as error:
+        raise BadInput(f"{path}: damaged; delete {folder}, and the surfkit train command plans again") from error
+    found = []
+    for index, count in enumerate(views):
+        state = folder / f"{index:03}" / "state.json"
+        said = read_json(state, dict[str, Any]) if state.exists() else {}
+        known = {name: said[name] for name in ("status", "step", "steps", "error") if said.get(name) is not None}
+        found.append(load(Block, {"index": index, "views": count} | known, str(state)))
+    return tuple(found)
 
 
 def _steps(recipe: Path) -> int:
