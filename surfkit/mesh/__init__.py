@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from surfkit.core.registry import Component, hookimpl
+from surfkit.mesh.poisson import Poisson
 from surfkit.mesh.tetra import Tetra
 from surfkit.mesh.tsdf import TSDF
 
@@ -10,4 +11,4 @@ from surfkit.mesh.tsdf import TSDF
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Names of what this folder offers."""
-    return {"tsdf": TSDF, "tetra": Tetra}
+    return {"tsdf": TSDF, "tetra": Tetra, "poisson": Poisson}

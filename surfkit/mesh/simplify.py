@@ -10,13 +10,13 @@ from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 
 
-def require() -> None:
-    """BadInput if there is nothing to simplify with."""
+def require(what: str = "--lods") -> None:
+    """BadInput if Open3D, which `what` is made with, is not there."""
     try:
         import open3d  # noqa: F401
     except ImportError as error:
         raise BadInput(
-            f"--lods needs Open3D, which cannot be imported ({error}); pip install 'surfkit[mesh]'"
+            f"{what} needs Open3D, which cannot be imported ({error}); pip install 'surfkit[mesh]'"
         ) from error
 
 
