@@ -48,6 +48,9 @@ ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
 ALIVE_S = 5.0
 """Seconds between signs of life of a block."""
+PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
+"""What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
+moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
 
@@ -260,12 +263,16 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
     command += ["--cache", f"{share}", "--checkpoint-every", f"{site.every.checkpoint}"]
     command += ["--resized-copies"] * site.store.copies
+    pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
+    photos = 3 * sum(view.camera.width * view.camera.height for view in site.scene.train if view.name in block.views)
+    growth = 1 if site.this.recipe.tune.densify is None else 3
     return executor.Job(
         index=index,
         folder=site.place(index),
         call=lambda: guarded(site, blocks, index),
         command=tuple(command),
         cost=block.work,
+        memory_bytes=PROGRAM_BYTES + growth * POINT_BYTES * block.points + PIXEL_BYTES * pixels + min(share, photos),
     )
 
 
