@@ -16,8 +16,8 @@ BLOCK_TRIANGLES = 60
 """Of a block, about; and half as many vertices."""
 MESH_BYTES = 5_000
 """Most that these take while tiles are joined: everything twice, and the names of the vertices."""
-SHARE = 0.4
-"""Of the memory budget that a grid may take; the rest is for the triangles."""
+SHARE = 0.2
+"""Of the memory budget that a grid may take; the rest is for the triangles, which are all there at the end."""
 DENSE = 4
 """Splats in a cell from which it is taken for covered."""
 THICK = 3.0
