@@ -126,7 +126,7 @@ def run(
                 export(this, state, scene)
             if not meshed(this, state.index):
                 mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto")))
-            return evaluate(this, state, scene, rasterizer, meter)
+            return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
 
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
@@ -162,7 +162,7 @@ def evaluate(
         scene: Its data.
         rasterizer: What draws.
         meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
-        lpips_weights: See `surfkit.evaluate.lpips.load_perceptual`; or "none".
+        lpips_weights: See `surfkit.evaluate.lpips.networks`.
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)

@@ -18,12 +18,12 @@ from surfkit.evaluate.pictures import write_picture
 from surfkit.folder import Run
 from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.clean import Report, clean
-from surfkit.mesh.crop import Prism, box, read_crop
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require, simplified
 from surfkit.raster.api import Rasterizer
+from surfkit.scene.crop import Crop, box, read_crop
 from surfkit.scene.masks import mask_cache
 from surfkit.scene.scene import Scene
 from surfkit.train.stage import StageState
@@ -69,7 +69,7 @@ class Delivery:
         if self.lods:
             require()
 
-    def volume(self) -> Prism | None:
+    def volume(self) -> Crop | None:
         """The crop, in the frame of the input."""
         if self.crop_box is not None:
             return box(self.crop_box)
@@ -112,7 +112,7 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
     for left in this.out.glob(TILES):
         shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
-    inside = None if volume is None else lambda local: volume.contains(frame.to_input(local))
+    inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside)
     facts = dict(raw.facts)
     del raw

@@ -11,12 +11,12 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.evaluate.crop import Axis, Crop, read_crop
 from surfkit.evaluate.measurement import LEAST, Draw, Measurement, Side, cloud_side, mesh_side, refuse_few
 from surfkit.evaluate.scores import spacing, tree
 from surfkit.evaluate.surface import Surface
 from surfkit.evaluate.transform import read_transform, scale_of
 from surfkit.evaluate.volume import Enough, said, visible_crop
+from surfkit.scene.crop import Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5

@@ -8,9 +8,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from surfkit.core.files import replacing
-from surfkit.evaluate.crop import PLANES, Axis, Crop
 from surfkit.evaluate.visibility import nearest_rows, pictured, sides
 from surfkit.scene.camera import Camera
+from surfkit.scene.crop import PLANES, Axis, Crop
 from surfkit.scene.ply import write_points
 
 STOPS = np.array([0.0, 1.0, 1.0001, 2.5, 5.0])

@@ -12,12 +12,12 @@ import numpy as np
 from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.chart import write_chart
 from surfkit.evaluate.comparison import Comparison, Outcome, compare
-from surfkit.evaluate.crop import write_crop
 from surfkit.evaluate.errors import LONGEST_PX, coloured, seen_by, write_cloud, write_plan, write_row
 from surfkit.evaluate.measurement import Draw
 from surfkit.evaluate.scores import chamfer, curve, shares
 from surfkit.evaluate.surface import read_surface
 from surfkit.evaluate.transform import apply, scale_of, write_transform
+from surfkit.scene.crop import write_crop
 from surfkit.scene.scene import Frame, View
 
 REACH = 5

@@ -224,7 +224,7 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
     """Both networks, or those whose weights are here, and why others are not; none of them where that is "none".
 
     Args:
-        where: See `load_perceptual`.
+        where: See `load_perceptual`; or "none", or "gpu" for "auto" where there is one and "none" elsewhere.
         smallest_px: Least side of the images to come.
 
     Raises:
@@ -232,12 +232,14 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
     """
     if where == "none":
         return (), "left out, by --lpips-weights none"
+    if where == "gpu" and not torch.cuda.is_available():
+        return (), "left out, as it takes most of a minute a photograph without a GPU; surfkit evaluate measures it"
     if smallest_px < SMALLEST_PX:
         return (), f"a photograph has a side of less than {SMALLEST_PX} pixels"
     found, lacking = [], None
     for net in PLANS:
         try:
-            found.append(load_perceptual(net, where))
+            found.append(load_perceptual(net, "auto" if where == "gpu" else where))
         except NoWeights as error:
             lacking = f"{net}: {error}"
     return tuple(found), lacking

@@ -10,7 +10,6 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.evaluate.crop import Crop
 from surfkit.evaluate.registration import Alignment, align
 from surfkit.evaluate.sampling import face_areas, sample_surface
 from surfkit.evaluate.scores import Distances, nearest, tree
@@ -18,6 +17,7 @@ from surfkit.evaluate.surface import Surface
 from surfkit.evaluate.thinning import thin, voxel_for
 from surfkit.evaluate.transform import apply
 from surfkit.evaluate.volume import said
+from surfkit.scene.crop import Crop
 
 MOST = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.crop import PLANES, Axis, Crop
 from surfkit.evaluate.outline import outline
 from surfkit.evaluate.scores import surface_gap, tree
 from surfkit.evaluate.transform import apply, scale_of
 from surfkit.evaluate.visibility import visible_counts
+from surfkit.scene.crop import PLANES, Axis, Crop
 from surfkit.scene.scene import Frame, View
 
 RADIUS = 0.02

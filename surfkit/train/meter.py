@@ -49,4 +49,6 @@ class Meter:
         """The peak, and its parts by name."""
         peak = peak_memory_bytes()
         parts = {**self.parts, **self.caches, **self.added}
-        return {"peak": peak, **parts, "steps": max(0, peak - sum(parts.values()))}
+        rest = peak - sum(parts.values())
+        parts["program"] += min(0, rest)  # what it had let go of again was taken by others
+        return {"peak": peak, **parts, "steps": max(0, rest)}

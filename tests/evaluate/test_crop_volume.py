@@ -8,12 +8,12 @@ import torch
 from scipy.spatial import Delaunay
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.crop import Crop, read_crop, within, write_crop
 from surfkit.evaluate.outline import outline
 from surfkit.evaluate.scores import surface_gap, tree
 from surfkit.evaluate.visibility import visible, visible_counts
 from surfkit.evaluate.volume import Enough, visible_crop
 from surfkit.scene.camera import Camera
+from surfkit.scene.crop import Crop, read_crop, within, write_crop
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.synthetic import SURFACES, Flight, photograph
 

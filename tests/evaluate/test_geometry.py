@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 from surfkit.core.check import BadInput
 from surfkit.evaluate import measurement
 from surfkit.evaluate.comparison import Comparison, compare
-from surfkit.evaluate.crop import Crop, write_crop
 from surfkit.evaluate.errors import coloured
 from surfkit.evaluate.geometry import measure_geometry
 from surfkit.evaluate.measurement import cloud_side
 from surfkit.evaluate.scores import shares
 from surfkit.evaluate.surface import Surface, read_surface
 from surfkit.evaluate.transform import apply, write_transform
+from surfkit.scene.crop import Crop, write_crop
 from surfkit.scene.ply import read_vertices, write_points
 from surfkit.scene.synthetic import Flight, photograph
 

@@ -9,7 +9,7 @@ import trimesh
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import boundaries, clean, clusters
-from surfkit.mesh.crop import box, read_crop
+from surfkit.scene.crop import box, read_crop
 
 
 def ball(centre=(0, 0, 0), divisions=2):
@@ -64,25 +64,25 @@ def test_holes_are_reported():
 
 def test_crops(tmp_path):
     mesh = together(ball(), ball((5, 0, 0)))
-    kept, report = clean(mesh, 50, 50, box((-2, -2, -2, 2, 2, 2)).contains)
+    kept, report = clean(mesh, 50, 50, box((-2, -2, -2, 2, 2, 2)).inside)
     assert report.cropped == 320 and kept.vertices[:, 0].max() <= 1
-    half = clean(mesh, 50, 50, box((-2, -2, 0, 2, 2, 2)).contains)[0]
+    half = clean(mesh, 50, 50, box((-2, -2, 0, 2, 2, 2)).inside)[0]
     assert 100 < len(half.faces) < 220 and half.vertices[:, 2].min() > -0.3
     volume = {"orthogonal_axis": "Y", "axis_min": -3, "axis_max": 3.0, "class_name": "SelectionPolygonVolume"}
     corners = [[3, 0, -2], [7, 0, -2], [7, 0, 2]]  # x, anything, z
     path = tmp_path / "crop.json"
     path.write_text(json.dumps(volume | {"bounding_polygon": corners}))
     points = np.random.default_rng(0).uniform(-4, 8, (2000, 3))
-    inside = read_crop(path).contains(points)
+    inside = read_crop(path).inside(points)
     x, y, z = points.T
     assert np.array_equal(inside, (abs(y) <= 3) & (x > 3) & (x < 7) & (z > -2) & (z < x - 5)) and inside.sum() > 20
     with pytest.raises(BadInput, match="outside the crop: is it in the frame of the input"):
-        clean(mesh, 50, 50, box((50, 50, 50, 60, 60, 60)).contains)
+        clean(mesh, 50, 50, box((50, 50, 50, 60, 60, 60)).inside)
     with pytest.raises(BadInput, match="--crop-box 1 0 0 0 1 1: give the lowest"):
         box((1, 0, 0, 0, 1, 1))
     for text in ("{", "[]", '{"orthogonal_axis": "W"}', json.dumps(volume | {"bounding_polygon": [[1, 2, 3]]})):
         path.write_text(text)
-        with pytest.raises(BadInput, match="no crop volume with"):
+        with pytest.raises(BadInput, match="no crop volume|bounding_polygon|orthogonal_axis"):
             read_crop(path)
     with pytest.raises(BadInput, match="cannot be read"):
         read_crop(tmp_path / "none.json")

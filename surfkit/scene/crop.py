@@ -1,4 +1,4 @@
-"""The volume in which surfaces are compared: a polygon on the ground and a range of heights (Tanks and Temples)."""
+"""A volume above a polygon on the ground, as Tanks and Temples has them: surfaces are compared in it, or cut to it."""
 
 from __future__ import annotations
 
@@ -67,6 +67,15 @@ def within(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     result = np.empty(len(points), bool)
     result[order] = odd
     return result
+
+
+def box(sides: tuple[float, ...]) -> Crop:
+    """The box between two corners, x0 y0 z0 x1 y1 z1."""
+    x0, y0, z0, x1, y1, z1 = sides
+    if not (x0 < x1 and y0 < y1 and z0 < z1):
+        shown = " ".join(f"{side:g}" for side in sides)
+        raise BadInput(f"--crop-box {shown}: give the lowest x y z, then the highest x y z")
+    return Crop(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), z0, z1)
 
 
 def read_crop(path: Path) -> Crop:
