@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from surfkit.densify.base import Policy, Step
     from surfkit.losses.base import Loss, Sample
+    from surfkit.mesh.base import Mesher, Subject
+    from surfkit.partition.base import Partition, Sight
     from surfkit.primitives.base import Primitive
     from surfkit.primitives.points import Points
     from surfkit.raster.api import Maps
@@ -205,3 +207,42 @@ def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) 
 
     for key, value in first.items():
         assert torch.equal(value, second[key]), f"{what}: {key!r} differs for the same seed; draw from the generator"
+
+
+def check_partition(partition: Partition, sight: Sight) -> None:
+    """Its cells own every place exactly once, far away and on their sides too, and come out the same again."""
+    import torch
+
+    cells = partition.cells(sight)
+    assert cells == partition.cells(sight), "the same model gives other cells"
+    assert sorted(set(cells.blocks)) == list(range(cells.count)), "blocks are not counted from 0 without gaps"
+    assert len(cells.boxes) == len(cells.blocks), "each box belongs to one block"
+    generator = torch.Generator().manual_seed(0)
+    far = torch.randn(2_000, 3, generator=generator, dtype=torch.float64) * torch.logspace(-2, 4, 2_000)[:, None]
+    places = torch.cat([far, sight.splats.means.double(), sight.centres])
+    single = [replace(cells, boxes=(box,), blocks=(0,)).owner(places) == 0 for box in cells.boxes]
+    owners = torch.stack(single).sum(0)
+    assert int(owners.min()) == 1, "a place has no owner"
+    assert int(owners.max()) == 1, "a place has two owners"
+
+
+def check_mesher(mesher: Mesher, subject: Subject) -> None:
+    """Its mesh is whole, faces the cameras, and has the same area when it is made again."""
+    import numpy as np
+    import torch
+
+    fresh = [replace(subject, generator=torch.Generator().manual_seed(1)) for _ in range(2)]
+    mesh, again = (mesher.mesh(given) for given in fresh)
+    assert len(mesh.faces), "there is no face"
+    assert np.isfinite(mesh.vertices).all(), "a vertex is not finite"
+    assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices), "a face names a vertex that is not there"
+    assert mesh.colors is None or mesh.colors.shape == mesh.vertices.shape, "colors are not one for each vertex"
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
+    nearest = centres[((a[:, None] - centres[None]) ** 2).sum(2).argmin(1)]
+    towards = np.einsum("ni,ni->n", np.cross(b - a, c - a), nearest - a)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    a, b, c = (again.vertices[again.faces[:, k]].astype(np.float64) for k in range(3))
+    other = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    assert abs(area.sum() - other.sum()) <= 1e-3 * area.sum(), "the same splats give another surface"
+    assert area[towards > 0].sum() > area[towards < 0].sum(), "most of the mesh faces away from the cameras"

@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.mesh.base import Subject
+from surfkit.core.registry import components
+from surfkit.mesh.base import Mesher, Subject
 from surfkit.mesh.delaunay import crossing, split
 from surfkit.mesh.tetra import Tetra, triangles, used
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
+from surfkit.testing import check_mesher
 
 RADIUS = 0.5
 
@@ -174,3 +176,12 @@ def test_points_in_a_plane_enclose_nothing():
     points = np.random.default_rng(2).normal(size=(50, 3)) * [1, 1, 0]
     tets, doubtful = crossing(points, np.ones(50, bool), np.arange(50) % 2 == 0, 1 << 30)
     assert tets.shape == (0, 4) and doubtful == 0
+
+
+@pytest.mark.parametrize("name", components(Mesher))
+def test_every_mesher_keeps_the_contract(name):
+    mesher = components(Mesher)[name]()
+    if name == "poisson":
+        pytest.importorskip("open3d", reason="mesh:poisson needs open3d")
+        mesher = replace(mesher, octree=5, points=5_000)
+    check_mesher(mesher, ball())

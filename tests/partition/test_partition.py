@@ -26,6 +26,7 @@ from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
+from surfkit.testing import check_partition
 
 WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), Balanced(6)]
 FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -285,5 +286,12 @@ def test_bad_settings_and_scenes():
     assert plan(away, QuantileGrid((1, 1)), PictureShare()).blocks[0].cameras == len(sight.views)
 
 
-def test_all_partitions_are_offered():
-    assert set(components(Partition)) >= {"contracted-grid", "quantile-grid", "balanced"}
+@pytest.mark.parametrize("name", components(Partition))
+def test_every_partition_keeps_the_contract(name):
+    check_partition(components(Partition)[name](), city())
+
+
+def test_a_partition_with_a_gap_is_found():
+    gap = Cells(FLAT, ((None, None, 0.0, None), (0.1, None, None, None)), (0, 1))
+    with pytest.raises(AssertionError, match="no owner"):
+        check_partition(Fixed(gap), city())
