@@ -69,7 +69,7 @@ def test_memory_keeps_blocks_waiting_but_never_all(tmp_path, monkeypatch):
 
 def test_leaving_stops_the_workers(tmp_path):
     """As Ctrl-C does: they get SIGINT, may save, and are waited for."""
-    code = "import time\nfrom pathlib import Path\nPath('began').touch()\ntry:\n    time.sleep(60)\n"
+    code = "import time\nfrom pathlib import Path\ntry:\n    Path('began').touch()\n    time.sleep(60)\n"
     code += "except KeyboardInterrupt:\n    Path('saved').touch()\n    raise SystemExit(130)"
     running = Pool(workers=1).run([job(tmp_path, 0, f"exec({code!r})")])
     began = time.monotonic()

@@ -40,7 +40,7 @@ def test_a_stopped_run(folder, capsys):
         "state": "stopped", "process": None, "stage": "pretrain", "step": 120, "steps": 400, "saved_step": 100,
         "steps_per_second": pytest.approx(4), "seconds_left": None, "points": 170, "loss": 0.75,
         "peak_memory_bytes": 10**9, "metrics": {"psnr": 20.5, "views": 2, "step": 80},
-        "warnings": ["the scene is odd"], "skipped": ["c.jpg"],
+        "warnings": ["the scene is odd"], "skipped": ["c.jpg"], "blocks": [],
     }  # fmt: skip
     assert main(["status", str(folder)]) == 3
     lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
