@@ -104,7 +104,7 @@ CITY = replace(
     tune=replace(
         COARSE.pretrain,
         losses=COARSE.pretrain.losses | {"normal": NormalConsistency(weight=0.0125, start=0, depth="median")},
-        # The paper ranks by the mean over all views, where a view that does not see a point counts as 0: what few views
+        # The paper ranks by the mean over all views, where one that does not see a point counts as 0: what few views
         # see goes first, the rim of a survey, and held-out views lost 0.7 to 1.2 dB at a ratio of 0.1. By the peak, none.
         prune=(Trim(ratio=0.025, score="peak"),),
         rates=RATES | {"means": Rate(6.4e-5, 6.4e-7), "scales": Rate(4e-3)},
