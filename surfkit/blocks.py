@@ -119,8 +119,8 @@ class Record:
     plan: Plan
 
 
-def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState]:
-    """The run with the state of all blocks together; what is done already is not done again.
+def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState, bool]:
+    """The run with the state of all blocks together, and whether it is new; what is done already is not done again.
 
     Args:
         site: Run, data and means.
@@ -135,13 +135,13 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     record = planned(site, coarse)
     state = merged(site, record)
     if state is not None:
-        return final, state
+        return final, state, False
     await_workers(site, record.plan)
     work(site, record.plan, hands)
     state = put_together(site, record.plan, coarse)
     checkpoint.save(final.checkpoint, state)
     emit(FileWritten(final.checkpoint, "merged blocks"))
-    return final, state
+    return final, state, True
 
 
 def planned(site: Site, coarse: StageState) -> Record:

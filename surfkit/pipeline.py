@@ -114,9 +114,8 @@ def run(
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
-                there = saved(replace(this, part="tune"), scene)
-                unfinished |= there is None or there.index < recipe.tune.steps
-                this, state = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+                this, state, fresh = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+                unfinished |= fresh
             if unfinished:
                 discard(this.metrics, this.cloud, this.mesh_record)
             elif this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -226,6 +227,14 @@ def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
     run(longer, data, tmp_path, Hands("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
+
+
+def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_path):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "blocks" / "001")
+    (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert same(tmp_path / "run", undisturbed)
 
 
 def test_tune_by_hand(undisturbed, tmp_path, capsys):
