@@ -25,7 +25,7 @@ from surfkit.core.events import FileWritten, StepDone, Warned, emit
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.folder import Run, say
+from surfkit.folder import Run, discard, say
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition import executor
 from surfkit.partition.base import Sight
@@ -119,8 +119,8 @@ class Record:
     plan: Plan
 
 
-def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState, bool]:
-    """The run with the state of all blocks together, and whether it is new; what is done already is not done again.
+def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState]:
+    """The run with the state of all blocks together; what is done already is not done again.
 
     Args:
         site: Run, data and means.
@@ -135,13 +135,14 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     record = planned(site, coarse)
     state = merged(site, record)
     if state is not None:
-        return final, state, False
+        return final, state
+    discard(final.metrics, final.cloud, final.mesh_record)
     await_workers(site, record.plan)
     work(site, record.plan, hands)
     state = put_together(site, record.plan, coarse)
     checkpoint.save(final.checkpoint, state)
     emit(FileWritten(final.checkpoint, "merged blocks"))
-    return final, state, True
+    return final, state
 
 
 def planned(site: Site, coarse: StageState) -> Record:

@@ -114,11 +114,8 @@ def run(
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
-                this, state, fresh = tuned(Site(this, scene, rasterizer, every, store), state, hands)
-                unfinished |= fresh
-            if unfinished:
-                discard(this.metrics, this.cloud, this.mesh_record)
-            elif this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
+                this, state = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+            if not unfinished and this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
                 return read_metrics(out)
             if not this.cloud.exists():
