@@ -18,7 +18,7 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks import Hands, Site, tuned
+from surfkit.blocks import Hands, tuned
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
@@ -35,6 +35,7 @@ from surfkit.scene.read import read
 from surfkit.scene.scene import View
 from surfkit.train import checkpoint
 from surfkit.train.material import Store
+from surfkit.tuning import Site
 
 
 def tuning(steps: int) -> dict[str, float]:

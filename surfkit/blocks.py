@@ -6,51 +6,38 @@ come to, and whoever comes back to it goes on from there.
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import torch
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
-from surfkit.core.events import FileWritten, StepDone, Warned, emit
-from surfkit.core.journal import kept
-from surfkit.core.lock import held
-from surfkit.core.registry import hookimpl, plugins
+from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.folder import Run, discard, say
-from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition import executor
-from surfkit.partition.base import Sight
 from surfkit.partition.executor import Executor, Inline
 from surfkit.partition.merge import Share, merge
 from surfkit.partition.picture import plan_picture
 from surfkit.partition.plan import Fewest, Plan, plan
-from surfkit.partition.state import read_state, write_state
-from surfkit.primitives.points import Columns, Points
-from surfkit.raster.api import Rasterizer
+from surfkit.partition.state import read_state, worked_on, write_state
+from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
-from surfkit.scene.scene import Scene
 from surfkit.train import checkpoint
-from surfkit.train.material import Store, read_ahead
-from surfkit.train.meter import Meter
+from surfkit.train.look import fresh_looks
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
+from surfkit.tuning import BUSY, Site, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
-ALIVE_S = 5.0
-"""Seconds between signs of life of a block."""
-PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
+PROGRAM_BYTES, POINT_BYTES, COARSE_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 700, 150
 """What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
-moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
+moments, gradients, records of the rasterizer), for each of the coarse model, and for each pixel of a photograph."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
 
@@ -72,38 +59,6 @@ class Unfinished(Fault):
     """Some blocks are not tuned; the others are, and stay so."""
 
     status = 3
-
-
-@dataclass(frozen=True)
-class Site:
-    """Where blocks are worked on.
-
-    Attributes:
-        this: The run.
-        scene: Its data.
-        rasterizer: What draws.
-        every: When a block writes what.
-        store: Where its photographs are kept at hand.
-    """
-
-    this: Run
-    scene: Scene
-    rasterizer: Rasterizer
-    every: Every
-    store: Store
-
-    @property
-    def folder(self) -> Path:
-        """Of all blocks."""
-        return self.this.out / "blocks"
-
-    def place(self, index: int) -> Path:
-        """The folder of one block."""
-        return self.folder / f"{index:03}"
-
-    def block(self, index: int) -> Run:
-        """One block as a run of its own."""
-        return Run(self.place(index), self.this.recipe, self.this.data, "tune")
 
 
 @dataclass(frozen=True)
@@ -137,9 +92,10 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     if state is not None:
         return final, state
     discard(final.metrics, final.cloud, final.mesh_record)
-    await_workers(site, record.plan)
-    work(site, record.plan, hands)
-    state = put_together(site, record.plan, coarse)
+    while state is None:
+        await_workers(site, record.plan)
+        work(site, record.plan, hands)
+        state = put_together(site, record.plan, coarse)
     checkpoint.save(final.checkpoint, state)
     emit(FileWritten(final.checkpoint, "merged blocks"))
     return final, state
@@ -150,8 +106,14 @@ def planned(site: Site, coarse: StageState) -> Record:
     path = site.folder / "plan.json"
     if path.exists():
         record = read_json(path, Record)
+        known = {view.name for view in site.scene.train}
+        if unknown := {name for block in record.plan.blocks for name in block.views} - known:
+            raise BadInput(
+                f"{path}: names a view that is not there, {min(unknown)}; delete {site.folder} to plan again"
+            )
         if record.coarse_steps == coarse.index:
             return record
+        await_workers(site, record.plan)
         aside = site.this.out / "blocks-before"
         shutil.rmtree(aside, ignore_errors=True)
         os.replace(site.folder, aside)
@@ -171,14 +133,6 @@ def planned(site: Site, coarse: StageState) -> Record:
             f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
         )
     return made
-
-
-def sight_of(site: Site, coarse: StageState) -> Sight:
-    """The coarse model, to be looked at."""
-    stage = site.this.recipe.pretrain
-    splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
-    splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})
-    return Sight(splats, site.scene.train, site.rasterizer, stage.near)
 
 
 def merged(site: Site, record: Record) -> StageState | None:
@@ -208,7 +162,7 @@ def left(site: Site, blocks: Plan) -> list[int]:
 def await_workers(site: Site, blocks: Plan) -> None:
     """Wait for workers of an earlier driver, which stop when they notice that it is gone."""
     until = time.monotonic() + LEAVE_S
-    while busy := [block.index for block in blocks.blocks if read_state(site.place(block.index)).running_now()]:
+    while busy := [block.index for block in blocks.blocks if worked_on(site.place(block.index))]:
         if time.monotonic() > until:
             raise BadInput(f"{site.place(busy[0])}: block {busy[0]} is being worked on; wait for its end, or stop it")
         time.sleep(0.2)
@@ -229,8 +183,6 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
             if ended.status == 0:
                 say(f"block {index} is done")
                 continue
-            if ended.status == 130:
-                raise KeyboardInterrupt
             reason = told(site, index, ended.status)
             again = ended.status not in (1, 2) and attempts[index] < ATTEMPTS
             emit(Warned(f"block {index} {reason}" + ("; it is tried again" if again else "")))
@@ -248,11 +200,13 @@ def told(site: Site, index: int, status: int) -> str:
     state = read_state(site.place(index))
     if status < 0:
         name = signal.Signals(-status).name
-        write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}", pid=None)
+        write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}")
         return f"was ended by {name}"
+    if status == BUSY:
+        return "is worked on by another process"
     if state.status != "failed":
         log = site.place(index) / executor.LOG
-        write_state(site.place(index), status="failed", kind="crash", error=f"exit status {status}", pid=None)
+        write_state(site.place(index), status="failed", kind="crash", error=f"exit status {status}")
         return f"ended with status {status}; see {log}"
     return f"failed: {state.error}"
 
@@ -273,85 +227,56 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         call=lambda: guarded(site, blocks, index),
         command=tuple(command),
         cost=block.work,
-        memory_bytes=PROGRAM_BYTES + growth * POINT_BYTES * block.points + PIXEL_BYTES * pixels + min(share, photos),
+        memory_bytes=PROGRAM_BYTES
+        + growth * POINT_BYTES * block.points
+        + COARSE_BYTES * sum(other.points for other in blocks.blocks)
+        + PIXEL_BYTES * pixels
+        + min(share, photos),
     )
 
 
-def guarded(site: Site, blocks: Plan, index: int) -> int:
-    """Tune a block and return an exit status; what goes wrong is in its state."""
-    folder = site.place(index)
-    try:
-        tune(site, blocks, index)
-    except (BadInput, Fault) as error:
-        kind = "data" if isinstance(error, BadInput) else "numbers"
-        write_state(folder, status="failed", kind=kind, error=" ".join(str(error).split()), pid=None)
-        return 2 if isinstance(error, BadInput) else 1
-    except KeyboardInterrupt:
-        write_state(folder, status="failed", kind="interrupted", error="interrupted", pid=None)
-        return 130
-    except BaseException as error:
-        write_state(folder, status="failed", kind="crash", error=f"{type(error).__name__}: {error}", pid=None)
-        raise
-    return 0
+def put_together(site: Site, blocks: Plan, coarse: StageState) -> StageState | None:
+    """All blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
 
-
-def tune(site: Site, blocks: Plan, index: int) -> None:
-    """Tune one block in this process, from where it stands to its end."""
-    block = site.block(index)
-    wanted = set(blocks.blocks[index].views)
-    views = tuple(view for view in site.scene.train if view.name in wanted)
-    scene = replace(site.scene, train=views, held_out=())
-    steps, folder = block.stage.steps, block.out
-    with held(folder), kept(folder), signs(folder):
-        state = saved(block, scene, repair=True)
-        write_state(folder, status="running", step=state.index if state else 0, steps=steps, error=None, kind=None)
-        if state is None or state.index < steps:
-            given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
-            start = lambda: surroundings(site, blocks, index, views)  # noqa: E731
-            every = replace(site.every, pictures=0)
-            state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
-        write_state(folder, status="done", step=state.index, steps=steps, pid=None)
-
-
-def surroundings(site: Site, blocks: Plan, index: int, views: Sequence[Any]) -> Columns:
-    """The points that a block owns, and those that its views show, as they are in the coarse model.
-
-    The latter are drawn and tuned with the block, so that it need not explain what others own; they are not merged.
+    None if a result is not what its state says; that block is planned again.
     """
-    found = checkpoint.load_last(replace(site.this, part="pretrain").checkpoint)
-    assert found is not None
-    coarse = found[0]
-    params = site.this.recipe.pretrain.finished(coarse)
-    wanted = blocks.cells.owner(params["means"]) == index
-    sight = sight_of(site, coarse)
-    for view in views:
-        wanted |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
-    return {name: value[wanted].clone() for name, value in params.items()}
-
-
-def put_together(site: Site, blocks: Plan, coarse: StageState) -> StageState:
-    """All blocks as one state, each point from its owner; where nothing was tuned, from the coarse model."""
     recipe = site.this.recipe
     tune_stage, params = recipe.tune, recipe.pretrain.finished(coarse)
     skipped = frozenset(block.index for block in blocks.blocks if not block.views)
-    states, results = [], {}
-    for block in blocks.blocks:
-        if block.index in skipped:
-            continue
-        found = checkpoint.load_last(site.block(block.index).checkpoint)
-        if found is None:
-            raise BadInput(f"{site.place(block.index)}: no result, though it should be done; delete that folder")
-        states.append(found[0])
-        results[block.index] = tune_stage.finished(found[0])
+    states: dict[int, StageState] = {}
+    for index in range(len(blocks.blocks)):
+        if index not in skipped and (state := sound(site, index)) is not None:
+            states[index] = state
+    if len(states) + len(skipped) < len(blocks.blocks):
+        return None
+    results = {index: tune_stage.finished(state) for index, state in states.items()}
     whole, shares = merge(blocks.cells, params, results, skipped)
     note(site, shares)
     state = StageState(Points.fresh(whole), Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed))
     state.index = tune_stage.steps
-    state.seconds = coarse.seconds + sum(part.seconds for part in states)
-    state.cpu_seconds = coarse.cpu_seconds + sum(part.cpu_seconds for part in states)
-    state.peak_memory_bytes = max(part.peak_memory_bytes for part in (coarse, *states))
-    state.sh_degree = max(part.sh_degree for part in (coarse, *states))
+    state.seconds = coarse.seconds + sum(part.seconds for part in states.values())
+    state.cpu_seconds = coarse.cpu_seconds + sum(part.cpu_seconds for part in states.values())
+    state.peak_memory_bytes = max(part.peak_memory_bytes for part in (coarse, *states.values()))
+    state.sh_degree = max(part.sh_degree for part in (coarse, *states.values()))
+    if tune_stage.appearance is not None:  # the blocks' own are folded into their colours
+        state.looks = fresh_looks(tune_stage.appearance, len(site.scene.train))
     return state
+
+
+def sound(site: Site, index: int) -> StageState | None:
+    """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
+    path, steps = site.block(index).checkpoint, site.this.recipe.tune.steps
+    try:
+        found = checkpoint.load_last(path)
+    except BadInput as error:
+        emit(Warned(f"block {index} is tuned from its beginning again: {error}"))
+        checkpoint.discard(path)
+        found = None
+    if found is not None and found[0].index >= steps:
+        return found[0]
+    emit(Warned(f"block {index} has lost steps: its checkpoint is of {found[0].index if found else 0}, not of {steps}"))
+    write_state(site.place(index), status="planned", step=found[0].index if found else 0)
+    return None
 
 
 def note(site: Site, shares: Sequence[Share]) -> None:
@@ -359,35 +284,3 @@ def note(site: Site, shares: Sequence[Share]) -> None:
     write_json(site.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
     if filled := [str(share.index) for share in shares if share.filled]:
         emit(Warned(f"blocks {', '.join(filled)} have no views, and are as they were in the coarse model"))
-
-
-@contextmanager
-def signs(folder: Path) -> Iterator[None]:
-    """Within, steps become signs of life of a block; and a worker whose driver is gone stops as if it were asked to."""
-    watch = Watch(folder)
-    plugins().register(watch, f"signs of {folder}")
-    try:
-        yield
-    finally:
-        plugins().unregister(watch)
-
-
-class Watch:
-    """Writes where a block stands, every few seconds."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.parent = os.getppid()
-        self.next = -math.inf
-
-    @hookimpl
-    def surfkit_event(self, event: Any) -> None:
-        """See one event."""
-        if not isinstance(event, StepDone):
-            return
-        if os.getppid() != self.parent:
-            self.parent = os.getppid()
-            os.kill(os.getpid(), signal.SIGTERM)
-        if time.monotonic() >= self.next:
-            self.next = time.monotonic() + ALIVE_S
-            write_state(self.folder, step=event.index)

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from surfkit.blocks import Hands, Site, tuned
+from surfkit.blocks import Hands, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit
@@ -49,11 +49,13 @@ from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.surface import Delivery, deliver, meshed, subject
+from surfkit.train import checkpoint
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
+from surfkit.tuning import Site
 
 AHEAD = 8
 """Photographs in memory while held-out ones are measured: each is needed once."""
@@ -97,7 +99,7 @@ def run(
     refuse_file(out)
     store.bytes()  # or BadInput, before anything is done
     with noted() as notes, held(out), in_one_line(out), bars():
-        sweep(out)
+        sweep(out, out / "blocks")
         refuse_other(this)
         scene = read(this.data)
         meter.scene_read()
@@ -111,6 +113,7 @@ def run(
         with kept(out):
             if given is not None:
                 discard(this.metrics, this.cloud, this.mesh_record)
+                checkpoint.discard(replace(this, part="tune").checkpoint)
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
@@ -215,9 +218,10 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     """
     this = opened(out)
     scene = read(this.data)
-    if this.recipe.partition is not None:
-        this = replace(this, part="tune")
     state = saved(this, scene)
+    if this.recipe.partition is not None and state is not None and state.index >= this.stage.steps:
+        this = replace(this, part="tune")
+        state = saved(this, scene)
     steps = this.stage.steps
     if state is None and this.part == "tune":
         raise BadInput(f"{out}: not all blocks are tuned; give its surfkit train command again to finish it")

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit import blocks
+from surfkit import blocks, pipeline, tuning
+from surfkit.appearance.exposure import Exposure
 from surfkit.blocks import Hands, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
@@ -113,7 +114,7 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
     def stopped(site, plan, index):
         if index == 1:
             site = replace(site, every=Every(checkpoint=4, pictures=0))
-            monkeypatch.setattr(blocks, "optimise", stop_after(blocks.optimise, 6))
+            monkeypatch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
         return guarded(site, plan, index)
 
     with monkeypatch.context() as patch:
@@ -177,7 +178,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
 
 
 def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, tmp_path, capsys):
-    optimise = blocks.optimise
+    optimise = tuning.optimise
 
     def failing(job, state):
         if job.this.out.name == "001":
@@ -185,7 +186,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
         return optimise(job, state)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(blocks, "optimise", failing)
+        patch.setattr(tuning, "optimise", failing)
         with pytest.raises(Unfinished, match="block 1 failed: numbers are not finite; the others are done") as told:
             run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert told.value.status == 3
@@ -235,6 +236,67 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
     run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed)
+
+
+def test_a_damaged_result_is_not_merged(undisturbed, data, recipe, tmp_path):
+    """The merged model is gone and a last checkpoint damaged: the block goes on from the one before, to the same bits."""
+    shutil.copytree(undisturbed, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "tune")
+    path = tmp_path / "run" / "blocks" / "000" / "tune" / "checkpoint.safetensors"
+    content = path.read_bytes()
+    path.write_bytes(content[:-8] + b"damaged!")
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert same(tmp_path / "run", undisturbed)
+    assert "block 0 has lost steps" in (tmp_path / "run" / "run.json").read_text()
+
+
+def test_a_longer_coarse_stage_makes_the_old_result_void(undisturbed, data, recipe, tmp_path, monkeypatch):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 8))
+    monkeypatch.setattr(pipeline, "optimise", stop_after(pipeline.optimise, STEPS + 3))
+    with pytest.raises(KeyboardInterrupt):
+        run(longer, data, tmp_path / "run", Hands("cpu"), EVERY)
+    with pytest.raises(BadInput, match=f"stopped after step {STEPS + 3} of {STEPS + 8}"):
+        load_run(tmp_path / "run")
+
+
+def test_exposures_of_blocks_are_folded(data, recipe, tmp_path):
+    tune = replace(recipe.tune, appearance=Exposure())
+    metrics = run(replace(recipe, tune=tune), data, tmp_path, Hands("cpu"), EVERY)
+    assert metrics["images"]["psnr_corrected"] > 8 and load_run(tmp_path)[1].looks
+
+
+def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    folder = tmp_path / "run" / "blocks" / "000"
+    before = (folder / "state.json").read_bytes()
+    holding = "import sys, time\nfrom pathlib import Path\nfrom surfkit.core.lock import held\n"
+    holding += f"with held(Path({str(folder)!r})):\n    print('held', flush=True)\n    time.sleep(60)"
+    other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
+    try:
+        assert other.stdout.readline() == b"held\n"
+        assert main(["tune", str(tmp_path / "run"), "0"]) == tuning.BUSY
+    finally:
+        other.kill()
+        other.wait()
+    assert "works in it" in capsys.readouterr().err and (folder / "state.json").read_bytes() == before
+
+
+def test_a_plan_that_cannot_be(undisturbed, data, recipe, tmp_path):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    path = tmp_path / "run" / "blocks" / "plan.json"
+    sound = json.loads(path.read_text())
+    for spoil in (
+        lambda plan: plan["cells"].update(blocks=[0]),
+        lambda plan: plan["cells"].update(blocks=[0, 0]),
+        lambda plan: plan["blocks"].reverse(),
+        lambda plan: plan["blocks"][0].update(views=["nowhere.png"]),
+    ):
+        record = json.loads(json.dumps(sound))
+        spoil(record["plan"])
+        path.write_text(json.dumps(record))
+        with pytest.raises(BadInput, match="plan"):
+            run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
 
 
 def test_tune_by_hand(undisturbed, tmp_path, capsys):

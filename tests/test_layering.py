@@ -17,6 +17,7 @@ FLOORS = (
     "recipe",
     "folder",
     "optimise",
+    "tuning",
     "blocks",
     "surface",
     "pipeline",

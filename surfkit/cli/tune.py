@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.blocks import Record, Site, guarded
+from surfkit.blocks import Record
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.folder import noted
@@ -19,6 +19,7 @@ from surfkit.scene.read import read
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store
+from surfkit.tuning import Site, guarded
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,11 @@ class Tune:
         this, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
         if not path.exists():
             raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
-        plan = read_json(path, Record).plan
+        record = read_json(path, Record)
+        plan, steps = record.plan, this.recipe.pretrain.steps
+        if record.coarse_steps != steps:
+            told = f"{path} is for a coarse model of {record.coarse_steps} steps, not {steps}"
+            raise BadInput(f"{told}; give the surfkit train command again")
         if not 0 <= self.block < len(plan.blocks):
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:

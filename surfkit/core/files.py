@@ -39,8 +39,9 @@ def sync_folder(folder: Path) -> None:
             os.close(here)
 
 
-def sweep(folder: Path) -> None:
-    """Delete what dead processes left unfinished in a folder that no other process works in."""
+def sweep(folder: Path, but: Path | None = None) -> None:
+    """Delete what dead processes left unfinished in a folder that no other process works in, `but` for one inside."""
     for pattern in UNFINISHED:
         for path in folder.rglob(pattern):
-            path.unlink(missing_ok=True)
+            if but is None or not path.is_relative_to(but):
+                path.unlink(missing_ok=True)

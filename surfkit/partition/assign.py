@@ -12,7 +12,6 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.registry import Component
 from surfkit.partition.base import Sight
-from surfkit.raster.api import Splats
 from surfkit.raster.ssim import ssim
 
 
@@ -47,11 +46,11 @@ class SSIMDifference(Assign):
     def measure(self, sight: Sight, owner: Tensor, count: int) -> Tensor:
         """Draw each view once whole, and once without each block of which it shows anything."""
         difference = torch.zeros(len(sight.views), count)
-        without = [rows(sight.splats, owner != block) for block in range(count)]
         for at, view in enumerate(sight.views):
             whole = sight.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False)
             for block in owner[whole.seen].unique().tolist():
-                rest = sight.rasterizer.render(without[block], view.camera, sight.near, geometry=False)
+                without = replace(sight.splats, opacities=sight.splats.opacities * (owner != block))
+                rest = sight.rasterizer.render(without, view.camera, sight.near, geometry=False)
                 difference[at, block] = 1 - ssim(rest.maps.color, whole.maps.color)
             emit(Progress("assigning views", at + 1, len(sight.views)))
         return difference
@@ -79,11 +78,6 @@ class PictureShare(Assign):
             share[at].index_add_(0, owner, sight.share(at).float())
             emit(Progress("assigning views", at + 1, len(sight.views)))
         return share
-
-
-def rows(splats: Splats, kept: Tensor) -> Splats:
-    """Some of the splats."""
-    return replace(splats, **{name: value[kept] for name, value in splats.tensors().items()})
 
 
 def _check(threshold: float, name: str) -> None:

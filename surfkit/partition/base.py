@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.scene import View
@@ -99,6 +100,12 @@ class Cells:
     boxes: tuple[Box, ...]
     blocks: tuple[int, ...]
     contraction: Contraction | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.boxes) != len(self.blocks) or sorted(set(self.blocks)) != list(range(len(set(self.blocks)))):
+            raise BadInput(f"cells: {len(self.boxes)} boxes of blocks {self.blocks}; each needs one, counted from 0")
+        if not self.boxes:
+            raise BadInput("cells: there are none")
 
     @property
     def count(self) -> int:

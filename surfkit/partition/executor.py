@@ -6,18 +6,23 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.scene.memory import free_bytes
 
 POLL_S = 0.2
+DRIVER = "SURFKIT_DRIVER"
+"""Names the process that a worker works for; without it, the worker stops."""
+INTERRUPTED = 130
 LOG = "log.txt"
 """What a worker process prints, in the folder of its block."""
 
@@ -85,7 +90,10 @@ class Inline(Executor):
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""
         for job in jobs:
-            yield Ended(job, job.call())
+            status = job.call()
+            if status == INTERRUPTED:
+                raise KeyboardInterrupt
+            yield Ended(job, status)
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,7 @@ class Pool(Executor):
         waiting = sorted(jobs, key=lambda job: (-job.cost, job.index))
         crew = Crew(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
         room = self.memory_share * free_bytes()
+        before = terminating()
         try:
             while waiting or crew.busy:
                 while waiting and len(crew.busy) < self.workers:
@@ -129,6 +138,15 @@ class Pool(Executor):
                 time.sleep(POLL_S)
         finally:
             crew.stop()
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
+
+
+def terminating() -> Any:
+    """Let SIGTERM act as Ctrl-C, so that workers save their states; the handler before, or None if it stays."""
+    if threading.current_thread() is not threading.main_thread():
+        return None
+    return signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @dataclass
@@ -146,11 +164,13 @@ class Crew:
     def begin(self, job: Job) -> None:
         """Start a process; it gets no Ctrl-C of its own, but is told by `stop`."""
         job.folder.mkdir(parents=True, exist_ok=True)
-        limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} | {
+            DRIVER: str(os.getpid())
+        }
         with open(job.folder / LOG, "ab") as log:
             process = subprocess.Popen(
                 [sys.executable, *job.command],
-                env=os.environ | limits,
+                env=os.environ | limits | {DRIVER: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

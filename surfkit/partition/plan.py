@@ -45,6 +45,10 @@ class Plan:
     cells: Cells
     blocks: tuple[Block, ...]
 
+    def __post_init__(self) -> None:
+        if [block.index for block in self.blocks] != list(range(self.cells.count)):
+            raise BadInput(f"plan: {len(self.blocks)} blocks for {self.cells.count} in the cells, or out of order")
+
 
 @dataclass(frozen=True)
 class Fewest:

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Literal
 
 from surfkit.core.codec import read_json, write_json
+from surfkit.core.lock import holder
 
 Status = Literal["planned", "running", "done", "failed"]
-Kind = Literal["data", "numbers", "memory", "disk", "crash", "interrupted"]
+Kind = Literal["data", "fault", "crash", "interrupted"]
 
 STALE_S = 120.0
 """Seconds without a sign of life after which a block of another machine counts as abandoned."""
@@ -44,19 +45,12 @@ class BlockState:
     pid: int | None = None
     heard: float = 0.0
 
-    def running_now(self) -> bool:
-        """Whether somebody works on it: the process is alive, or on another machine it was heard of lately."""
-        if self.status != "running" or self.pid is None:
-            return False
-        if self.host != platform.node():
-            return time.time() - self.heard < STALE_S
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return False
-        except PermissionError:
-            return True
-        return True
+
+def worked_on(folder: Path) -> bool:
+    """Whether some process works on the block in a folder: it holds the lock, or was heard of lately elsewhere."""
+    state = read_state(folder)
+    elsewhere = state.status == "running" and state.host != platform.node() and time.time() - state.heard < STALE_S
+    return elsewhere or holder(folder) is not None
 
 
 def state_path(folder: Path) -> Path:

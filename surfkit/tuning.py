@@ -1,0 +1,199 @@
+"""One block of a large scene, tuned in this process."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.check import BadInput, Fault
+from surfkit.core.events import StepDone
+from surfkit.core.files import sweep
+from surfkit.core.journal import kept
+from surfkit.core.lock import held
+from surfkit.core.registry import hookimpl, plugins
+from surfkit.folder import Run, say
+from surfkit.optimise import Every, Job, optimise, saved
+from surfkit.partition.base import Sight
+from surfkit.partition.executor import DRIVER
+from surfkit.partition.plan import Plan
+from surfkit.partition.state import read_state, write_state
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Rasterizer
+from surfkit.scene.scene import Scene, View
+from surfkit.train import checkpoint
+from surfkit.train.material import Store, read_ahead
+from surfkit.train.meter import Meter
+from surfkit.train.stage import StageState
+
+ALIVE_S = 5.0
+"""Seconds between signs of life of a block."""
+CRASHED, BUSY, INTERRUPTED = 70, 75, 130
+"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, and a block that another works on."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where blocks are worked on.
+
+    Attributes:
+        this: The run.
+        scene: Its data.
+        rasterizer: What draws.
+        every: When a block writes what.
+        store: Where its photographs are kept at hand.
+    """
+
+    this: Run
+    scene: Scene
+    rasterizer: Rasterizer
+    every: Every
+    store: Store
+
+    @property
+    def folder(self) -> Path:
+        """Of all blocks."""
+        return self.this.out / "blocks"
+
+    def place(self, index: int) -> Path:
+        """The folder of one block."""
+        return self.folder / f"{index:03}"
+
+    def block(self, index: int) -> Run:
+        """One block as a run of its own."""
+        return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+
+
+def guarded(site: Site, blocks: Plan, index: int) -> int:
+    """Tune a block and return an exit status; what goes wrong is told, and is in the block's state."""
+    folder = site.place(index)
+    try:
+        with held(folder):
+            return _begun(site, blocks, index)
+    except BadInput as error:  # another process works there, and the state is its
+        say(f"block {index}: {error}")
+        return BUSY
+
+
+def _begun(site: Site, blocks: Plan, index: int) -> int:
+    folder = site.place(index)
+    sweep(folder)
+    try:
+        with kept(folder), signs(folder):
+            tune(site, blocks, index)
+    except (BadInput, Fault) as error:
+        reason = " ".join(str(error).split())
+        say(f"block {index}: {reason}")
+        write_state(folder, status="failed", kind="data" if isinstance(error, BadInput) else "fault", error=reason)
+        return 2 if isinstance(error, BadInput) else 1
+    except KeyboardInterrupt:
+        write_state(folder, status="failed", kind="interrupted", error="interrupted")
+        return INTERRUPTED
+    except Exception as error:
+        traceback.print_exc()
+        write_state(folder, status="failed", kind="crash", error=f"{type(error).__name__}: {error}")
+        return CRASHED
+    return 0
+
+
+def tune(site: Site, blocks: Plan, index: int) -> None:
+    """Tune one block from where it stands to its end."""
+    block = site.block(index)
+    wanted = set(blocks.blocks[index].views)
+    views = tuple(view for view in site.scene.train if view.name in wanted)
+    scene = replace(site.scene, train=views, held_out=())
+    steps, folder = block.stage.steps, block.out
+    state = saved(block, scene, repair=True)
+    begun = read_state(folder).attempts + 1
+    done = state.index if state else 0
+    write_state(folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None)
+    if state is None or state.index < steps:
+        given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
+        every = replace(site.every, pictures=0)
+        start = Start(site, blocks, index, views)
+        state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
+    write_state(folder, status="done", step=state.index, steps=steps)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a block begins: with the points that it owns, and those that its views show, of the coarse model.
+
+    The latter are drawn and tuned with the block, so that it need not explain what others own; they are not merged.
+    """
+
+    site: Site
+    blocks: Plan
+    index: int
+    views: Sequence[View]
+
+    def __call__(self) -> Columns:
+        """Their raw parameters."""
+        site = self.site
+        found = checkpoint.load_last(replace(site.this, part="pretrain").checkpoint)
+        if found is None:
+            raise BadInput(f"{site.this.out}: the coarse model is gone; give its surfkit train command again")
+        coarse = found[0]
+        params = site.this.recipe.pretrain.finished(coarse)
+        wanted = self.blocks.cells.owner(params["means"]) == self.index
+        sight = sight_of(site, coarse)
+        for view in self.views:
+            wanted |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+        return {name: value[wanted].clone() for name, value in params.items()}
+
+
+def sight_of(site: Site, coarse: StageState) -> Sight:
+    """The coarse model, to be looked at."""
+    stage = site.this.recipe.pretrain
+    splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
+    splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})
+    return Sight(splats, site.scene.train, site.rasterizer, stage.near)
+
+
+@contextmanager
+def signs(folder: Path) -> Iterator[None]:
+    """Within, steps become signs of life of a block; a worker whose driver is gone stops as if it were asked to.
+
+    Raises:
+        KeyboardInterrupt: The driver is gone already.
+    """
+    watch = Watch(folder)
+    if watch.alone():
+        raise KeyboardInterrupt
+    plugins().register(watch, f"signs of {folder}")
+    try:
+        yield
+    finally:
+        plugins().unregister(watch)
+
+
+class Watch:
+    """Writes where a block stands, every few seconds."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.driver = int(os.environ.get(DRIVER, 0))
+        self.next = -math.inf
+
+    def alone(self) -> bool:
+        """Whether a driver began this process and is gone."""
+        return self.driver not in (0, os.getppid())
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if not isinstance(event, StepDone):
+            return
+        if self.alone():
+            self.driver = 0
+            os.kill(os.getpid(), signal.SIGTERM)
+        if time.monotonic() >= self.next:
+            self.next = time.monotonic() + ALIVE_S
+            write_state(self.folder, status="running", step=event.index)
