@@ -239,7 +239,7 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
 
 
 def test_a_damaged_result_is_not_merged(undisturbed, data, recipe, tmp_path):
-    """The merged model is gone and a last checkpoint damaged: the block goes on from the one before, to the same bits."""
+    """The merged model is gone, a checkpoint damaged: the block goes on from the one before, to the same bits."""
     shutil.copytree(undisturbed, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "tune")
     path = tmp_path / "run" / "blocks" / "000" / "tune" / "checkpoint.safetensors"
