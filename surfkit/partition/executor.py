@@ -184,10 +184,13 @@ class Crew:
         return [Ended(self.busy.pop(process), process.returncode) for process in over]
 
     def stop(self) -> None:
-        """Ask every process to save its state and end, and wait until they have."""
+        """Ask every process to save its state and end, and wait until they have.
+
+        By SIGTERM: SIGINT is ignored by what a shell has started in the background.
+        """
         for process in self.busy:
             with suppress(ProcessLookupError):
-                process.send_signal(signal.SIGINT)
+                process.terminate()
         for process in self.busy:
             process.wait()
         self.busy.clear()

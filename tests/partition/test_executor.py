@@ -66,9 +66,10 @@ def test_memory_keeps_blocks_waiting_but_never_all(tmp_path, monkeypatch):
 
 
 def test_leaving_stops_the_workers(tmp_path):
-    """As Ctrl-C does: they get SIGINT, may save, and are waited for."""
-    code = "import time\nfrom pathlib import Path\ntry:\n    Path('began').touch()\n    time.sleep(60)\n"
-    code += "except KeyboardInterrupt:\n    Path('saved').touch()\n    raise SystemExit(130)"
+    """As Ctrl-C does: they get SIGTERM, may save, and are waited for."""
+    code = "import signal, sys, time\nfrom pathlib import Path\n"
+    code += "def save(*_):\n    Path('saved').touch()\n    sys.exit(130)\n"
+    code += "signal.signal(signal.SIGTERM, save)\nPath('began').touch()\ntime.sleep(60)\n"
     running = Pool(workers=1).run([job(tmp_path, 0, f"exec({code!r})")])
     began = time.monotonic()
     executor_poll = executor.POLL_S
