@@ -93,7 +93,7 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
         return final, state
     discard(final.metrics, final.cloud, final.mesh_record)
     while state is None:
-        await_workers(site, record.plan)
+        await_workers(site)
         work(site, record.plan, hands)
         state = put_together(site, record.plan, coarse)
     checkpoint.save(final.checkpoint, state)
@@ -113,12 +113,13 @@ def planned(site: Site, coarse: StageState) -> Record:
             )
         if record.coarse_steps == coarse.index:
             return record
-        await_workers(site, record.plan)
+    if site.folders():  # of another coarse model, or of a plan that is gone
+        await_workers(site)
         aside = site.this.out / "blocks-before"
         shutil.rmtree(aside, ignore_errors=True)
         os.replace(site.folder, aside)
         checkpoint.discard(replace(site.this, part="tune").checkpoint)
-        emit(Warned(f"the coarse model has changed, so all blocks are tuned anew; the ones before are in {aside}"))
+        emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
     recipe = site.this.recipe
     sight = sight_of(site, coarse)
     made = Record(coarse.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
@@ -159,12 +160,12 @@ def left(site: Site, blocks: Plan) -> list[int]:
     return found
 
 
-def await_workers(site: Site, blocks: Plan) -> None:
+def await_workers(site: Site) -> None:
     """Wait for workers of an earlier driver, which stop when they notice that it is gone."""
     until = time.monotonic() + LEAVE_S
-    while busy := [block.index for block in blocks.blocks if worked_on(site.place(block.index))]:
+    while busy := [folder for folder in site.folders() if worked_on(folder)]:
         if time.monotonic() > until:
-            raise BadInput(f"{site.place(busy[0])}: block {busy[0]} is being worked on; wait for its end, or stop it")
+            raise BadInput(f"{busy[0]}: the block is being worked on; wait for its end, or stop it")
         time.sleep(0.2)
 
 

@@ -34,13 +34,13 @@ class Recipe:
     """How the scene is cut into blocks that are tuned apart, after pretraining; none leaves it whole."""
 
     assign: Annotated[Assign, choice(Assign)] = SSIMDifference()
-    """Which views a block is tuned on."""
+    """Which views a block is tuned on, where the scene is cut."""
 
     min_views: Annotated[int, tyro.conf.arg(name="min-views")] = 50
     """A block with fewer views is joined to a neighbour; in a small scene a quarter of an even share is enough."""
 
     tune: Stage = field(default_factory=Stage)
-    """Optimisation of each block."""
+    """Optimisation of each block, where the scene is cut."""
 
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""

@@ -66,6 +66,10 @@ class Site:
         """The folder of one block."""
         return self.folder / f"{index:03}"
 
+    def folders(self) -> list[Path]:
+        """Those of the blocks that somebody has begun."""
+        return sorted(self.folder.glob("[0-9]*"))
+
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
         return Run(self.place(index), self.this.recipe, self.this.data, "tune")

@@ -299,6 +299,17 @@ def test_a_plan_that_cannot_be(undisturbed, data, recipe, tmp_path):
             run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
 
 
+def test_blocks_of_a_plan_that_is_gone_are_put_aside(undisturbed, data, recipe, tmp_path):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    (tmp_path / "run" / "blocks" / "plan.json").unlink()
+    longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 4))
+    run(longer, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert (tmp_path / "run" / "blocks-before" / "000").is_dir()
+    began = (tmp_path / "run" / "blocks" / "000" / "events.jsonl").read_text().splitlines()
+    assert sum('"StepDone"' in line for line in began) == STEPS, "from the first step, not on top of the old ones"
+    assert read_state(tmp_path / "run" / "blocks" / "000").attempts == 1
+
+
 def test_tune_by_hand(undisturbed, tmp_path, capsys):
     assert main(["tune", str(undisturbed), "0"]) == 0  # it is done
     assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
