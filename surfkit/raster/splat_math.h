@@ -191,7 +191,6 @@ struct SplatGrad {
     R scale[3]{0, 0, 0};
     R opacity = 0;
     R signal[2]{0, 0};
-    R chosen[2]{0, 0};
 };
 
 // The region of the image in which alpha >= kAlphaMin: an ellipse about (mx, my) with the matrix (hxx, hxy, hyy), and a
@@ -323,19 +322,18 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     return true;
 }
 
-// How the sums over pixels (or the share of one pixel) become the screen-space gradient, in both directions.
+// How what one pixel hands back becomes its share of the screen-space gradient, in both directions: factors of q0 Y
+// (q0 X for y), q0, q1 Y (q1 X), q1, dL/d(det), and, outside the disc, dL/d(rho / 2) times the offset from the low-pass
+// centre. X, Y about the anchor, q the cotangents of p = X a + Y b + c.
 template <class R>
 struct SignalRow {
     R x[6], y[6];
 };
-
-// Factors of the sums of: q0 Y (q0 X for y), q0, q1 Y (q1 X), q1, dL/d(det), dL/d(low-pass centre); X, Y about the
-// anchor, q the cotangents of p = X a + Y b + c.
 template <class R>
 SPLAT_FN SignalRow<R> surfel_signal(const CameraModel<R>& cam, const Surfel<R>& o) {
     const Vec<R> w = o.h.w, u = o.h.u - o.ax * w, v = o.h.v - o.ay * w;
     const R half_w = w.z * R(0.5) * R(cam.width), half_h = w.z * R(0.5) * R(cam.height);
-    const R fx = half_w / o.unit, fy = half_h / o.unit, low = o.low.f.z * w.z;
+    const R fx = half_w / o.unit, fy = half_h / o.unit, low = R(-2) * o.low.f.z * w.z;
     return {{fx * w.y, -fx * v.y, -fx * w.x, fx * v.x, fx * (v.x * w.y - v.y * w.x), half_w * low},
             {-fy * w.y, fy * u.y, fy * w.x, -fy * u.x, fy * (w.x * u.y - w.y * u.x), half_h * low}};
 }
@@ -348,8 +346,6 @@ struct SurfelSums {
     R low[2];
     Vec<R> normal;
     R opacity;
-    // The same of the chosen losses, as far as the signal needs them: x and y of a, b, c.
-    R chosen_a[2], chosen_b[2], chosen_c[2], chosen_low[2], chosen_det;
 };
 
 template <class R>
@@ -371,11 +367,6 @@ SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const Came
     const R half_w = w.z * R(0.5) * R(cam.width), half_h = w.z * R(0.5) * R(cam.height);
     out.signal[0] = du.z * half_w;
     out.signal[1] = dv.z * half_h;
-    const SignalRow<R> f = surfel_signal(cam, o);
-    out.chosen[0] = f.x[0] * g.chosen_b[0] + f.x[1] * g.chosen_c[0] + f.x[2] * g.chosen_b[1] + f.x[3] * g.chosen_c[1] +
-                    f.x[4] * g.chosen_det + f.x[5] * g.chosen_low[0];
-    out.chosen[1] = f.y[0] * g.chosen_a[0] + f.y[1] * g.chosen_c[0] + f.y[2] * g.chosen_a[1] + f.y[3] * g.chosen_c[1] +
-                    f.y[4] * g.chosen_det + f.y[5] * g.chosen_low[1];
     const Vec<R> da{cam.fx * du.x, cam.fy * dv.x, cam.cx * du.x + cam.cy * dv.x + dw.x};
     const Vec<R> db{cam.fx * du.y, cam.fy * dv.y, cam.cx * du.y + cam.cy * dv.y + dw.y};
     const Vec<R> dc{cam.fx * du.z, cam.fy * dv.z, cam.cx * du.z + cam.cy * dv.z + dw.z};
@@ -480,15 +471,6 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     return true;
 }
 
-// Factors of the sums of: e dx, e dy, dL/dz; the rest is 0.
-template <class R>
-SPLAT_FN SignalRow<R> gaussian_signal(const CameraModel<R>& cam, const Gaussian<R>& o) {
-    const R qa = o.l00 * o.l00, qb = o.l00 * o.l01, qc = o.l01 * o.l01 + o.l11 * o.l11;
-    const R half_w = R(0.5) * cam.width, half_h = R(0.5) * cam.height;
-    return {{half_w * qa, half_w * qb, -half_w * o.slope_x, 0, 0, 0},
-            {half_h * qb, half_h * qc, -half_h * o.slope_y, 0, 0, 0}};
-}
-
 // What the pixels hand back for a gaussian: moments of e = dL/d(power) about the centre, and the rest.
 template <class R>
 struct GaussianSums {
@@ -496,7 +478,6 @@ struct GaussianSums {
     R z, z_x, z_y;  // sums of dL/dz, and of it times the offset
     Vec<R> normal;
     R opacity;  // of the compensated opacity
-    R chosen_x, chosen_y, chosen_z;
 };
 
 template <class R>
@@ -507,9 +488,6 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
     const R mean_x = qa * g.e_x + qb * g.e_y - o.slope_x * g.z, mean_y = qb * g.e_x + qc * g.e_y - o.slope_y * g.z;
     out.signal[0] = mean_x * R(0.5) * cam.width;
     out.signal[1] = mean_y * R(0.5) * cam.height;
-    const SignalRow<R> f = gaussian_signal(cam, o);
-    out.chosen[0] = f.x[0] * g.chosen_x + f.x[1] * g.chosen_y + f.x[2] * g.chosen_z;
-    out.chosen[1] = f.y[0] * g.chosen_x + f.y[1] * g.chosen_y + f.y[2] * g.chosen_z;
     // dL/d(footprint) = -Q G Q with G = -1/2 sum e d d^T.
     const R gxx = R(-0.5) * g.e_xx, gxy = R(-0.5) * g.e_xy, gyy = R(-0.5) * g.e_yy;
     const R txx = qa * gxx + qb * gxy, txy = qa * gxy + qb * gyy, tyx = qb * gxx + qc * gxy, tyy = qb * gxy + qc * gyy;

@@ -141,7 +141,7 @@ inline int block_at(int bit) { return bit / 16 * kBlocksDown + bit % 16 / kBlock
 struct LocalSurfel {
     float a[3], b[3], c[3], det, low_x, low_y, z_low, z_high, opacity;
     SURFKIT_INLINE LocalSurfel(const SurfelRecord& s, float sx, float sy)
-        : det(s.det), low_x(s.low_x - sx), low_y(s.low_y - sy), z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {
+        : det(s.det), low_x(s.disc_x - sx), low_y(s.disc_y - sy), z_low(s.z_low), z_high(s.z_high), opacity(s.opacity) {
         for (int i = 0; i < 3; i++) {
             a[i] = (float)s.a[i];
             b[i] = (float)s.b[i];
@@ -192,14 +192,25 @@ struct GaussianPixel {
     }
 };
 
-// A SignalRow about the tile's centre.
+// A splat::SignalRow about the tile's centre.
 struct LocalSignal {
     float x[6], y[6];
-    SURFKIT_INLINE void about(const splat::SignalRow<double>& row, float sx, float sy) {
-        for (int i = 0; i < 6; i++) {
-            x[i] = (float)(row.x[i] + (i == 1 || i == 3 ? sy * row.x[i - 1] : 0));
-            y[i] = (float)(row.y[i] + (i == 1 || i == 3 ? sx * row.y[i - 1] : 0));
-        }
+    SURFKIT_INLINE LocalSignal(const Job& job, const SurfelRecord& s, float sx, float sy) {
+        const float side = (float)job.height / (float)job.width, *const f = s.signal_x, *const g = s.signal_y;
+        const float x_[6] = {f[0], f[1] + sy * f[0], f[2], f[3] + sy * f[2], f[4], f[5]};
+        const float y_[6] = {-side * f[0], g[0] - sx * side * f[0], -side * f[2], g[1] - sx * side * f[2], g[2],
+                             side * f[5]};
+        std::memcpy(x, x_, sizeof x);
+        std::memcpy(y, y_, sizeof y);
+    }
+    SURFKIT_INLINE LocalSignal(const Job& job, const GaussianRecord& s, float, float) : x{}, y{} {
+        const float half_w = 0.5f * (float)job.width, half_h = 0.5f * (float)job.height, cross = s.l00 * s.l01;
+        x[0] = half_w * s.l00 * s.l00;
+        x[1] = half_w * cross;
+        x[2] = -half_w * s.slope_x;
+        y[0] = half_h * cross;
+        y[1] = half_h * (s.l01 * s.l01 + s.l11 * s.l11);
+        y[2] = -half_h * s.slope_y;
     }
 };
 
@@ -207,14 +218,12 @@ struct Surfels {
     using Record = SurfelRecord;
     using Local = LocalSurfel;
     using Pixel = SurfelPixel;
-    static constexpr float anchored = 1;  // the signal's factors change with the origin
     static constexpr int sums = kSurfelSums, sums_chosen = kSurfelSumsChosen;
 };
 struct Gaussians {
     using Record = GaussianRecord;
     using Local = LocalGaussian;
     using Pixel = GaussianPixel;
-    static constexpr float anchored = 0;
     static constexpr int sums = kGaussianSums, sums_chosen = kGaussianSumsChosen;
 };
 
@@ -382,38 +391,21 @@ struct SurfelAdder {
         s[10] = madd(f, at.hit.dx, s[10]);
         s[11] = madd(f, at.hit.dy, s[11]);
     }
-    inline void add_chosen(const SurfelPixel& at, Floats x, Floats y, Mask m, Floats e, Floats dz) {
+    // The pixel's share of the chosen signal; `e` is 0 where nothing was blended.
+    inline void add_chosen(const SurfelPixel& at, const LocalSignal& f, Floats x, Floats y, Mask m, Floats e,
+                           Floats dz) {
         const Mask disc = at.on_disc & m;
-        const Floats ei = e * at.hit.inv;
-        const Floats q0 = keep(disc, ei * at.hit.u), q1 = keep(disc, ei * at.hit.v);
-        s[20] = madd(q0, x, s[20]);
-        s[21] = madd(q1, x, s[21]);
-        s[22] = madd(q0, y, s[22]);
-        s[23] = madd(q1, y, s[23]);
-        s[24] += q0;
-        s[25] += q1;
-        const Floats f = keep(without(m, at.on_disc), -2.0f * e);
-        s[26] = madd(f, at.hit.dx, s[26]);
-        s[27] = madd(f, at.hit.dy, s[27]);
-        if (chosen == kChosenAll && level >= kGeometry) s[28] += keep(at.free_z & m, dz * at.hit.inv);
-    }
-    inline void add_absolute(const SurfelPixel& at, const LocalSignal& f, Floats x, Floats y, Mask m, Floats e,
-                             Floats dz) {
-        const Mask disc = at.on_disc & m;
-        const Floats ei = e * at.hit.inv;
-        const Floats q0 = keep(disc, ei * at.hit.u), q1 = keep(disc, ei * at.hit.v);
-        const Floats low = keep(without(m, at.on_disc), -2.0f * e);
-        Floats gx = madd(q0, madd(y, f.x[0], broadcast(f.x[1])), q1 * madd(y, f.x[2], broadcast(f.x[3])));
-        Floats gy = madd(q0, madd(x, f.y[0], broadcast(f.y[1])), q1 * madd(x, f.y[2], broadcast(f.y[3])));
-        gx = madd(low * at.hit.dx, f.x[5], gx);
-        gy = madd(low * at.hit.dy, f.y[5], gy);
-        if (level >= kGeometry) {
+        const Floats u = at.hit.inv * at.hit.u, v = at.hit.inv * at.hit.v;
+        const Floats hx = madd(u, madd(y, f.x[0], broadcast(f.x[1])), v * madd(y, f.x[2], broadcast(f.x[3])));
+        const Floats hy = madd(u, madd(x, f.y[0], broadcast(f.y[1])), v * madd(x, f.y[2], broadcast(f.y[3])));
+        Floats gx = e * select(disc, hx, at.hit.dx * f.x[5]), gy = e * select(disc, hy, at.hit.dy * f.y[5]);
+        if (chosen != kChosenColor && level >= kGeometry) {
             const Floats t = keep(at.free_z & m, dz * at.hit.inv);
             gx = madd(t, f.x[4], gx);
             gy = madd(t, f.y[4], gy);
         }
-        s[20] += magnitude(gx);
-        s[21] += magnitude(gy);
+        s[20] += chosen == kChosenAbsolute ? magnitude(gx) : gx;
+        s[21] += chosen == kChosenAbsolute ? magnitude(gy) : gy;
     }
     inline void add_normal(int c, Floats v) { s[12 + c] += v; }
     inline void add_opacity(Floats v) { s[15] += v; }
@@ -425,11 +417,6 @@ struct SurfelAdder {
             out[i] += sx * out[6 + i];
             out[3 + i] += sy * out[6 + i];
         }
-        if (chosen == kChosenColor || chosen == kChosenAll)
-            for (int i = 0; i < 2; i++) {
-                out[20 + i] += sx * out[24 + i];
-                out[22 + i] += sy * out[24 + i];
-            }
     }
 };
 template <int level, int chosen>
@@ -450,17 +437,15 @@ struct GaussianAdder {
             s[7] = madd(t, at.dy, s[7]);
         }
     }
-    inline void add_chosen(const GaussianPixel& at, Floats, Floats, Mask m, Floats e, Floats dz) {
-        s[16] = s[16] - e * at.dx;
-        s[17] = s[17] - e * at.dy;
-        if (chosen == kChosenAll && level >= kGeometry) s[18] += keep(at.free_z & m, dz);
-    }
-    inline void add_absolute(const GaussianPixel& at, const LocalSignal& f, Floats, Floats, Mask m, Floats e,
-                             Floats dz) {
-        const Floats ex = -(e * at.dx), ey = -(e * at.dy);
-        const Floats t = level >= kGeometry ? keep(at.free_z & m, dz) : Floats{};
-        s[16] += magnitude(madd(ex, f.x[0], madd(ey, f.x[1], t * f.x[2])));
-        s[17] += magnitude(madd(ex, f.y[0], madd(ey, f.y[1], t * f.y[2])));
+    inline void add_chosen(const GaussianPixel& at, const LocalSignal& f, Floats, Floats, Mask m, Floats e, Floats dz) {
+        Floats gx = -e * madd(at.dx, f.x[0], at.dy * f.x[1]), gy = -e * madd(at.dx, f.y[0], at.dy * f.y[1]);
+        if (chosen != kChosenColor && level >= kGeometry) {
+            const Floats t = keep(at.free_z & m, dz);
+            gx = madd(t, f.x[2], gx);
+            gy = madd(t, f.y[2], gy);
+        }
+        s[16] += chosen == kChosenAbsolute ? magnitude(gx) : gx;
+        s[17] += chosen == kChosenAbsolute ? magnitude(gy) : gy;
     }
     inline void add_normal(int c, Floats v) { s[8 + c] += v; }
     inline void add_opacity(Floats v) { s[11] += v; }
@@ -510,9 +495,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
         const Ints here = Ints{} + (int32_t)(k - tile.begin);
-        LocalSignal signal;
-        if (chosen == kChosenAbsolute)
-            signal.about(tile.job.signals[tile.job.entries[k].record], K::anchored * sx, K::anchored * sy);
+        const LocalSignal signal(tile.job, s, sx, sy);
         typename AdderOf<K, level, chosen>::Type adder;
         for (uint64_t todo = blended; todo; todo &= todo - 1) {
             const int b = block_at(__builtin_ctzll(todo));
@@ -553,10 +536,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
                 part.behind[b] = madd(w, pw, part.behind[b]);
                 Floats pz{};
                 if (chosen_level >= kGeometry) pz = part.per_depth(b, w, mid, m_z, d, all[b], m1[b]);
-                if (chosen == kChosenAbsolute)
-                    adder.add_absolute(at, signal, x, y, m, -(pa * raw), pz);
-                else
-                    adder.add_chosen(at, x, y, m, -(pa * raw), pz);
+                adder.add_chosen(at, signal, x, y, m, -(pa * raw), pz);
             }
         }
         const uint32_t slot = tile.job.entries[k].slot;

@@ -1,5 +1,4 @@
 // What the per-pixel kernels read and write, and the table through which one of their compilations is chosen.
-// After splat_math.h.
 #pragma once
 
 #include <cstdint>
@@ -16,12 +15,13 @@ struct Entry {
 // What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
 struct alignas(64) SurfelRecord {
     double a[3], b[3], c[3];  // double so that the origin moves to each tile without loss
-    float det;
-    float low_x, low_y, z_low, z_high;
+    float det, z_low, z_high;
     float opacity, color[3], normal[3];
     float ax, ay;
-    // the bound about the anchor, for rows: x = mx + tilt dy +- sqrt(wide (1 - dy^2 flat))
+    // the bound about the anchor, for rows: x = mx + tilt dy +- sqrt(wide (1 - dy^2 flat)); the disc is the low-pass
+    // filter's
     float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
+    float signal_x[6], signal_y[3];  // of the SignalRow: x, and the entries 1, 3 and 4 of y; the others follow from x
 };
 
 struct alignas(64) GaussianRecord {
@@ -50,8 +50,7 @@ struct Job {
     int width, height, tiles_x, tiles_y;
     const void* records;
     const Entry* entries;
-    const int64_t* offsets;                   // tiles + 1
-    const splat::SignalRow<double>* signals;  // per record; for kChosenAbsolute alone
+    const int64_t* offsets;  // tiles + 1
 };
 
 enum Kind { kSurfel = 0, kGaussian = 1 };
@@ -61,7 +60,7 @@ enum Level { kColor = 0, kGeometry = 1, kDistortion = 2 };
 // shares of the pixels are summed without their signs.
 enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2, kChosenAbsolute = 3 };
 
-constexpr int kSurfelSums = 20, kSurfelSumsChosen = 32;
+constexpr int kSurfelSums = 20, kSurfelSumsChosen = 24;
 constexpr int kGaussianSums = 16, kGaussianSumsChosen = 20;
 
 // Normals of the splats against those of a depth map: inputs, and where the gradients go. Planes of width x height; the

@@ -135,11 +135,12 @@ bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool
         to[k][2] = m[k].z;
     }
     r.det = (float)s.det;
-    r.low_x = (float)(s.low.x - s.ax);
-    r.low_y = (float)(s.low.y - s.ay);
     r.z_low = (float)s.z_low;
     r.z_high = (float)s.z_high;
     fill_look(r, in.opacity, Shade{}, s.flip * p.axes.c2);
+    const splat::SignalRow<double> row = splat::surfel_signal(cam, s);
+    for (int k = 0; k < 6; k++) r.signal_x[k] = (float)row.x[k];
+    for (int k = 0; k < 3; k++) r.signal_y[k] = (float)row.y[k == 2 ? 4 : 2 * k + 1];
     return true;
 }
 bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool antialias, GaussianRecord& r,
@@ -385,8 +386,7 @@ void Pass::bin(int threads) {
 }
 
 Job Pass::job() const {
-    return {camera_.width,  camera_.height, tiles_x_,        tiles_y_,
-            records_.get(), entries_.get(), offsets_.data(), nullptr};
+    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.get(), offsets_.data()};
 }
 
 Saved Pass::saved() {
@@ -412,42 +412,14 @@ void Pass::forward(Level level, const Planes& out, int threads) {
 namespace {
 
 splat::SurfelSums<double> surfel_sums(const double* s) {
-    return {{s[0], s[1], s[2]},
-            {s[3], s[4], s[5]},
-            {s[6], s[7], s[8]},
-            s[9],
-            {s[10], s[11]},
-            {s[12], s[13], s[14]},
-            s[15],
-            {s[20], s[21]},
-            {s[22], s[23]},
-            {s[24], s[25]},
-            {s[26], s[27]},
-            s[28]};
+    return {
+        {s[0], s[1], s[2]}, {s[3], s[4], s[5]}, {s[6], s[7], s[8]}, s[9], {s[10], s[11]}, {s[12], s[13], s[14]}, s[15]};
 }
 splat::GaussianSums<double> gaussian_sums(const double* s) {
-    return {s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], {s[8], s[9], s[10]}, s[11], s[16], s[17], s[18]};
+    return {s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], {s[8], s[9], s[10]}, s[11]};
 }
 
 }  // namespace
-
-Buffer<splat::SignalRow<double>> Pass::signals(const SplatArrays& splats, int threads) const {
-    Buffer<splat::SignalRow<double>> rows = buffer<splat::SignalRow<double>>(count_);
-    each_seen(threads, [&](int64_t r) {
-        const SplatIn<double> in = read_splat(splats, index_[r], scale_columns(kind_));
-        const Posed<double> p = splat::pose(in, camera_);
-        if (kind_ == kSurfel) {
-            Surfel<double> o;
-            splat::surfel_project(in, p, camera_, whole, o);
-            rows[r] = splat::surfel_signal(camera_, o);
-        } else {
-            Gaussian<double> o;
-            splat::gaussian_project(in, p, camera_, antialias_, o);
-            rows[r] = splat::gaussian_signal(camera_, o);
-        }
-    });
-    return rows;
-}
 
 void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute,
                     const GradientArrays& out, int threads) {
@@ -458,12 +430,9 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     if (total.distortion || part.distortion) level = kDistortion;
     if (level > level_) throw std::invalid_argument("a cotangent was given for a map that was not rendered");
     Chosen what = kNone;
-    if (chosen)
+    if (chosen) {
         what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
-    Buffer<splat::SignalRow<double>> rows;
-    if (chosen && absolute) {
-        what = kChosenAbsolute;
-        rows = signals(splats, threads);
+        if (absolute) what = kChosenAbsolute;
     }
     const int width =
         kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
@@ -471,15 +440,14 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     const Buffer<float> sums = buffer<float>(pairs_ * width);
     std::vector<uint8_t> touched(pairs(), 0);
     const Saved kept = saved();
-    Job work = job();
-    work.signals = rows.get();
+    const Job work = job();
     const Kernels& k = kernels();
     parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
         k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
     });
     const int columns = scale_columns(kind_);
     each_seen(threads, [&](int64_t r) {
-        double s[32] = {};
+        double s[kSurfelSumsChosen] = {};
         bool hit = false;
         for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) {
             if (!touched[slot]) continue;
@@ -510,7 +478,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         out.opacities[i] = (float)g.opacity;
         for (int q = 0; q < 2; q++) {
             out.signal[2 * i + q] = (float)g.signal[q];
-            if (out.chosen) out.chosen[2 * i + q] = (float)(what == kChosenAbsolute ? s[chosen_at + q] : g.chosen[q]);
+            if (out.chosen) out.chosen[2 * i + q] = (float)s[chosen_at + q];
         }
     });
 }

@@ -51,7 +51,6 @@ class Pass {
     Saved saved();
     template <class F>
     void each_seen(int threads, F f) const;
-    Buffer<splat::SignalRow<double>> signals(const SplatArrays& splats, int threads) const;
 
     Kind kind_;
     splat::CameraModel<double> camera_;
