@@ -75,3 +75,24 @@ def test_published_settings_of_the_other_recipes():
         0.1,
         35_000,
     )
+
+
+def test_citygs2_t_begins_its_blocks_from_the_first_7000_steps_of_the_same_pretraining():
+    whole, tiny = recipes()["citygs2-s"], recipes()["citygs2-t"]
+    assert tiny.pretrain.steps == 7_000 and tiny.tune == whole.tune
+    for index in (1, 2_500, 7_000):
+        for name, rate in whole.pretrain.rates.items():
+            assert tiny.pretrain.rates[name].at(index, 7_000) == pytest.approx(rate.at(index, 30_000))
+        for name, loss in whole.pretrain.losses.items():
+            assert tiny.pretrain.losses[name].weight_at(index, 7_000) == pytest.approx(loss.weight_at(index, 30_000))
+    assert tiny.pretrain.densify == whole.pretrain.densify
+
+
+def test_citygs2_for_streets():
+    street, at = recipes()["citygs2-street"], {}
+    for part in ("pretrain", "tune"):
+        stage = getattr(street, part)
+        at[part] = [stage.rates["means"].at(step, stage.steps) for step in (0, stage.steps)]
+        assert stage.densify.reset_every >= stage.densify.until  # never
+    assert at == {"pretrain": pytest.approx([1.6e-5, 1.6e-6]), "tune": pytest.approx([8e-6, 8e-7])}
+    assert street.assign.least == 0.01 and street.partition.blocks == (5, 4) and street.tune.prune == ()

@@ -1,25 +1,21 @@
 """Recipes by name."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from surfkit.core.registry import hookimpl
 from surfkit.densify.adc import ADC
-from surfkit.densify.filters import Elongation
 from surfkit.densify.prune import Importance
-from surfkit.densify.signal import AbsGradient, LossGradient
+from surfkit.densify.signal import AbsGradient
 from surfkit.densify.trim import Trim
-from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
-from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
-from surfkit.train.adam import Rate
-from surfkit.train.stage import RATES, Stage
+from surfkit.recipes import city
+from surfkit.train.stage import Stage
 
 GAUSSIANS = Recipe(
     about="3D Gaussian splatting (Kerbl et al. 2023): the sharpest pictures, no usable surface",
@@ -79,40 +75,6 @@ LIGHT = Recipe(
 )
 
 
-# CityGaussianV2: the upper half of its ablation table, from `recipes.ablations.COARSE_BASELINE` to here.
-COARSE = Recipe(
-    about="Pretraining of CityGaussianV2 (Liu et al. 2024): densified by the gradient of SSIM, depth from priors",
-    primitive=Surfel2D(),
-    pretrain=Stage(
-        losses={
-            "l1": L1(),
-            "ssim": SSIM(),
-            "normal": NormalConsistency(weight=0.0125, start=7_000, depth="median"),
-            "depth": DepthRegression(start=0.5, end=0.0025),
-        },
-        signal=LossGradient(terms=("ssim",), boost=0.9),
-        densify=ADC(cull_opacity=0.005, filters=(Elongation(min_ratio=0.01),)),
-    ),
-    mesh=TSDF(),
-)
-
-
-CITY = replace(
-    COARSE,
-    about="CityGaussianV2 (Liu et al. 2024): pretraining, then blocks that are tuned apart and trimmed, then merged",
-    partition=ContractedGrid(blocks=(2, 2)),
-    tune=replace(
-        COARSE.pretrain,
-        losses=COARSE.pretrain.losses | {"normal": NormalConsistency(weight=0.0125, start=0, depth="median")},
-        # The paper ranks by the mean over all views, and 0 counts for one that does not see a point: what few see,
-        # such as the rim of a survey, goes first. At a ratio of 0.1 that cost 0.7 to 1.2 dB, and the peak nothing.
-        prune=(Trim(ratio=0.025, score="peak"),),
-        rates=RATES | {"means": Rate(6.4e-5, 6.4e-7), "scales": Rate(4e-3)},
-        sh_every=1,
-    ),
-)
-
-
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
     """The recipes of surfkit."""
@@ -123,6 +85,10 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "absgs": ABSOLUTE,
         "trim2dgs": TRIMMED,
         "lightgaussian": LIGHT,
-        "citygs2-coarse": COARSE,
-        "citygs2": CITY,
+        "citygs2-coarse": city.COARSE,
+        "citygs2": city.CITY,
+        "citygs2-s": city.SMALL,
+        "citygs2-t": city.TINY,
+        "citygs2-aerial": city.AERIAL,
+        "citygs2-street": city.STREET,
     }
