@@ -18,7 +18,7 @@ import torch
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.folder import Run, discard, say
+from surfkit.folder import Run, discard_results, say
 from surfkit.partition import executor
 from surfkit.partition.executor import Executor, Inline
 from surfkit.partition.merge import Share, merge
@@ -91,7 +91,7 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     state = merged(site, record)
     if state is not None:
         return final, state
-    discard(final.metrics, final.cloud, final.mesh_record)
+    discard_results(final)
     while state is None:
         await_workers(site)
         work(site, record.plan, hands)

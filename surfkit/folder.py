@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -19,11 +19,14 @@ from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, 
 from surfkit.core.registry import hookimpl, plugins, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
+from surfkit.primitives.base import Primitive
 from surfkit.recipe import Recipe
+from surfkit.refine.base import Refine
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
 from surfkit.scene.scene import Frame, Scene
+from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
@@ -40,23 +43,42 @@ class Run:
         recipe: Part of it as recipe.json.
         data: Part of it in run.json.
         part: The stage that is spoken of: "pretrain" for the whole scene at once, "tune" for a block, and for all of
-            them when they are merged.
+            them when they are merged; then "refine0", "refine1" and so on.
     """
 
     out: Path
     recipe: Recipe
     data: Data
-    part: Literal["pretrain", "tune"] = "pretrain"
+    part: str = "pretrain"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """All there are, in their order."""
+        tune = ("tune",) if self.recipe.partition is not None else ()
+        return ("pretrain", *tune, *(f"refine{at}" for at in range(len(self.recipe.refine))))
+
+    @property
+    def refined(self) -> tuple[Refine, ...]:
+        """What the model has gone through as a whole at the end of the stage that is spoken of."""
+        return self.recipe.refine[: int(self.part[6:]) + 1] if self.part.startswith("refine") else ()
 
     @property
     def stage(self) -> Stage:
         """The one that is spoken of."""
-        return getattr(self.recipe, self.part)
+        return self.refined[-1].stage if self.refined else getattr(self.recipe, self.part)
+
+    @property
+    def primitive(self) -> Primitive:
+        """What the points are in the stage that is spoken of."""
+        found = self.recipe.primitive
+        for refine in self.refined:
+            found = refine.primitive(found)
+        return found
 
     @property
     def needs_priors(self) -> bool:
         """Whether a loss of the recipe looks at depth priors."""
-        stages = [self.recipe.pretrain] + [self.recipe.tune] * (self.recipe.partition is not None)
+        stages = [replace(self, part=part).stage for part in self.parts]
         return any(loss.needs_prior for stage in stages for loss in stage.losses.values())
 
     @property
@@ -327,10 +349,12 @@ def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     return metrics
 
 
-def discard(*paths: Path) -> None:
-    """Delete results that further steps make wrong."""
-    for path in paths:
+def discard_results(this: Run) -> None:
+    """Delete what further steps of a stage make wrong: results, and the states of the stages after it."""
+    for path in (this.metrics, this.cloud, this.mesh_record):
         path.unlink(missing_ok=True)
+    for part in this.parts[this.parts.index(this.part) + 1 :]:
+        checkpoint.discard(replace(this, part=part).checkpoint)
 
 
 def say(text: str) -> None:

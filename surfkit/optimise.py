@@ -62,6 +62,7 @@ class Job:
         given: What to look at.
         meter: Sees what memory is taken by.
         start: The points to begin with; the sparse ones of the scene if None.
+        before: The model that it goes on from, if its times count too.
     """
 
     this: Run
@@ -71,6 +72,7 @@ class Job:
     given: Material
     meter: Meter
     start: Callable[[], Columns] | None = None
+    before: StageState | None = None
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -101,7 +103,7 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     When memory gives out, it goes back with a smaller cache, until there is none.
     """
     this, given = job.this, job.given
-    stage, primitive = this.stage, this.recipe.primitive
+    stage, primitive = this.stage, this.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, job.scene.train, *sources)
     along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
@@ -109,7 +111,11 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
         params = job.start() if job.start else primitive.init(job.scene.cloud, generator)
-        return trainer.begin(Points.fresh(params), generator)
+        fresh = trainer.begin(Points.fresh(params), generator)
+        if job.before is not None:
+            for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
+                setattr(fresh, name, getattr(job.before, name))
+        return fresh
 
     if state is not None:
         say(f"{this.out}: going on after step {state.index} of {stage.steps}")
@@ -202,7 +208,7 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
 def drawing(this: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
     """What draws the points of a state, as they are to be looked at."""
     stage = this.stage
-    splats = this.recipe.primitive.shape(stage.finished(state), state.sh_degree)
+    splats = this.primitive.shape(stage.finished(state), state.sh_degree)
     return lambda view: rasterizer.render(splats, view.camera, stage.near, geometry).maps
 
 

@@ -24,7 +24,7 @@ from surfkit.evaluate.pictures import panel, picture_path, write_picture
 from surfkit.folder import (
     Run,
     claim,
-    discard,
+    discard_results,
     note_metrics,
     noted,
     read_data,
@@ -40,6 +40,7 @@ from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.recipe import Recipe
+from surfkit.refining import refined, seen_by
 from surfkit.scene.cameras import write_cameras
 from surfkit.scene.data import Data
 from surfkit.scene.masks import mask_cache
@@ -49,7 +50,6 @@ from surfkit.scene.ply import write_splats
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
 from surfkit.surface import Delivery, deliver, meshed, subject
-from surfkit.train import checkpoint
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store, read_ahead
@@ -112,12 +112,12 @@ def run(
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
             if given is not None:
-                discard(this.metrics, this.cloud, this.mesh_record)
-                checkpoint.discard(replace(this, part="tune").checkpoint)
+                discard_results(this)
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
                 this, state = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+            this, state = refined(Site(this, scene, rasterizer, every, store), state)
             if not unfinished and this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
                 return read_metrics(out)
@@ -133,7 +133,7 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     params = this.stage.finished(state)
     write_cameras(this.cameras, scene)
     emit(FileWritten(this.cameras, "cameras"))
-    write_splats(this.cloud, to_table(this.recipe.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
+    write_splats(this.cloud, to_table(this.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(this.cloud, "points"))
 
 
@@ -218,18 +218,17 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     """
     this = opened(out)
     scene = read(this.data)
-    state = saved(this, scene)
-    if this.recipe.partition is not None and state is not None and state.index >= this.stage.steps:
-        this = replace(this, part="tune")
-        state = saved(this, scene)
-    steps = this.stage.steps
-    if state is None and this.part == "tune":
-        raise BadInput(f"{out}: not all blocks are tuned; give its surfkit train command again to finish it")
-    if state is None or state.index < steps:
-        raise BadInput(
-            f"{out}: the run stopped after step {state.index if state else 0} of {steps}; "
-            "give its surfkit train command again to finish it"
-        )
+    state, ahead = None, None
+    for part in reversed(this.parts):
+        this = replace(this, part=part)
+        if (state := saved(this, seen_by(this, scene))) is not None:
+            break
+        ahead = part
+    step, again = state.index if state else 0, "give its surfkit train command again to finish it"
+    if step < this.stage.steps:
+        raise BadInput(f"{out}: the run stopped after step {step} of {this.stage.steps}; {again}")
+    if ahead is not None:
+        raise BadInput(f"{out}: {'not all blocks are tuned' if ahead == 'tune' else f'{ahead} is not begun'}; {again}")
     return this, state, scene
 
 

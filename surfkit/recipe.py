@@ -14,6 +14,7 @@ from surfkit.partition.assign import Assign, SSIMDifference
 from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.refine.base import Refine
 from surfkit.train.stage import Stage
 
 
@@ -41,6 +42,10 @@ class Recipe:
 
     tune: Stage = field(default_factory=Stage)
     """Optimisation of each block, where the scene is cut."""
+
+    refine: tuple[Annotated[Refine, choice(Refine)], ...] = ()
+    """What the whole model goes through when its blocks are merged; refine.0:NAME adds the first, refine.1:NAME the
+    next, refine.0:none drops one."""
 
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""

@@ -79,7 +79,7 @@ class Delivery:
 def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int) -> Subject:
     """The splats of a state, to be meshed."""
     stage = this.stage
-    splats = this.recipe.primitive.shape(stage.finished(state), state.sh_degree)
+    splats = this.primitive.shape(stage.finished(state), state.sh_degree)
     masks = mask_cache(scene.train, budget_bytes // 4)
     return Subject(
         splats=splats,

@@ -24,7 +24,7 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
-_PARTS = ("scene", "primitives", "losses", "depth", "appearance", "densify", "mesh", "partition", "recipes")
+_PARTS = ("scene", "primitives", "losses", "depth", "appearance", "densify", "mesh", "partition", "refine", "recipes")
 BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS)
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
 

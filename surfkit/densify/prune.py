@@ -19,7 +19,7 @@ class Importance(Prune):
     """Drop the points of least importance: opacity times pixels hit, times a power of the volume (LightGaussian)."""
 
     at: tuple[Steps, ...] = (15_000,)
-    """Steps after which to prune."""
+    """Steps after which to prune; 0 is at once, after the first."""
 
     ratio: float = 0.66
     """Share of the points that is dropped."""
@@ -33,7 +33,7 @@ class Importance(Prune):
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Drop the least important at the given steps."""
-        if step.index not in self.at:
+        if step.index not in self.at and not (step.index == 1 and 0 in self.at):
             return None
         return Edit(drop=lowest(self.importance(step), self.ratio))
 

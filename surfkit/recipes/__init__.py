@@ -85,6 +85,7 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "absgs": ABSOLUTE,
         "trim2dgs": TRIMMED,
         "lightgaussian": LIGHT,
+        "citygs": city.FIRST,
         "citygs2-coarse": city.COARSE,
         "citygs2": city.CITY,
         "citygs2-s": city.SMALL,

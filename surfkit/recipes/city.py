@@ -1,4 +1,4 @@
-"""CityGaussianV2 (Liu et al. 2024) and its predecessor: pretraining, blocks that are tuned apart, and what follows."""
+"""CityGaussian in its two versions (Liu et al. 2024): pretraining, blocks that are tuned apart, and what follows."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import SSIMDifference
 from surfkit.partition.grid import ContractedGrid
+from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
+from surfkit.refine.light import Distil, Recover
 from surfkit.train.adam import Rate
 from surfkit.train.stage import RATES, Stage
 
@@ -104,4 +106,13 @@ STREET = replace(
         prune=(),
         rates=RATES | {"means": Rate(8e-6, 8e-7), "scales": Rate(2.5e-3)},
     ),
+)
+
+# The first version: no surface, but the pipeline that the second goes on from.
+FIRST = Recipe(
+    about="CityGaussian (Liu et al. 2024): 3DGS in blocks, then half as many points and simpler colours",
+    primitive=Gaussian3D(),
+    partition=ContractedGrid(blocks=(2, 2)),
+    tune=Stage(rates=CITY.tune.rates, sh_every=1),
+    refine=(Recover(), Distil()),
 )

@@ -91,7 +91,7 @@ def status(out: Path) -> Status:
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it){doing}")
     kept, lines = read_json(record, dict[str, Any]), _sound(journal.read(out / journal.NAME))
     last, metrics = _last(lines), _metrics(out, lines)
-    steps, step = _steps(recipe), last["StepDone"].get("index", 0)
+    steps, step = last["StageBegan"].get("steps", _steps(recipe)), last["StepDone"].get("index", 0)
     finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
     pace = _pace(lines)
     return Status(

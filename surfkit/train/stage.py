@@ -15,7 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, PointsEdited, StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import choice
-from surfkit.core.schedule import Interval, Steps
+from surfkit.core.schedule import Interval
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
@@ -48,7 +48,7 @@ GEOMETRY = {"depth", "median", "normal", "distortion"}
 class Stage:
     """One optimisation run over a set of views."""
 
-    steps: Steps = 30_000
+    steps: Interval = 30_000
     """Photographs shown, one a step."""
 
     losses: dict[str, Annotated[Loss, choice(Loss)]] = field(default_factory=lambda: {"l1": L1(), "ssim": SSIM()})

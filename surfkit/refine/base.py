@@ -1,0 +1,36 @@
+"""What may be done with a trained model as a whole, once its blocks are merged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from surfkit.core.registry import Component
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
+from surfkit.scene.scene import View
+from surfkit.train.stage import Stage
+
+
+@dataclass(frozen=True)
+class Refine(Component):
+    """One more optimisation of the whole model, from where the one before ended."""
+
+    taught: ClassVar[bool] = False
+    """Whether it is shown what the model before it draws, instead of photographs."""
+
+    stage: Stage = field(default_factory=Stage)
+    """The optimisation."""
+
+    def primitive(self, primitive: Primitive) -> Primitive:
+        """What the points are from then on, given what they were."""
+        return primitive
+
+    def params(self, params: Columns) -> Columns:
+        """Raw parameters to begin with, given those of the model before."""
+        return params
+
+    def views(self, views: Sequence[View]) -> tuple[View, ...]:
+        """The cameras to look from, given those of the training photographs. All of them, unless it is taught."""
+        return tuple(views)

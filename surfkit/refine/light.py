@@ -1,0 +1,88 @@
+"""LightGaussian (Fan et al. 2024): the same pictures from fewer points and smaller colours, as CityGaussian does it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.densify.prune import Importance
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
+from surfkit.refine.base import Refine
+from surfkit.scene.scene import View
+from surfkit.train.adam import Rate
+from surfkit.train.stage import RATES, Stage
+
+
+def slowing(rates: dict[str, float], to: float) -> dict[str, Rate]:
+    """Rates that fall to a share of themselves, in three digits."""
+    return {name: Rate(rate, float(f"{rate * to:.3g}")) if rate else Rate(0.0) for name, rate in rates.items()}
+
+
+STARTS = {name: rate.start for name, rate in RATES.items()}
+# CityGaussian's: all rates fall by 5 % every 400 steps of recovery and by 10 % every 500 of distillation; positions
+# hardly move, and their rate goes on falling from one to the other.
+RECOVERY = slowing(STARTS | {"scales": 7.5e-5}, 0.95**75) | {"means": Rate(3e-7, 3e-9)}
+DISTILLATION = slowing(STARTS | {"scales": 7.5e-5, "opacities": 0.0}, 0.9**20) | {"means": Rate(9.5e-9, 3e-9)}
+
+
+@dataclass(frozen=True)
+class Recover(Refine):
+    """Drop the points of least importance, and let the others make up for them."""
+
+    stage: Stage = field(
+        default_factory=lambda: Stage(densify=None, prune=(Importance(at=(0,), ratio=0.5),), rates=RECOVERY, sh_every=1)
+    )
+    """The optimisation, with what it drops."""
+
+
+@dataclass(frozen=True)
+class Distil(Refine):
+    """Cut the harmonics of the colours, and learn from what the model drew before, also beside the photographs."""
+
+    taught: ClassVar[bool] = True
+
+    stage: Stage = field(default_factory=lambda: Stage(steps=10_000, densify=None, rates=DISTILLATION, sh_every=1))
+    """The optimisation."""
+
+    sh_degree: int = 2
+    """Highest degree of the harmonics that are left."""
+
+    jitter: float = 0.01
+    """Cameras stand beside those of the photographs by so much along each axis: the standard deviation, as a share of
+    the scene extent."""
+
+    copies: int = 4
+    """Places beside each photograph."""
+
+    def __post_init__(self) -> None:
+        if self.sh_degree not in range(4):
+            raise BadInput(f"distil.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
+        if self.jitter < 0 or self.copies < 1:
+            raise BadInput(f"distil.jitter {self.jitter}, copies {self.copies}: give 0 or more, and 1 or more")
+
+    def primitive(self, primitive: Primitive) -> Primitive:
+        """The same with fewer harmonics."""
+        return replace(primitive, sh_degree=min(self.sh_degree, primitive.sh_degree))
+
+    def params(self, params: Columns) -> Columns:
+        """Without the higher harmonics."""
+        kept = (self.sh_degree + 1) ** 2 - 1
+        return params | {"sh_rest": params["sh_rest"][:, :kept].clone()}
+
+    def views(self, views: Sequence[View]) -> tuple[View, ...]:
+        """Each camera `copies` times, moved without being turned."""
+        generator = torch.Generator().manual_seed(len(views))
+        shifts = self.jitter * torch.randn(self.copies, len(views), 3, generator=generator, dtype=torch.float64)
+        return tuple(beside(view, shift) for row in shifts for view, shift in zip(views, row, strict=True))
+
+
+def beside(view: View, shift: torch.Tensor) -> View:
+    """A view whose camera stands elsewhere by `shift`, (3,) local units."""
+    pose = view.camera.world_to_camera.clone()
+    pose[:3, 3] -= pose[:3, :3] @ shift
+    return replace(view, camera=replace(view.camera, world_to_camera=pose))

@@ -1,0 +1,165 @@
+"""The whole model made smaller after its blocks are merged."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from surfkit import optimise
+from surfkit.blocks import Hands
+from surfkit.core.check import BadInput
+from surfkit.densify.prune import Importance
+from surfkit.optimise import Every
+from surfkit.partition import PictureShare, QuantileGrid
+from surfkit.pipeline import load_run, run, with_steps
+from surfkit.primitives import Gaussian3D
+from surfkit.raster.select import select
+from surfkit.recipe import Recipe
+from surfkit.recipes.city import FIRST
+from surfkit.refine import Distil, Recover
+from surfkit.refine.light import DISTILLATION, RECOVERY
+from surfkit.scene.data import Data
+from surfkit.scene.ply import read_splats
+from surfkit.scene.read import read
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train.stage import Stage
+
+EVERY = Every(checkpoint=2, pictures=0)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Data:
+    folder = tmp_path_factory.mktemp("scene")
+    write_colmap(folder, photograph(Flight(views=12, width=32, height=24, points=200)))
+    return Data(folder)
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """One block, then half of the points for 4 steps, then colours of degree 1 for 6."""
+    stage, recover, distil = Stage(steps=6, sh_every=1), Recover(), Distil(sh_degree=1, copies=2)
+    return Recipe(
+        primitive=Gaussian3D(sh_degree=2),
+        pretrain=stage,
+        partition=QuantileGrid((1, 1)),
+        assign=PictureShare(),
+        tune=stage,
+        refine=(
+            replace(recover, stage=replace(recover.stage, steps=4)),
+            replace(distil, stage=replace(distil.stage, steps=6)),
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(data, recipe, tmp_path_factory):
+    out = tmp_path_factory.mktemp("finished") / "run"
+    run(recipe, data, out, Hands("cpu"), EVERY)
+    return out
+
+
+def state_of(out, part):
+    return checkpoint.load_last(out / part / "checkpoint.safetensors")[0]
+
+
+def test_what_is_left(finished):
+    assert [len(state_of(finished, part).points) for part in ("tune", "refine0", "refine1")] == [200, 100, 100]
+    splats = read_splats(finished / "point_cloud.ply")
+    assert splats.means.shape == (100, 3) and splats.sh_rest.shape == (100, 3, 3)
+    this, state, _ = load_run(finished)
+    assert this.part == "refine1" and this.primitive.sh_degree == 1 and state.index == 6
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["points"] == 100
+    spent = [state_of(finished, part).cpu_seconds for part in ("tune", "refine0", "refine1")]
+    assert 0 < spent[0] < spent[1] < spent[2] == metrics["cpu_seconds"], "all stages count"
+
+
+def test_recovery_goes_on_from_the_merged_model(finished):
+    """Its points are some of the merged ones, moved by four steps of Adam at most."""
+    before, after = (state_of(finished, part).points.params for part in ("tune", "refine0"))
+    nearest = (after["means"][:, None] - before["means"]).norm(dim=-1).min(1)
+    assert float(nearest.values.max()) < 4 * 3e-7 * 3**0.5 * 1.5
+    assert len(set(nearest.indices.tolist())) == 100
+
+
+def test_distillation_learns_what_the_model_drew_before(finished, data):
+    """Beside the photographs too, the student is nearer to the teacher than the teacher without those harmonics is."""
+    this, student, scene = load_run(finished)
+    teacher = state_of(finished, "refine0")
+    assert torch.equal(teacher.points.params["opacities"], student.points.params["opacities"]), "they are frozen"
+    cut = replace(teacher.points, params=this.recipe.refine[1].params(teacher.points.params))
+    before, rasterizer = replace(this, part="refine0"), select("cpu")[0]
+    drawn = [
+        optimise.drawing(run, state, rasterizer, geometry=False)
+        for run, state in ((before, teacher), (this, student), (this, replace(teacher, points=cut, sh_degree=1)))
+    ]
+    views = this.recipe.refine[1].views(scene.train)
+    taught, learnt, plain = (torch.stack([draw(view).color for view in views]) for draw in drawn)
+    assert float((learnt - taught).abs().mean()) < 0.9 * float((plain - taught).abs().mean())
+
+
+def test_interrupted_and_continued(finished, data, recipe, tmp_path, monkeypatch):
+    save, count = checkpoint.save, 0
+
+    def stop(path, state):
+        nonlocal count
+        save(path, state)
+        count += 1
+        if path.parent.name.startswith("refine") and state.index == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimise.checkpoint, "save", stop)
+    for part in ("refine0", "refine1"):
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        assert state_of(tmp_path, part).index == 2
+        with pytest.raises(BadInput, match="stopped after step 2"):
+            load_run(tmp_path)
+    monkeypatch.undo()
+    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert (tmp_path / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
+
+
+def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path):
+    import shutil
+
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=8))
+    run(longer, data, out, Hands("cpu"), EVERY)
+    assert not torch.equal(
+        state_of(out, "refine0").points.params["sh0"], state_of(finished, "refine0").points.params["sh0"]
+    )
+
+
+def test_cameras_beside_those_of_the_photographs(data):
+    scene = read(data)
+    views = Distil(jitter=0.01, copies=40).views(scene.train)
+    there = torch.stack([view.camera.centre for view in scene.train]).repeat(40, 1)
+    shift = torch.stack([view.camera.centre for view in views]) - there
+    assert len(views) == 40 * len(scene.train)
+    assert float(shift.std()) == pytest.approx(0.01, rel=0.1) and abs(float(shift.mean())) < 0.002
+    turned = [view.camera.world_to_camera[:3, :3] for view in views[: len(scene.train)]]
+    assert all(torch.equal(a, b.camera.world_to_camera[:3, :3]) for a, b in zip(turned, scene.train, strict=True))
+    assert [v.camera.centre.tolist() for v in Distil().views(scene.train)] == [
+        v.camera.centre.tolist() for v in Distil().views(scene.train)
+    ]
+
+
+def test_citygaussian():
+    recover, distil = FIRST.refine
+    assert recover.stage.prune == (Importance(at=(0,), ratio=0.5),) and recover.stage.steps == 30_000
+    assert with_steps(FIRST, 1_000).refine[0].stage.prune[0].at == (0,), "at once, whatever the length"
+    for rates, stage, fall, each in ((RECOVERY, recover.stage, 0.95, 400), (DISTILLATION, distil.stage, 0.9, 500)):
+        ratio = rates["sh0"].at(each * 2, stage.steps) / rates["sh0"].at(each, stage.steps)
+        assert ratio == pytest.approx(fall, rel=1e-3)
+    assert DISTILLATION["means"].start == pytest.approx(RECOVERY["means"].at(30_000, 40_000), rel=0.01)
+    assert DISTILLATION["opacities"].at(5, 10) == 0
+
+
+@pytest.mark.parametrize("wrong", [{"sh_degree": 4}, {"jitter": -1.0}, {"copies": 0}])
+def test_settings_that_cannot_be(wrong):
+    with pytest.raises(BadInput, match="distil"):
+        Distil(**wrong)
