@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from surfkit.core.journal import kept
 from surfkit.folder import Run, discard_results
 from surfkit.optimise import Job, drawing, optimise, saved
 from surfkit.primitives.points import Columns
@@ -51,8 +52,10 @@ def _gone_through(site: Site, before: Run, given: StageState) -> StageState:
     losses = this.stage.losses
     shown = _drawn(before, given, scene, site.rasterizer) if refine.taught else None
     shown = shown or read_ahead(this.data, scene, losses, site.store)
-    every = replace(site.every, pictures=0)
-    return optimise(Job(this, scene, site.rasterizer, every, shown, Meter(), start, given), state)
+    every, folder = replace(site.every, pictures=0), this.checkpoint.parent
+    folder.mkdir(exist_ok=True)
+    with kept(folder):  # its steps are counted anew
+        return optimise(Job(this, scene, site.rasterizer, every, shown, Meter(), start, given), state)
 
 
 def seen_by(this: Run, scene: Scene) -> Scene:

@@ -24,6 +24,7 @@ COMMANDS = {
     "evaluate": "Measure a finished run on photographs it has not seen, or its mesh against true geometry.",
     "doctor": "Examine a data set before training: faults, and what a run takes.",
     "status": "Tell where a run stands.",
+    "curves": "Draw how the points, the loss or the memory of runs went, step by step.",
     "export": "Write the result of a run for other programs.",
     "prepare": "Make what a data set may need before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",

@@ -70,6 +70,9 @@ def test_what_is_left(finished):
     assert splats.means.shape == (100, 3) and splats.sh_rest.shape == (100, 3, 3)
     this, state, _ = load_run(finished)
     assert this.part == "refine1" and this.primitive.sh_degree == 1 and state.index == 6
+    for folder, steps in ((finished, 6), (finished / "refine0", 4), (finished / "refine1", 6)):
+        lines = map(json.loads, (folder / "events.jsonl").read_text().splitlines())
+        assert [line["index"] for line in lines if line["event"] == "StepDone"] == [*range(1, steps + 1)]
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["points"] == 100
     spent = [state_of(finished, part).cpu_seconds for part in ("tune", "refine0", "refine1")]
