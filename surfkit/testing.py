@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from surfkit.mesh.base import Mesher, Subject
     from surfkit.partition.base import Partition, Sight
     from surfkit.primitives.base import Primitive
-    from surfkit.primitives.points import Points
+    from surfkit.primitives.points import Columns, Points
     from surfkit.raster.api import Maps
+    from surfkit.refine.base import Refine
+    from surfkit.scene.scene import View
 
 
 def check_component(part: Component) -> None:
@@ -224,6 +226,34 @@ def check_partition(partition: Partition, sight: Sight) -> None:
     owners = torch.stack(single).sum(0)
     assert int(owners.min()) == 1, "a place has no owner"
     assert int(owners.max()) == 1, "a place has two owners"
+
+
+def check_refine(refine: Refine, primitive: Primitive, params: Columns, views: Sequence[View]) -> None:
+    """It begins with points that its primitive can draw, changes none of those given, and sees the same views again.
+
+    Args:
+        refine: To check.
+        primitive: What the points are before.
+        params: N of them.
+        views: Of the training photographs.
+    """
+    import torch
+
+    from surfkit.scene.scene import Cloud
+
+    name, before = type(refine).__name__, {key: value.clone() for key, value in params.items()}
+    begun, after = refine.params(params), refine.primitive(primitive)
+    assert all(torch.equal(value, before[key]) for key, value in params.items()), f"{name} changed what it was given"
+    fresh = after.init(Cloud(torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0))
+    shapes, wanted = ({key: value.shape[1:] for key, value in columns.items()} for columns in (begun, fresh))
+    assert shapes == wanted, f"{name}: its points have the columns {shapes}, and what they are then has {wanted}"
+    assert len({len(value) for value in begun.values()}) == 1, f"{name}: the columns differ in length"
+    assert set(refine.stage.rates) == set(begun), f"{name}: stage.rates and the columns of the points differ"
+    assert after.shape(begun, after.sh_degree).sh.shape[1] == (after.sh_degree + 1) ** 2
+    seen, again = ([view.camera.centre.tolist() for view in refine.views(views)] for _ in range(2))
+    assert seen and seen == again, f"{name}: its views are not the same again"
+    there = [view.camera.centre.tolist() for view in views]
+    assert refine.taught or seen == there, f"{name} has photographs of the training views only"
 
 
 def check_mesher(mesher: Mesher, subject: Subject) -> None:

@@ -9,6 +9,7 @@ import torch
 from surfkit import optimise
 from surfkit.blocks import Hands
 from surfkit.core.check import BadInput
+from surfkit.core.registry import components
 from surfkit.densify.prune import Importance
 from surfkit.optimise import Every
 from surfkit.partition import PictureShare, QuantileGrid
@@ -17,12 +18,13 @@ from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
 from surfkit.recipe import Recipe
 from surfkit.recipes.city import FIRST
-from surfkit.refine import Distil, Recover
+from surfkit.refine import Distil, Recover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
 from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing import check_refine
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 
@@ -160,6 +162,31 @@ def test_citygaussian():
         assert ratio == pytest.approx(fall, rel=1e-3)
     assert DISTILLATION["means"].start == pytest.approx(RECOVERY["means"].at(30_000, 40_000), rel=0.01)
     assert DISTILLATION["opacities"].at(5, 10) == 0
+
+
+class Keeps(Distil):
+    """Says that colours are simpler than they are."""
+
+    def params(self, params):
+        return params
+
+
+class Wanders(Recover):
+    """Looks from where there is no photograph."""
+
+    def views(self, views):
+        return Distil().views(views)
+
+
+@pytest.mark.parametrize("refine", [*(cls() for cls in components(Refine).values()), Keeps(), Wanders()])
+def test_conformance(refine, data):
+    scene, primitive = read(data), Gaussian3D(sh_degree=3)
+    params = primitive.init(scene.cloud, torch.Generator().manual_seed(0))
+    if isinstance(refine, (Keeps, Wanders)):
+        with pytest.raises(AssertionError, match=type(refine).__name__):
+            check_refine(refine, primitive, params, scene.train)
+    else:
+        check_refine(refine, primitive, params, scene.train)
 
 
 @pytest.mark.parametrize("wrong", [{"sh_degree": 4}, {"jitter": -1.0}, {"copies": 0}])
