@@ -36,13 +36,17 @@ class Ground:
 
     @classmethod
     def under(cls, centres: Tensor, points: Tensor) -> Ground:
-        """The plane along which cameras, (V, 3), spread the most, or points, (N, 3), where those stand in a line.
+        """The plane along which cameras, (V, 3), spread the most, or points, (N, 3), where cameras tell less.
 
-        If it is nearly a plane of two axes of the frame, as in a georeferenced scene, it is that one.
+        That is where they stand in a line, or where a kite or a walk has taken them up and down, and the points lie
+        twice as flat. If it is nearly a plane of two axes of the frame, as in a georeferenced scene, it is that one.
         """
         spread, axes = _axes(centres)
-        if len(centres) < 3 or spread[1] < 0.05 * spread[2]:
-            axes = _axes(points)[1]
+        depth, others = _axes(_without_far(points))
+        in_line = len(centres) < 3 or spread[1] < 0.05 * spread[2]
+        up_and_down = spread[0] > 0.1 * spread[1] and 2 * depth[0] * spread[1] < spread[0] * depth[1]
+        if in_line or up_and_down:
+            axes = others
         up = axes[:, 0]
         if float(up.abs().max()) >= UPRIGHT:
             flat = [axis for axis in range(3) if axis != int(up.abs().argmax())]
@@ -55,6 +59,12 @@ class Ground:
     def flat(self, points: Tensor) -> Tensor:
         """(N, 2) float64 places on the ground of (N, 3) points."""
         return points.double() @ torch.tensor([self.x, self.y], dtype=torch.float64).T
+
+
+def _without_far(points: Tensor) -> Tensor:
+    """(M, 3) the points without the twentieth that is farthest from their middle."""
+    distance = (points - points.median(0).values).norm(dim=1)
+    return points[distance <= distance.sort().values[int(0.95 * (len(points) - 1))]]
 
 
 def _axes(points: Tensor) -> tuple[Tensor, Tensor]:

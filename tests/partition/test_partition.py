@@ -137,6 +137,17 @@ def test_ground_of_a_tilted_flight():
     assert Ground.under(line, flat) == FLAT
 
 
+def test_the_ground_under_a_kite_is_that_of_the_points():
+    """Cameras spread more in height than to one side; a twentieth of the points hangs far away in the sky."""
+    generator = torch.Generator().manual_seed(3)
+    cameras = torch.randn(30, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 0.3, 0.8])
+    points = torch.randn(1_000, 3, generator=generator, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.1])
+    points[:45] += 50
+    assert Ground.under(cameras, points) == FLAT
+    steady = cameras * torch.tensor([1.0, 1.0, 0.01])
+    assert Ground.under(steady, points[:, [0, 2, 1]]) == FLAT, "a flight at one height, past a wall"
+
+
 def test_rows_of_equal_count():
     sight = city()
     cells = QuantileGrid((3, 1)).cells(sight)
