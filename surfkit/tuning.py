@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import StepDone
 from surfkit.core.files import sweep
@@ -28,9 +30,9 @@ from surfkit.partition.state import read_state, write_state
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import Scene, View
-from surfkit.train import checkpoint
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
+from surfkit.train.pieces import Stored, open_last
 from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
@@ -140,21 +142,29 @@ class Start:
 
     def __call__(self) -> Columns:
         """Their raw parameters."""
+        kept = [self.wanted(piece) for piece in coarse_model(self.site.this).pieces()]
+        return {name: torch.cat([part[name] for part in kept]) for name in kept[0]}
+
+    def wanted(self, piece: StageState) -> Columns:
+        """Those among some points of the coarse model."""
         site = self.site
-        found = checkpoint.load_last(replace(site.this, part="pretrain").checkpoint)
-        if found is None:
-            raise BadInput(f"{site.this.out}: the coarse model is gone; give its surfkit train command again")
-        coarse = found[0]
-        params = site.this.recipe.pretrain.finished(coarse)
-        wanted = self.blocks.cells.owner(params["means"]) == self.index
-        sight = sight_of(site, coarse)
+        params, sight = site.this.recipe.pretrain.finished(piece), sight_of(site, piece)
+        rows = self.blocks.cells.owner(params["means"]) == self.index
         for view in self.views:
-            wanted |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
-        return {name: value[wanted].clone() for name, value in params.items()}
+            rows |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+        return {name: value[rows] for name, value in params.items()}
+
+
+def coarse_model(this: Run) -> Stored:
+    """The coarse model of a run, which stays on disk."""
+    found = open_last(replace(this, part="pretrain").checkpoint)
+    if found is None:
+        raise BadInput(f"{this.out}: the coarse model is gone; give its surfkit train command again")
+    return found[0]
 
 
 def sight_of(site: Site, coarse: StageState) -> Sight:
-    """The coarse model, to be looked at."""
+    """The coarse model, or some points of it, to be looked at."""
     stage = site.this.recipe.pretrain
     splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
     splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})

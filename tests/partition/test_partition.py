@@ -21,7 +21,7 @@ from surfkit.partition import (
     SSIMDifference,
 )
 from surfkit.partition.base import Contraction, Ground
-from surfkit.partition.merge import merge
+from surfkit.partition.merge import Merge
 from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough
 from surfkit.testing import check_partition
 
@@ -216,6 +216,18 @@ def test_small_scenes_need_fewer_views():
     assert Fewest().of(5_000, 16) == 50 and Fewest().of(30, 4) == 2 and Fewest().of(3, 8) == 1
 
 
+def merged(cells, coarse, tuned, skipped=frozenset()):
+    """All blocks as one, from pieces of 7 points; and what each gave."""
+
+    def pieces(params):
+        rows = range(0, len(params["means"]), 7)
+        return lambda: ({name: value[at : at + 7] for name, value in params.items()} for at in rows)
+
+    merge = Merge(cells, pieces(coarse), {index: pieces(params) for index, params in tuned.items()}, skipped)
+    parts = list(merge.pieces())
+    return {name: torch.cat([part[name] for part in parts]) for name in coarse}, merge.shares()
+
+
 def test_merged_points_come_from_their_owner_once():
     sight = city()
     cells = QuantileGrid((2, 2)).cells(sight)
@@ -225,7 +237,7 @@ def test_merged_points_come_from_their_owner_once():
         means = sight.splats.means + 0.05 * torch.randn(len(sight.splats), 3, generator=draws)
         tuned[index] = {"means": means, "mark": torch.full((len(means),), index)}
     coarse = {"means": sight.splats.means, "mark": torch.full((len(sight.splats),), -1)}
-    whole, shares = merge(cells, coarse, tuned)
+    whole, shares = merged(cells, coarse, tuned)
     assert torch.equal(cells.owner(whole["means"]), whole["mark"])
     assert [share.kept for share in shares] == [int((cells.owner(t["means"]) == i).sum()) for i, t in tuned.items()]
     assert len(whole["mark"]) == sum(share.kept for share in shares) and not any(share.filled for share in shares)
@@ -237,8 +249,8 @@ def test_a_hole_is_refused_or_filled():
     coarse = {"means": sight.splats.means}
     tuned = {index: coarse for index in (0, 1, 3)}
     with pytest.raises(BadInput, match="blocks 2 are not tuned"):
-        merge(cells, coarse, tuned)
-    whole, shares = merge(cells, coarse, tuned, frozenset({2}))
+        merged(cells, coarse, tuned)
+    whole, shares = merged(cells, coarse, tuned, frozenset({2}))
     assert [share.filled for share in shares] == [False, False, True, False]
     assert torch.equal(whole["means"].sort(0).values, sight.splats.means.sort(0).values)
 
