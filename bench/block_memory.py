@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -33,10 +32,11 @@ MAKE = """
 import sys, torch
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks import Record
+from surfkit.blocks import Record, extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.folder import Run
+from surfkit.optimise import Every
 from surfkit.partition import QuantileGrid, Sight
 from surfkit.partition.plan import Plan, blocks_of
 from surfkit.primitives.points import Points
@@ -44,8 +44,10 @@ from surfkit.raster.select import select
 from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.train import checkpoint
+from surfkit.train.material import Store
 from surfkit.train.stage import Stage, StageState
 from surfkit.train.views import Order
+from surfkit.tuning import Site
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 data = Data(Path(sys.argv[1]), test_every=0)
@@ -60,7 +62,9 @@ cells = recipe.partition.cells(sight)
 inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
 write_json(out / "recipe.json", recipe)
 write_json(out / "run.json", {"data": data})
-write_json(out / "blocks" / "plan.json", Record(steps, Plan(cells, blocks_of(sight, cells, inside, inside))))
+plan = Plan(cells, blocks_of(sight, cells, inside, inside))
+write_json(out / "blocks" / "plan.json", Record(steps, plan))
+extract_views(Site(this, scene, sight.rasterizer, Every(), Store()), plan)
 """
 
 FINISH = """
@@ -144,7 +148,6 @@ def measured(tiles: int, points: int, steps: int) -> dict[str, float]:
         parts = [json.loads(line) for line in (out / "blocks" / f"{int(block):03}" / "events.jsonl").open()]
         begun = next(line["points"] for line in parts if line["event"] == "StageBegan")
         coarse = (out / "pretrain" / "checkpoint.safetensors").stat().st_size / 1e6
-        shutil.rmtree(out / "blocks" / f"{int(block):03}")
         subprocess.run([sys.executable, "-c", FINISH, str(out)], check=True)
         merging = peak_mb("block_memory.py", "--merge", str(out))
     return {"tuning": tuned, "merging": merging, "points of the block": begun, "coarse checkpoint": coarse}
@@ -157,12 +160,13 @@ def merge(out: Path) -> None:
     from surfkit.optimise import Every
     from surfkit.pipeline import opened
     from surfkit.raster.select import select
-    from surfkit.scene.read import read
+    from surfkit.scene import extract
     from surfkit.train.material import Store
-    from surfkit.tuning import Site, coarse_model
+    from surfkit.tuning import Site, coarse_model, views_file
 
     this = opened(out)
-    site = Site(this, read(this.data), select("cpu")[0], Every(pictures=0), Store("100MB"))
+    scene = extract.load(views_file(out, 0)).scene  # the driver has read the data set for other reasons
+    site = Site(this, scene, select("cpu")[0], Every(pictures=0), Store("100MB"))
     plan = read_json(out / "blocks" / "plan.json", Record).plan
     assert put_together(site, plan, coarse_model(this))
 

@@ -27,8 +27,12 @@ from surfkit.partition.plan import Fewest, Plan, plan
 from surfkit.partition.state import read_state, worked_on, write_state
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
+from surfkit.scene import extract
+from surfkit.scene.depth_prior import Anchors, typical_inverse_depth
+from surfkit.scene.read import observations
 from surfkit.train import checkpoint, pieces
 from surfkit.train.look import fresh_looks
+from surfkit.train.material import need_priors
 from surfkit.train.pieces import Stored
 from surfkit.train.stage import Stage, StageState
 from surfkit.train.views import Order
@@ -36,9 +40,9 @@ from surfkit.tuning import BUSY, Site, coarse_model, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
-PROGRAM_BYTES, POINT_BYTES, COARSE_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 700, 150
+PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
 """What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
-moments, gradients, records of the rasterizer), for each of the coarse model, and for each pixel of a photograph."""
+moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
 
@@ -88,6 +92,7 @@ def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
     """
     final, coarse = replace(site.this, part="tune"), coarse_model(site.this)
     record = planned(site, coarse)
+    extract_views(site, record.plan)
     state = merged(site, record)
     if state is not None:
         return final, state
@@ -133,6 +138,19 @@ def planned(site: Site, coarse: Stored) -> Record:
             f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
         )
     return made
+
+
+def extract_views(site: Site, blocks: Plan) -> None:
+    """Write the views of each block into its folder, with what sparse points say of their depths if a loss asks."""
+    missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
+    scene = site.scene
+    needed = missing and need_priors(site.this.recipe.tune.losses)
+    tracks = observations(site.this.data, scene) if needed else None
+    for block in missing:
+        part, anchors = extract.part_of(scene, block.views), None
+        if tracks is not None:
+            anchors = Anchors(tracks.of_views(part.train), typical_inverse_depth(part.train, tracks, scene))
+        extract.save(site.views(block.index), extract.Extract(part, anchors))
 
 
 def merged(site: Site, record: Record) -> StageState | None:
@@ -227,11 +245,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         call=lambda: guarded(site, blocks, index),
         command=tuple(command),
         cost=block.work,
-        memory_bytes=PROGRAM_BYTES
-        + growth * POINT_BYTES * block.points
-        + COARSE_BYTES * sum(other.points for other in blocks.blocks)
-        + PIXEL_BYTES * pixels
-        + min(share, photos),
+        memory_bytes=PROGRAM_BYTES + growth * POINT_BYTES * block.points + PIXEL_BYTES * pixels + min(share, photos),
     )
 
 

@@ -29,6 +29,7 @@ from surfkit.partition.plan import Plan
 from surfkit.partition.state import read_state, write_state
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
+from surfkit.scene import extract
 from surfkit.scene.scene import Scene, View
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
@@ -47,7 +48,7 @@ class Site:
 
     Attributes:
         this: The run.
-        scene: Its data.
+        scene: Its data, or those of the block that is worked on.
         rasterizer: What draws.
         every: When a block writes what.
         store: Where its photographs are kept at hand.
@@ -68,6 +69,10 @@ class Site:
         """The folder of one block."""
         return self.folder / f"{index:03}"
 
+    def views(self, index: int) -> Path:
+        """Where the views of a block are."""
+        return views_file(self.this.out, index)
+
     def folders(self) -> list[Path]:
         """Those of the blocks that somebody has begun."""
         return sorted(self.folder.glob("[0-9]*"))
@@ -75,6 +80,11 @@ class Site:
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
         return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+
+
+def views_file(out: Path, index: int) -> Path:
+    """Where the views of a block of a run are, so that nobody need read the data set to tune it."""
+    return out / "blocks" / f"{index:03}" / "views.npz"
 
 
 def guarded(site: Site, blocks: Plan, index: int) -> int:
@@ -112,18 +122,16 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
 def tune(site: Site, blocks: Plan, index: int) -> None:
     """Tune one block from where it stands to its end."""
     block = site.block(index)
-    wanted = set(blocks.blocks[index].views)
-    views = tuple(view for view in site.scene.train if view.name in wanted)
-    scene = replace(site.scene, train=views, held_out=())
-    steps, folder = block.stage.steps, block.out
+    part = extract.load(site.views(index))
+    scene, steps, folder = part.scene, block.stage.steps, block.out
     state = saved(block, scene, repair=True)
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
     write_state(folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None)
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
+        given = read_ahead(site.this.data, scene, block.stage.losses, site.store, part.anchors)
         every = replace(site.every, pictures=0)
-        start = Start(site, blocks, index, views)
+        start = Start(site, blocks, index, scene.train)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
     write_state(folder, status="done", step=state.index, steps=steps)
 
