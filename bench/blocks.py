@@ -33,7 +33,6 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.scene.scene import View
-from surfkit.train import checkpoint
 from surfkit.train.material import Store
 from surfkit.tuning import Site
 
@@ -49,14 +48,13 @@ def tuning(steps: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         data, out = Data(EXAMPLE, scale=2.0), Path(folder) / "run"
         run(replace(recipe, partition=None), data, out, Hands("cpu"), Every(pictures=0))
-        coarse = checkpoint.load_last(out / "pretrain" / "checkpoint.safetensors")[0]
         for workers in (1, 2):
             write_json(out / "recipe.json", recipe)
             for old in ("blocks", "tune"):
                 shutil.rmtree(out / old, ignore_errors=True)
             site = Site(Run(out, recipe, data), read(data), select("cpu")[0], Every(pictures=0), Store("1GB"))
             began = time.perf_counter()
-            tuned(site, coarse, Hands("cpu", Pool(workers=workers, threads=1)))
+            tuned(site, Hands("cpu", Pool(workers=workers, threads=1)))
             seconds[f"{workers} workers s"] = time.perf_counter() - began
     return seconds | {"faster with 2": seconds["1 workers s"] / seconds["2 workers s"]}
 

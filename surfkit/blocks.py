@@ -21,23 +21,28 @@ from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.folder import Run, discard_results, say
 from surfkit.partition import executor
 from surfkit.partition.executor import Executor, Inline
-from surfkit.partition.merge import Share, merge
+from surfkit.partition.merge import Merge, Pieces, Share
 from surfkit.partition.picture import plan_picture
 from surfkit.partition.plan import Fewest, Plan, plan
 from surfkit.partition.state import read_state, worked_on, write_state
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
-from surfkit.train import checkpoint
+from surfkit.scene import extract
+from surfkit.scene.depth_prior import Anchors, typical_inverse_depth
+from surfkit.scene.read import observations
+from surfkit.train import checkpoint, pieces
 from surfkit.train.look import fresh_looks
-from surfkit.train.stage import StageState
+from surfkit.train.material import need_priors
+from surfkit.train.pieces import Stored
+from surfkit.train.stage import Stage, StageState
 from surfkit.train.views import Order
-from surfkit.tuning import BUSY, Site, guarded, sight_of
+from surfkit.tuning import BUSY, Site, coarse_model, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
-PROGRAM_BYTES, POINT_BYTES, COARSE_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 700, 150
+PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
 """What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
-moments, gradients, records of the rasterizer), for each of the coarse model, and for each pixel of a photograph."""
+moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
 
@@ -74,20 +79,20 @@ class Record:
     plan: Plan
 
 
-def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState]:
+def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
     """The run with the state of all blocks together; what is done already is not done again.
 
     Args:
-        site: Run, data and means.
-        coarse: The state after pretraining.
+        site: Run, data and means; the coarse model is in its folder.
         hands: Who tunes the blocks.
 
     Raises:
         Unfinished: Blocks failed, also when they were tried again.
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
-    final = replace(site.this, part="tune")
+    final, coarse = replace(site.this, part="tune"), coarse_model(site.this)
     record = planned(site, coarse)
+    extract_views(site, record.plan)
     state = merged(site, record)
     if state is not None:
         return final, state
@@ -95,13 +100,12 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     while state is None:
         await_workers(site)
         work(site, record.plan, hands)
-        state = put_together(site, record.plan, coarse)
-    checkpoint.save(final.checkpoint, state)
-    emit(FileWritten(final.checkpoint, "merged blocks"))
+        if put_together(site, record.plan, coarse):
+            state = checkpoint.load(final.checkpoint)
     return final, state
 
 
-def planned(site: Site, coarse: StageState) -> Record:
+def planned(site: Site, coarse: Stored) -> Record:
     """The plan in the folder, or a new one; blocks of another coarse model are put aside."""
     path = site.folder / "plan.json"
     if path.exists():
@@ -111,7 +115,7 @@ def planned(site: Site, coarse: StageState) -> Record:
             raise BadInput(
                 f"{path}: names a view that is not there, {min(unknown)}; delete {site.folder} to plan again"
             )
-        if record.coarse_steps == coarse.index:
+        if record.coarse_steps == coarse.state.index:
             return record
     if site.folders():  # of another coarse model, or of a plan that is gone
         await_workers(site)
@@ -121,8 +125,8 @@ def planned(site: Site, coarse: StageState) -> Record:
         checkpoint.discard(replace(site.this, part="tune").checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
     recipe = site.this.recipe
-    sight = sight_of(site, coarse)
-    made = Record(coarse.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
+    sight = sight_of(site, checkpoint.load(coarse.path))
+    made = Record(coarse.state.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
     picture = site.folder / "plan.png"
     plan_picture(picture, sight, made.plan)
     emit(FileWritten(picture, "picture of the blocks"))
@@ -134,6 +138,19 @@ def planned(site: Site, coarse: StageState) -> Record:
             f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
         )
     return made
+
+
+def extract_views(site: Site, blocks: Plan) -> None:
+    """Write the views of each block into its folder, with what sparse points say of their depths if a loss asks."""
+    missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
+    scene = site.scene
+    needed = missing and need_priors(site.this.recipe.tune.losses)
+    tracks = observations(site.this.data, scene) if needed else None
+    for block in missing:
+        part, anchors = extract.part_of(scene, block.views), None
+        if tracks is not None:
+            anchors = Anchors(tracks.of_views(part.train), typical_inverse_depth(part.train, tracks, scene))
+        extract.save(site.views(block.index), extract.Extract(part, anchors))
 
 
 def merged(site: Site, record: Record) -> StageState | None:
@@ -228,55 +245,69 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         call=lambda: guarded(site, blocks, index),
         command=tuple(command),
         cost=block.work,
-        memory_bytes=PROGRAM_BYTES
-        + growth * POINT_BYTES * block.points
-        + COARSE_BYTES * sum(other.points for other in blocks.blocks)
-        + PIXEL_BYTES * pixels
-        + min(share, photos),
+        memory_bytes=PROGRAM_BYTES + growth * POINT_BYTES * block.points + PIXEL_BYTES * pixels + min(share, photos),
     )
 
 
-def put_together(site: Site, blocks: Plan, coarse: StageState) -> StageState | None:
-    """All blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
+def put_together(site: Site, blocks: Plan, coarse: Stored) -> bool:
+    """Write all blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
 
-    None if a result is not what its state says; that block is planned again.
+    False if a result is not what its state says; that block is planned again.
     """
-    recipe = site.this.recipe
-    tune_stage, params = recipe.tune, recipe.pretrain.finished(coarse)
+    recipe, final = site.this.recipe, replace(site.this, part="tune")
     skipped = frozenset(block.index for block in blocks.blocks if not block.views)
-    states: dict[int, StageState] = {}
-    for index in range(len(blocks.blocks)):
-        if index not in skipped and (state := sound(site, index)) is not None:
-            states[index] = state
-    if len(states) + len(skipped) < len(blocks.blocks):
-        return None
-    results = {index: tune_stage.finished(state) for index, state in states.items()}
-    whole, shares = merge(blocks.cells, params, results, skipped)
+    results = {index: sound(site, index) for index in range(len(blocks.blocks)) if index not in skipped}
+    found = {index: result for index, result in results.items() if result is not None}
+    if len(found) < len(results):
+        return False
+    tuned_pieces = {index: finished(recipe.tune, result) for index, result in found.items()}
+    merge = Merge(blocks.cells, finished(recipe.pretrain, coarse), tuned_pieces, skipped)
+    shares = merge.shares()
     note(site, shares)
-    state = StageState(Points.fresh(whole), Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed))
-    state.index = tune_stage.steps
-    state.seconds = coarse.seconds + sum(part.seconds for part in states.values())
-    state.cpu_seconds = coarse.cpu_seconds + sum(part.cpu_seconds for part in states.values())
-    state.peak_memory_bytes = max(part.peak_memory_bytes for part in (coarse, *states.values()))
-    state.sh_degree = max(part.sh_degree for part in (coarse, *states.values()))
-    if tune_stage.appearance is not None:  # the blocks' own are folded into their colours
-        state.looks = fresh_looks(tune_stage.appearance, len(site.scene.train))
+    points = sum(share.kept for share in shares)
+    parts = [result.state for result in (coarse, *found.values())]
+    pieces.save(final.checkpoint, together(site, parts, points), merge.pieces())
+    emit(FileWritten(final.checkpoint, "merged blocks"))
+    return True
+
+
+def finished(stage: Stage, stored: Stored) -> Pieces:
+    """The points of a state as they leave its stage."""
+    return lambda: (stage.finished(piece) for piece in stored.pieces())
+
+
+def together(site: Site, parts: Sequence[StageState], points: int) -> StageState:
+    """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
+    recipe = site.this.recipe
+    like = parts[0].points.params
+    params = {
+        name: torch.empty(points, *value.shape[1:], dtype=value.dtype, device="meta") for name, value in like.items()
+    }
+    order, generator = Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed)
+    state = StageState(Points(params, {}, {}), order, generator, index=recipe.tune.steps)
+    state.seconds = sum(part.seconds for part in parts)
+    state.cpu_seconds = sum(part.cpu_seconds for part in parts)
+    state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
+    state.sh_degree = max(part.sh_degree for part in parts)
+    if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
+        state.looks = fresh_looks(recipe.tune.appearance, len(site.scene.train))
     return state
 
 
-def sound(site: Site, index: int) -> StageState | None:
+def sound(site: Site, index: int) -> Stored | None:
     """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
     path, steps = site.block(index).checkpoint, site.this.recipe.tune.steps
     try:
-        found = checkpoint.load_last(path)
+        found = pieces.open_last(path)
     except BadInput as error:
         emit(Warned(f"block {index} is tuned from its beginning again: {error}"))
         checkpoint.discard(path)
         found = None
-    if found is not None and found[0].index >= steps:
+    step = found[0].state.index if found else 0
+    if found is not None and step >= steps:
         return found[0]
-    emit(Warned(f"block {index} has lost steps: its checkpoint is of {found[0].index if found else 0}, not of {steps}"))
-    write_state(site.place(index), status="planned", step=found[0].index if found else 0)
+    emit(Warned(f"block {index} has lost steps: its checkpoint is of {step}, not of {steps}"))
+    write_state(site.place(index), status="planned", step=step)
     return None
 
 

@@ -116,7 +116,8 @@ def run(
                 state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
-                this, state = tuned(Site(this, scene, rasterizer, every, store), state, hands)
+                state = None  # it is in the folder
+                this, state = tuned(Site(this, scene, rasterizer, every, store), hands)
             this, state = refined(Site(this, scene, rasterizer, every, store), state)
             if not unfinished and this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
                 say(f"{out} is finished; delete {this.metrics.name} in it to measure again")

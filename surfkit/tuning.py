@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import StepDone
 from surfkit.core.files import sweep
@@ -27,10 +29,11 @@ from surfkit.partition.plan import Plan
 from surfkit.partition.state import read_state, write_state
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
+from surfkit.scene import extract
 from surfkit.scene.scene import Scene, View
-from surfkit.train import checkpoint
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
+from surfkit.train.pieces import Stored, open_last
 from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
@@ -45,7 +48,7 @@ class Site:
 
     Attributes:
         this: The run.
-        scene: Its data.
+        scene: Its data, or those of the block that is worked on.
         rasterizer: What draws.
         every: When a block writes what.
         store: Where its photographs are kept at hand.
@@ -66,6 +69,10 @@ class Site:
         """The folder of one block."""
         return self.folder / f"{index:03}"
 
+    def views(self, index: int) -> Path:
+        """Where the views of a block are."""
+        return views_file(self.this.out, index)
+
     def folders(self) -> list[Path]:
         """Those of the blocks that somebody has begun."""
         return sorted(self.folder.glob("[0-9]*"))
@@ -73,6 +80,11 @@ class Site:
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
         return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+
+
+def views_file(out: Path, index: int) -> Path:
+    """Where the views of a block of a run are, so that nobody need read the data set to tune it."""
+    return out / "blocks" / f"{index:03}" / "views.npz"
 
 
 def guarded(site: Site, blocks: Plan, index: int) -> int:
@@ -110,18 +122,16 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
 def tune(site: Site, blocks: Plan, index: int) -> None:
     """Tune one block from where it stands to its end."""
     block = site.block(index)
-    wanted = set(blocks.blocks[index].views)
-    views = tuple(view for view in site.scene.train if view.name in wanted)
-    scene = replace(site.scene, train=views, held_out=())
-    steps, folder = block.stage.steps, block.out
+    part = extract.load(site.views(index))
+    scene, steps, folder = part.scene, block.stage.steps, block.out
     state = saved(block, scene, repair=True)
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
     write_state(folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None)
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
+        given = read_ahead(site.this.data, scene, block.stage.losses, site.store, part.anchors)
         every = replace(site.every, pictures=0)
-        start = Start(site, blocks, index, views)
+        start = Start(site, blocks, index, scene.train)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
     write_state(folder, status="done", step=state.index, steps=steps)
 
@@ -140,21 +150,29 @@ class Start:
 
     def __call__(self) -> Columns:
         """Their raw parameters."""
+        kept = [self.wanted(piece) for piece in coarse_model(self.site.this).pieces()]
+        return {name: torch.cat([part[name] for part in kept]) for name in kept[0]}
+
+    def wanted(self, piece: StageState) -> Columns:
+        """Those among some points of the coarse model."""
         site = self.site
-        found = checkpoint.load_last(replace(site.this, part="pretrain").checkpoint)
-        if found is None:
-            raise BadInput(f"{site.this.out}: the coarse model is gone; give its surfkit train command again")
-        coarse = found[0]
-        params = site.this.recipe.pretrain.finished(coarse)
-        wanted = self.blocks.cells.owner(params["means"]) == self.index
-        sight = sight_of(site, coarse)
+        params, sight = site.this.recipe.pretrain.finished(piece), sight_of(site, piece)
+        rows = self.blocks.cells.owner(params["means"]) == self.index
         for view in self.views:
-            wanted |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
-        return {name: value[wanted].clone() for name, value in params.items()}
+            rows |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+        return {name: value[rows] for name, value in params.items()}
+
+
+def coarse_model(this: Run) -> Stored:
+    """The coarse model of a run, which stays on disk."""
+    found = open_last(replace(this, part="pretrain").checkpoint)
+    if found is None:
+        raise BadInput(f"{this.out}: the coarse model is gone; give its surfkit train command again")
+    return found[0]
 
 
 def sight_of(site: Site, coarse: StageState) -> Sight:
-    """The coarse model, to be looked at."""
+    """The coarse model, or some points of it, to be looked at."""
     stage = site.this.recipe.pretrain
     splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
     splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})

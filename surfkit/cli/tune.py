@@ -15,11 +15,11 @@ from surfkit.folder import noted
 from surfkit.optimise import CHECKPOINT_EVERY, Every, drawer
 from surfkit.pipeline import opened
 from surfkit.raster.select import Device
-from surfkit.scene.read import read
+from surfkit.scene import extract
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store
-from surfkit.tuning import Site, guarded
+from surfkit.tuning import Site, guarded, views_file
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,10 @@ class Tune:
         store.bytes()
         with noted(), in_one_line(self.run_folder), bars():
             rasterizer, _ = drawer(self.device)
-            return guarded(Site(this, read(this.data), rasterizer, every, store), plan, self.block)
+            scene = extract.load(
+                views_file(this.out, self.block)
+            ).scene  # the data set is not read: it may be much larger
+            return guarded(Site(this, scene, rasterizer, every, store), plan, self.block)
 
 
 COMMAND = Tune

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 
 from surfkit.core.registry import Component, hookimpl
+from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
 from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, Partition, Sight
+from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.executor import Executor, Inline, Pool
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
 
@@ -16,17 +18,21 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     return {
         "contracted-grid": ContractedGrid,
         "quantile-grid": QuantileGrid,
+        "camera-grid": CameraGrid,
         "balanced": Balanced,
         "ssim-difference": SSIMDifference,
         "picture-share": PictureShare,
+        "airspace": Airspace,
         "inline": Inline,
         "pool": Pool,
     }
 
 
 __all__ = [
+    "Airspace",
     "Assign",
     "Balanced",
+    "CameraGrid",
     "Cells",
     "ContractedGrid",
     "Executor",

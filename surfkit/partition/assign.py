@@ -36,7 +36,7 @@ class SSIMDifference(Assign):
     """Smallest difference with which a view joins; 0.01 for streets."""
 
     def __post_init__(self) -> None:
-        _check(self.threshold, "ssim-difference")
+        check_threshold(self.threshold, "ssim-difference")
 
     @property
     def least(self) -> float:
@@ -64,7 +64,7 @@ class PictureShare(Assign):
     """Smallest share with which a view joins."""
 
     def __post_init__(self) -> None:
-        _check(self.threshold, "picture-share")
+        check_threshold(self.threshold, "picture-share")
 
     @property
     def least(self) -> float:
@@ -80,6 +80,7 @@ class PictureShare(Assign):
         return share
 
 
-def _check(threshold: float, name: str) -> None:
+def check_threshold(threshold: float, name: str) -> None:
+    """BadInput unless some view can join."""
     if not 0 <= threshold < 1:
         raise BadInput(f"assign: {name}.threshold is {threshold}; it must be 0 or more and below 1")

@@ -56,6 +56,12 @@ class Ground:
         first, second = (tuple(axis.tolist()) for axis in axes.T)
         return cls(first, second)
 
+    @property
+    def axes(self) -> Tensor:
+        """(3, 3) float64 unit vectors in rows: both axes of the plane, and the one that stands on it, up or down."""
+        plane = torch.tensor([self.x, self.y], dtype=torch.float64)
+        return torch.cat([plane, torch.linalg.cross(plane[0], plane[1])[None]])
+
     def flat(self, points: Tensor) -> Tensor:
         """(N, 2) float64 places on the ground of (N, 3) points."""
         return points.double() @ torch.tensor([self.x, self.y], dtype=torch.float64).T

@@ -127,7 +127,8 @@ class Render(ABC):
     """One rendered view, and the way back.
 
     Attributes:
-        maps: Detached images; color and alpha always, the rest when geometry was asked for.
+        maps: Detached images; color and alpha always, the rest when geometry was asked for. Some rasterizers draw them
+            when they are first looked at: what is seen can be had for less.
         seen: (N,) bool, the splat may touch a pixel.
         radii: (N,) pixels, half the larger side of the box around the splat's footprint; 0 where not seen.
     """

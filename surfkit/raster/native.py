@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import cache
+from functools import cache, cached_property
 from types import ModuleType
 
 import torch
@@ -89,18 +89,22 @@ class _Pass:
 
 
 class NativeRender(Render):
-    """A view drawn by the native kernels; keeps what the backward needs."""
+    """A view drawn by the native kernels, when its maps are first asked for; keeps what the backward needs."""
 
     def __init__(self, splats: Splats, camera: Camera, near: float, made: tuple[str, ...]) -> None:
         self._pass = _Pass(splats, camera, near)
         self.seen, self.radii = self._pass.seen, self._pass.radii
-        self._size = (camera.height, camera.width)
+        self._size, self._made = (camera.height, camera.width), made
+
+    @cached_property
+    def maps(self) -> Maps:
+        """See `Render`."""
         shapes = {"color": (3, *self._size), "normal": (3, *self._size)}
-        maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in made}
+        maps = {name: torch.empty(shapes.get(name, self._size), dtype=torch.float32) for name in self._made}
         self._pass.native.forward(
-            {2: 0, 5: 1, 6: 2}[len(made)], [maps.get(name) for name in MAPS], torch.get_num_threads()
+            {2: 0, 5: 1, 6: 2}[len(self._made)], [maps.get(name) for name in MAPS], torch.get_num_threads()
         )
-        self.maps = Maps(**maps)
+        return Maps(**maps)
 
     def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
         arrays = self._pass.arrays
@@ -120,9 +124,9 @@ class NativeRender(Render):
         return Gradients(*grads, signal, chosen_signal)
 
     def _cotangents(self, maps: Maps) -> list[Tensor | None]:
-        given = maps.present()
+        given, drawn = maps.present(), self.maps
         for name, value in given.items():
-            made = getattr(self.maps, name)
+            made = getattr(drawn, name)
             if made is None or made.shape != value.shape:
                 raise BadInput(f"cotangent of {name}: shape {tuple(value.shape)} does not fit the maps rendered")
         return [given[name].to(torch.float32).contiguous() if name in given else None for name in MAPS]

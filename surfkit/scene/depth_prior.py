@@ -46,6 +46,19 @@ Priors = Cache["DepthPrior | None"]
 
 
 @dataclass(frozen=True)
+class Anchors:
+    """What the sparse points say of the depths of some views.
+
+    Attributes:
+        tracks: The points, and where the views show them.
+        typical: See `DepthPrior`.
+    """
+
+    tracks: Observations
+    typical: float
+
+
+@dataclass(frozen=True)
 class Fit:
     """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units."""
 
@@ -87,16 +100,19 @@ def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
     return find_maps(data.path, model_folder(data), [view.name for view in scene.train], scene.frame.metres)
 
 
-def read_priors(data: Data, scene: Scene, budget_bytes: int | None = None) -> Priors | None:
+def read_priors(
+    data: Data, scene: Scene, budget_bytes: int | None = None, anchors: Anchors | None = None
+) -> Priors | None:
     """The depth priors of a data set, aligned to its sparse points; None, and a warning, where there are none.
 
-    Photographs without a map, or with one that cannot be used, are listed in one warning.
+    Photographs without a map, or with one that cannot be used, are listed in one warning. Without `anchors`, the sparse
+    points are read from the data set.
     """
     maps = prior_files(data, scene)
     if not maps:
         emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
         return None
-    tracks = observations(data, scene)
+    tracks = observations(data, scene) if anchors is None else anchors.tracks
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
@@ -110,7 +126,8 @@ def read_priors(data: Data, scene: Scene, budget_bytes: int | None = None) -> Pr
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
     _warn_of_leaks(data, scene)
-    return prior_cache(scene.train, fits, typical_inverse_depth(scene.train, tracks, scene), budget_bytes)
+    typical = typical_inverse_depth(scene.train, tracks, scene) if anchors is None else anchors.typical
+    return prior_cache(scene.train, fits, typical, budget_bytes)
 
 
 def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:

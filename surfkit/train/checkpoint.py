@@ -11,8 +11,10 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -40,6 +42,7 @@ SCALARS = {
 FACTS = {"views": int, "shown": int, **SCALARS}
 SYSTEM = re.compile(r"os error (\d+)")
 """How safetensors says what the system has refused."""
+Read = TypeVar("Read")
 
 
 def before(path: Path) -> Path:
@@ -53,18 +56,34 @@ def save(path: Path, state: StageState) -> None:
     Raises:
         OSError: It cannot be written; what was there stays.
     """
-    tensors = {
+    small, facts = beside_points(state)
+    tensors = small | {
         f"{group}.{name}": value.contiguous()
         for group in GROUPS
         for name, value in getattr(state.points, group).items()
     }
-    tensors |= {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
+    with taking_the_place(path) as part:
+        _write(part, tensors, facts)
+
+
+def beside_points(state: StageState) -> tuple[dict[str, Tensor], str]:
+    """What a file holds of a state beside its points: tensors, and facts as text."""
+    tensors = {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
     facts = {"views": state.order.count, "shown": state.order.at} | {name: getattr(state, name) for name in SCALARS}
+    return tensors, json.dumps(facts)
+
+
+@contextmanager
+def taking_the_place(path: Path) -> Iterator[Path]:
+    """Where to write what takes the place of a state when all went well; the one that was there becomes the one before.
+
+    What is written must be on the disk at the end.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
     try:
-        _write(part, tensors, json.dumps(facts))
+        yield part
         if path.exists():
             os.replace(path, before(path))
         os.replace(part, path)
@@ -79,11 +98,16 @@ def load_last(path: Path) -> tuple[StageState, str | None] | None:
     Raises:
         BadInput: There are files, and none of them can be used.
     """
+    return last_whole(path, load)
+
+
+def last_whole(path: Path, read: Callable[[Path], Read]) -> tuple[Read, str | None] | None:
+    """What `read` makes of the last file that it does not refuse by BadInput; else as `load_last`."""
     there = [file for file in (path, before(path)) if file.exists()]
     wrong = []
     for file in there:
         try:
-            return load(file), wrong[0] if wrong else None
+            return read(file), wrong[0] if wrong else None
         except BadInput as error:
             wrong.append(str(error))
     if wrong:
@@ -105,7 +129,17 @@ def discard(path: Path) -> None:
 
 def load(path: Path) -> StageState:
     """The state in a file that `save` wrote."""
-    tensors, facts = _read(path)
+    tensors, text = _read(path)
+    return state_of(path, tensors, text)
+
+
+def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState:
+    """The state that the tensors and facts in a file make; the columns of the points may be without values (meta).
+
+    Raises:
+        BadInput: They make none.
+    """
+    facts = _facts(path, tensors, text)
     groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks")}
     for key, value in tensors.items():
         group, _, name = key.partition(".")
@@ -144,7 +178,17 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
         os.fsync(file.fileno())
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Tensor], str]:
+    with reading(path) as (file, metadata):
+        tensors = {name: file.get_tensor(name) for name in file.keys()}
+    if _digest(tensors, metadata["facts"]) != metadata.get("digest"):
+        raise damaged(path)
+    return tensors, metadata["facts"]
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
+    """Within, a file that `save` wrote is open, by safetensors; also gives its metadata."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -154,35 +198,60 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 raise BadInput(
                     f"{path} is of format {metadata.get('format')!r}, not {FORMAT!r}; delete it to start anew"
                 )
-            tensors, facts = {name: file.get_tensor(name) for name in file.keys()}, json.loads(metadata["facts"])
+            if "facts" not in metadata:
+                raise BadInput(f"{path} is no readable checkpoint (it lacks its facts); delete it to start anew")
+            yield file, metadata
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         if isinstance(error, BadInput):
             raise
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
-    if _digest(tensors, metadata["facts"]) != metadata.get("digest"):
-        raise BadInput(f"{path} is damaged: its digest does not fit what is in it; delete it to start anew")
+
+
+def _facts(path: Path, tensors: Mapping[str, Tensor], text: str) -> dict[str, Any]:
+    """What is written beside the tensors; all that should be there is."""
+    try:
+        facts = json.loads(text)
+    except ValueError as error:
+        raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
     if not isinstance(facts, dict):
         raise _unusable(path, "it lacks its facts")
     wanted = {"params.means", "order", "generator"}
     if missing := (wanted - tensors.keys()) | (FACTS.keys() - facts.keys()):
         raise _unusable(path, f"it lacks {', '.join(sorted(missing))}")
     try:
-        return tensors, {name: load_value(hint, facts[name], name) for name, hint in FACTS.items()}
+        return {name: load_value(hint, facts[name], name) for name, hint in FACTS.items()}
     except BadInput as error:
         raise _unusable(path, str(error)) from error
+
+
+def damaged(path: Path) -> BadInput:
+    """For a file whose digest is another."""
+    return BadInput(f"{path} is damaged: its digest does not fit what is in it; delete it to start anew")
 
 
 def _unusable(path: Path, why: str) -> BadInput:
     return BadInput(f"{path}: {why}; delete it to start anew")
 
 
-def _digest(tensors: dict[str, Tensor], facts: str) -> str:
+def _digest(tensors: Mapping[str, Tensor], facts: str) -> str:
     """SHA-256 of names, types, shapes, bytes and facts."""
+    return digest(facts, ((name, tensors[name], [tensors[name]]) for name in sorted(tensors)))
+
+
+def digest(facts: str, tensors: Iterable[tuple[str, Tensor, Iterable[Tensor]]]) -> str:
+    """SHA-256 of facts and tensors.
+
+    Args:
+        facts: As in the file.
+        tensors: Sorted by name: the name; a tensor of that type and shape, whose values do not count; the values, in
+            pieces.
+    """
     found = hashlib.sha256(facts.encode())
-    for name in sorted(tensors):
-        value = tensors[name].detach().cpu().contiguous()
-        found.update(f"\0{name}\0{value.dtype}\0{tuple(value.shape)}\0".encode())
-        found.update(value.reshape(-1).view(torch.uint8).numpy() if value.numel() else b"")
+    for name, like, pieces in tensors:
+        found.update(f"\0{name}\0{like.dtype}\0{tuple(like.shape)}\0".encode())
+        for value in pieces:
+            value = value.detach().cpu().contiguous()
+            found.update(value.reshape(-1).view(torch.uint8).numpy() if value.numel() else b"")
     return found.hexdigest()
 
 

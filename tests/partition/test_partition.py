@@ -10,48 +10,24 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.partition import (
+    Airspace,
     Balanced,
+    CameraGrid,
     Cells,
     ContractedGrid,
     Partition,
     PictureShare,
     QuantileGrid,
-    Sight,
     SSIMDifference,
 )
 from surfkit.partition.base import Contraction, Ground
-from surfkit.partition.merge import merge
+from surfkit.partition.merge import Merge
 from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough
-from surfkit.raster.api import Splats
-from surfkit.raster.select import select
-from surfkit.scene.camera import Camera
-from surfkit.scene.scene import View
 from surfkit.testing import check_partition
 
-WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), Balanced(6)]
-FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+from .cities import FLAT, below, city
 
-
-def below(x: float, y: float, height: float = 0.5) -> Camera:
-    """A camera that looks straight down."""
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
-    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([x, y, height], dtype=torch.float64)
-    return Camera(pose, 50.0, 50.0, 24.0, 20.0, 48, 40)
-
-
-def city(count: int = 1_500, seed: int = 0) -> Sight:
-    """Discs on the ground, denser to the left, and 6 x 5 cameras above them."""
-    draws = torch.Generator().manual_seed(seed)
-    xy = torch.rand(count, 2, generator=draws) * 2 - 1
-    xy[:, 0] = 2 * ((xy[:, 0] + 1) / 2) ** 2 - 1
-    means = torch.cat([xy, 0.02 * torch.rand(count, 1, generator=draws)], 1)
-    color = torch.rand(count, 1, 3, generator=draws) * 2 - 1
-    quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4).contiguous()
-    splats = Splats("surfel", means, quats, torch.full((count, 2), 0.025), torch.full((count,), 0.9), color)
-    at = [(-0.8 + 1.6 * i / 5, -0.8 + 1.6 * j / 4) for j in range(5) for i in range(6)]
-    views = tuple(View(f"{i:02}.png", below(*xy), path=None) for i, xy in enumerate(at))
-    return Sight(splats, views, select("cpu")[0], 0.01)
+WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), CameraGrid((3, 2)), Balanced(6)]
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: type(way).__name__)
@@ -251,6 +227,18 @@ def test_small_scenes_need_fewer_views():
     assert Fewest().of(5_000, 16) == 50 and Fewest().of(30, 4) == 2 and Fewest().of(3, 8) == 1
 
 
+def merged(cells, coarse, tuned, skipped=frozenset()):
+    """All blocks as one, from pieces of 7 points; and what each gave."""
+
+    def pieces(params):
+        rows = range(0, len(params["means"]), 7)
+        return lambda: ({name: value[at : at + 7] for name, value in params.items()} for at in rows)
+
+    merge = Merge(cells, pieces(coarse), {index: pieces(params) for index, params in tuned.items()}, skipped)
+    parts = list(merge.pieces())
+    return {name: torch.cat([part[name] for part in parts]) for name in coarse}, merge.shares()
+
+
 def test_merged_points_come_from_their_owner_once():
     sight = city()
     cells = QuantileGrid((2, 2)).cells(sight)
@@ -260,7 +248,7 @@ def test_merged_points_come_from_their_owner_once():
         means = sight.splats.means + 0.05 * torch.randn(len(sight.splats), 3, generator=draws)
         tuned[index] = {"means": means, "mark": torch.full((len(means),), index)}
     coarse = {"means": sight.splats.means, "mark": torch.full((len(sight.splats),), -1)}
-    whole, shares = merge(cells, coarse, tuned)
+    whole, shares = merged(cells, coarse, tuned)
     assert torch.equal(cells.owner(whole["means"]), whole["mark"])
     assert [share.kept for share in shares] == [int((cells.owner(t["means"]) == i).sum()) for i, t in tuned.items()]
     assert len(whole["mark"]) == sum(share.kept for share in shares) and not any(share.filled for share in shares)
@@ -272,8 +260,8 @@ def test_a_hole_is_refused_or_filled():
     coarse = {"means": sight.splats.means}
     tuned = {index: coarse for index in (0, 1, 3)}
     with pytest.raises(BadInput, match="blocks 2 are not tuned"):
-        merge(cells, coarse, tuned)
-    whole, shares = merge(cells, coarse, tuned, frozenset({2}))
+        merged(cells, coarse, tuned)
+    whole, shares = merged(cells, coarse, tuned, frozenset({2}))
     assert [share.filled for share in shares] == [False, False, True, False]
     assert torch.equal(whole["means"].sort(0).values, sight.splats.means.sort(0).values)
 
@@ -281,9 +269,12 @@ def test_a_hole_is_refused_or_filled():
 def test_bad_settings_and_scenes():
     for make in (
         lambda: QuantileGrid((0, 2)),
+        lambda: CameraGrid((2, 0)),
         lambda: ContractedGrid((1, 1), foreground=(0.6, 0.0, 0.4, 1.0)),
         lambda: Balanced(0),
         lambda: SSIMDifference(1.5),
+        lambda: Airspace(threshold=1.0),
+        lambda: Airspace(growth=-0.1),
     ):
         with pytest.raises(BadInput):
             make()

@@ -1,0 +1,129 @@
+"""What some views of a scene need, in a file of its own: who has it need not read the data set, which may be large."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump
+from surfkit.core.codec import load as load_value
+from surfkit.core.files import replacing
+from surfkit.scene.camera import Camera
+from surfkit.scene.depth_prior import Anchors
+from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.scene import Cloud, Frame, Scene, View
+
+
+@dataclass(frozen=True)
+class Extract:
+    """Some views of a scene.
+
+    Attributes:
+        scene: With these for training, none held out, and no cloud.
+        anchors: What sparse points say of their depths, where that was asked for.
+    """
+
+    scene: Scene
+    anchors: Anchors | None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A view but for its pose, as in the file."""
+
+    name: str
+    path: Path
+    mask: Path | None
+    white: bool
+    lens: tuple[float, float, float, float]
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is not in arrays."""
+
+    name: str
+    shots: tuple[Shot, ...]
+    scale: float
+    metres: float | None
+    crs: str | None
+    shift: tuple[float, float, float]
+    typical: float | None
+
+
+def part_of(scene: Scene, names: Iterable[str]) -> Scene:
+    """The training views of these names alone."""
+    wanted = set(names)
+    return _scene(scene.name, tuple(view for view in scene.train if view.name in wanted), scene.frame)
+
+
+def _scene(name: str, views: tuple[View, ...], frame: Frame) -> Scene:
+    return Scene(name, views, (), Cloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), frame)
+
+
+def save(path: Path, made: Extract) -> None:
+    """Write an extract."""
+    scene, frame, tracks = made.scene, made.scene.frame, made.anchors and made.anchors.tracks
+    shots = tuple(
+        Shot(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height))
+        for v in scene.train
+        for c in [v.camera]
+    )
+    typical = made.anchors and made.anchors.typical
+    facts = Facts(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, typical)
+    poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.train])
+    arrays = {"facts": np.array(json.dumps(dump(facts))), "poses": poses, "origin": frame.origin}
+    if tracks:
+        seen = [tracks.seen.get(view.name, Seen(np.zeros(0, np.int64), np.zeros((0, 2)))) for view in scene.train]
+        arrays |= {"xyz": tracks.xyz, "error_px": tracks.error_px, "counts": np.array([len(s.points) for s in seen])}
+        arrays |= {"points": np.concatenate([s.points for s in seen]), "at": np.concatenate([s.at for s in seen])}
+    with replacing(path) as file:
+        np.savez(file, **arrays)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether there is an extract in a file."""
+    try:
+        load(path)
+    except BadInput:
+        return False
+    return True
+
+
+def load(path: Path) -> Extract:
+    """The extract in a file.
+
+    Raises:
+        BadInput: It is not there or damaged.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        return _extract(arrays)
+    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+        told = "is not there" if isinstance(error, FileNotFoundError) else f"cannot be used ({error})"
+        raise BadInput(f"{path} {told}; delete it and give the surfkit train command again") from error
+
+
+def _extract(arrays: dict[str, np.ndarray]) -> Extract:
+    facts = load_value(Facts, json.loads(str(arrays["facts"])))
+    views = tuple(
+        View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white)
+        for s, pose in zip(facts.shots, arrays["poses"], strict=True)
+    )
+    frame = Frame(arrays["origin"], facts.scale, facts.metres, facts.crs, facts.shift)
+    scene = _scene(facts.name, views, frame)
+    if facts.typical is None:
+        return Extract(scene, None)
+    ends = arrays["counts"].cumsum()[:-1]
+    rows = zip(views, np.split(arrays["points"], ends), np.split(arrays["at"], ends), strict=True)
+    seen = {view.name: Seen(points, at) for view, points, at in rows}
+    return Extract(scene, Anchors(Observations(arrays["xyz"], arrays["error_px"], seen), facts.typical))

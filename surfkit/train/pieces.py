@@ -1,0 +1,146 @@
+"""States on disk whose points are read and written piece by piece: they may be more than memory holds.
+
+A file is opened anew for every piece. What is read of a mapped file counts as memory of the process for as long as it
+is mapped, and a scene would be, though nothing keeps it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from torch import Tensor
+
+from surfkit.primitives.points import Columns, Points
+from surfkit.train import checkpoint
+from surfkit.train.checkpoint import FORMAT
+from surfkit.train.stage import StageState
+
+ROWS = 1 << 16
+"""Points of a piece."""
+BYTES = 1 << 24
+"""Read at once where rows do not matter."""
+POINTS = ("params.", "first.", "second.", "stats.")
+"""What names of tensors that have a row for each point begin with."""
+CODES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.uint8: "U8"}
+"""Types as safetensors names them."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A whole state in a file.
+
+    Attributes:
+        path: The file.
+        state: The state, but its points have no values (they are on the device "meta").
+    """
+
+    path: Path
+    state: StageState
+
+    def pieces(self) -> Iterator[StageState]:
+        """The state with some of its points each time, in their order, and without moments and statistics."""
+        for start in range(0, len(self.state.points), ROWS):
+            with checkpoint.reading(self.path) as (file, _):
+                params = {
+                    name: file.get_slice(f"params.{name}")[start : start + ROWS].clone()
+                    for name in self.state.points.params
+                }
+            yield replace(self.state, points=Points(params, {}, {}))
+
+
+def open_last(path: Path) -> tuple[Stored, str | None] | None:
+    """As `checkpoint.load_last`, but the points stay in the file."""
+    return checkpoint.last_whole(path, opened)
+
+
+def opened(path: Path) -> Stored:
+    """The state in a file, which is read to its end once, as what is damaged must not be used.
+
+    Raises:
+        BadInput: It cannot be used.
+    """
+    with checkpoint.reading(path) as (file, metadata):
+        tensors = {name: _without_values(file, name) for name in file.keys()}
+    if _digest(path, tensors, metadata["facts"]) != metadata.get("digest"):
+        raise checkpoint.damaged(path)
+    with checkpoint.reading(path) as (file, _):
+        small = {name: file.get_tensor(name).clone() for name in tensors if not name.startswith(POINTS)}
+    return Stored(path, checkpoint.state_of(path, tensors | small, metadata["facts"]))
+
+
+def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
+    """Write a state as `checkpoint.save` does, with moments of 0.
+
+    Args:
+        path: To write to.
+        state: Its parameters need have no values, only types and shapes; it has no statistics.
+        pieces: The parameters of all points, in their order.
+
+    Raises:
+        OSError: It cannot be written; what was there stays.
+    """
+    small, facts = checkpoint.beside_points(state)
+    params = state.points.params
+    groups = {f"{group}.{name}": value for group in ("params", "first", "second") for name, value in params.items()}
+    tensors = small | groups
+    with checkpoint.taking_the_place(path) as part:
+        with open(part, "wb") as file:
+            starts = _begin(file, tensors, facts, "0" * 64)
+            for name, value in small.items():
+                file.seek(starts[name])
+                file.write(_bytes(value))
+            done = 0
+            for piece in pieces:
+                for name, value in piece.items():
+                    file.seek(starts[f"params.{name}"] + done * math.prod(value.shape[1:]) * value.itemsize)
+                    file.write(_bytes(value))
+                done += len(piece["means"])
+            assert done == len(state.points), "the pieces are not the points"
+        digest = _digest(part, tensors, facts)
+        with open(part, "rb+") as file:
+            _begin(file, tensors, facts, digest)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _begin(file: BinaryIO, tensors: dict[str, Tensor], facts: str, digest: str) -> dict[str, int]:
+    """Write what comes before the values, as safetensors lays it out; where those of each tensor go, the rest is 0."""
+    header: dict[str, Any] = {"__metadata__": {"format": FORMAT, "facts": facts, "digest": digest}}
+    ends = 0
+    for name, value in sorted(tensors.items(), key=lambda item: (-item[1].itemsize, item[0])):  # so that all is aligned
+        begins, ends = ends, ends + value.numel() * value.itemsize
+        header[name] = {"dtype": CODES[value.dtype], "shape": list(value.shape), "data_offsets": [begins, ends]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    file.write(len(text).to_bytes(8, "little") + text)
+    file.truncate(8 + len(text) + ends)
+    return {name: 8 + len(text) + header[name]["data_offsets"][0] for name in tensors}
+
+
+def _bytes(value: Tensor) -> memoryview:
+    return memoryview(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+
+
+def _without_values(file: Any, name: str) -> Tensor:
+    part = file.get_slice(name)
+    like = part[0:0] if part.get_shape() else file.get_tensor(name)
+    return torch.empty(part.get_shape(), dtype=like.dtype, device="meta")
+
+
+def _digest(path: Path, tensors: dict[str, Tensor], facts: str) -> str:
+    """The digest of the values in a file, which are as many as `tensors` have."""
+
+    def values(name: str, like: Tensor) -> Iterator[Tensor]:
+        rows = max(1, BYTES // max(1, math.prod(like.shape[1:]) * like.itemsize))
+        for start in range(0, len(like) if like.dim() else 1, rows):
+            with checkpoint.reading(path) as (file, _):
+                yield file.get_slice(name)[start : start + rows] if like.dim() else file.get_tensor(name)
+
+    return checkpoint.digest(facts, ((name, tensors[name], values(name, tensors[name])) for name in sorted(tensors)))
