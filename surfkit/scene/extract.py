@@ -110,7 +110,7 @@ def load(path: Path) -> Extract:
         return _extract(arrays)
     except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
         told = "is not there" if isinstance(error, FileNotFoundError) else f"cannot be used ({error})"
-        raise BadInput(f"{path} {told}; delete it and give the surfkit train command again") from error
+        raise BadInput(f"{path} {told}; give the surfkit train command again, which makes it anew") from error
 
 
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:
