@@ -1,4 +1,4 @@
-"""A half-trained scene to measure on: the bundled example at half size."""
+"""A half-trained scene to measure on: by default the bundled example at half size."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from surfkit.train.stage import StageState, Trainer
 EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"
 
 
-def halfway(recipe: Recipe, steps: int, scale: float = 2.0) -> tuple[Trainer, StageState]:
+def halfway(recipe: Recipe, steps: int, data: Data | None = None) -> tuple[Trainer, StageState]:
     """A trainer of `recipe` in a run of `steps` steps, and its state after half of them."""
-    scene = read(Data(EXAMPLE, scale=scale))
+    scene = read(data or Data(EXAMPLE, scale=2.0))
     recipe = with_steps(recipe, steps)
     rasterizer, _ = select("cpu")
     trainer = Trainer(recipe.pretrain, recipe.primitive, scene.train, photo_cache(scene.train), rasterizer)

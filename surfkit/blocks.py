@@ -28,7 +28,7 @@ from surfkit.partition.state import read_state, worked_on, write_state
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
 from surfkit.scene import extract
-from surfkit.scene.depth_prior import Anchors, typical_inverse_depth
+from surfkit.scene.depth_prior import Anchors, prior_files, typical_inverse_depth
 from surfkit.scene.read import observations
 from surfkit.train import checkpoint, pieces
 from surfkit.train.look import fresh_looks
@@ -143,9 +143,9 @@ def planned(site: Site, coarse: Stored) -> Record:
 def extract_views(site: Site, blocks: Plan) -> None:
     """Write the views of each block into its folder, with what sparse points say of their depths if a loss asks."""
     missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
-    scene = site.scene
-    needed = missing and need_priors(site.this.recipe.tune.losses)
-    tracks = observations(site.this.data, scene) if needed else None
+    data, scene = site.this.data, site.scene
+    needed = missing and need_priors(site.this.recipe.tune.losses) and prior_files(data, scene)
+    tracks = observations(data, scene) if needed else None
     for block in missing:
         part, anchors = extract.part_of(scene, block.views), None
         if tracks is not None:

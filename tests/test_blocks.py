@@ -23,10 +23,12 @@ from surfkit.optimise import Every
 from surfkit.partition import Inline, PictureShare, Pool, QuantileGrid
 from surfkit.partition.state import read_state
 from surfkit.pipeline import load_run, run
+from surfkit.raster.select import select
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint
+from surfkit.train import checkpoint, pieces
+from surfkit.train.material import Store
 from surfkit.train.stage import Stage
 
 STEPS = 12
@@ -314,6 +316,45 @@ def test_tune_by_hand(undisturbed, tmp_path, capsys):
     assert main(["tune", str(undisturbed), "0"]) == 0  # it is done
     assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
     assert main(["tune", str(tmp_path), "0"]) == 2
+
+
+def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, monkeypatch):
+    """From pieces of 7 points, against the whole coarse model and pictures of all of it."""
+    monkeypatch.setattr(pieces, "ROWS", 7)
+    this, _, scene = load_run(undisturbed)
+    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    rasterizer = select("cpu")[0]
+    site = tuning.Site(this, scene, rasterizer, EVERY, Store())
+    coarse = checkpoint.load(undisturbed / "pretrain" / "checkpoint.safetensors")
+    splats = this.recipe.primitive.shape(coarse.points.params, coarse.sh_degree)
+    for index in range(2):
+        views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
+        wanted = plan.cells.owner(coarse.points.params["means"]) == index
+        wanted |= rasterizer.render(splats, views[0].camera, this.recipe.pretrain.near).seen
+        found = tuning.Start(site, plan, index, views)()
+        assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
+        assert all(torch.equal(value, coarse.points.params[name][wanted]) for name, value in found.items())
+
+
+def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_path, capsys):
+    """Only its photographs are there; afterwards all is as if it had been."""
+    shutil.copytree(undisturbed, tmp_path / "run")
+    folder = tmp_path / "run" / "blocks" / "001"
+    (folder / "state.json").unlink()
+    shutil.rmtree(folder / "tune")
+    model, away = data.path / "sparse", tmp_path / "sparse"
+    model.rename(away)
+    try:
+        assert main(["tune", str(tmp_path / "run"), "1", "--device", "cpu"]) == 0
+    finally:
+        away.rename(model)
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert same(tmp_path / "run", undisturbed)
+    (folder / "views.npz").write_bytes(b"damaged")
+    (folder / "state.json").unlink()
+    assert main(["tune", str(tmp_path / "run"), "1"]) == 2 and "views.npz cannot be used" in capsys.readouterr().err
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert read_state(folder).status == "done"
 
 
 def test_an_inline_executor_is_the_default(recipe):

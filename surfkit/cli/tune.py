@@ -66,9 +66,7 @@ class Tune:
         store.bytes()
         with noted(), in_one_line(self.run_folder), bars():
             rasterizer, _ = drawer(self.device)
-            scene = extract.load(
-                views_file(this.out, self.block)
-            ).scene  # the data set is not read: it may be much larger
+            scene = extract.load(views_file(this.out, self.block)).scene  # the data set may be much larger
             return guarded(Site(this, scene, rasterizer, every, store), plan, self.block)
 
 

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -108,9 +107,9 @@ def load(path: Path) -> Extract:
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
         return _extract(arrays)
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+    except Exception as error:  # of a damaged file, zipfile and numpy raise whatever comes
         told = "is not there" if isinstance(error, FileNotFoundError) else f"cannot be used ({error})"
-        raise BadInput(f"{path} {told}; delete it and give the surfkit train command again") from error
+        raise BadInput(f"{path} {told}; give the surfkit train command again, which makes it anew") from error
 
 
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:

@@ -423,6 +423,18 @@ def test_images_of_any_size(kind, size):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_what_is_seen_and_gradients_need_no_look_at_the_maps(kind):
+    """A view is drawn when its maps are asked for, by the way back too."""
+    shown, view = make("plain", kind, 2)
+    total = Maps(color=Draw(2).normal(3, view.height, view.width).float())
+    blind, looked = (NativeRasterizer().render(shown, view, NEAR) for _ in range(2))
+    assert torch.equal(blind.seen, looked.seen)
+    assert looked.maps.color.any() and looked.maps is looked.maps
+    found, expected = blind.backward(total).tensors(), looked.backward(total).tensors()
+    assert all(torch.equal(found[name], value) and value.any() for name, value in expected.items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_splat_at_the_centre_of_the_camera_changes_nothing(kind):
     shown, view = make("plain", kind, 3)
     shown.means[3] = view.centre.float()
