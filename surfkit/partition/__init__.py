@@ -8,6 +8,8 @@ from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, Partition, Sight
 from surfkit.partition.executor import Executor, Inline, Pool
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
+from surfkit.partition.ray import Ray
+from surfkit.partition.slurm import Slurm
 
 
 @hookimpl
@@ -21,6 +23,8 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "picture-share": PictureShare,
         "inline": Inline,
         "pool": Pool,
+        "ray": Ray,
+        "slurm": Slurm,
     }
 
 
@@ -35,6 +39,8 @@ __all__ = [
     "PictureShare",
     "Pool",
     "QuantileGrid",
+    "Ray",
     "SSIMDifference",
     "Sight",
+    "Slurm",
 ]
