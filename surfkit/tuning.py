@@ -192,6 +192,7 @@ def signs(folder: Path) -> Iterator[None]:
     finally:
         watch.over.set()
         thread.join()
+        watch.sign()
         plugins().unregister(watch)
         if before is not None:
             signal.signal(signal.SIGTERM, before)
@@ -225,5 +226,9 @@ class Watch:
                 os.kill(os.getpid(), signal.SIGTERM)
             if time.monotonic() - since >= ALIVE_S:
                 since = time.monotonic()
-                with suppress(OSError):  # a full disk is told where it matters
-                    write_state(self.folder, **self.step)
+                self.sign()
+
+    def sign(self) -> None:
+        """Give a sign of life."""
+        with suppress(OSError):  # a full disk is told where it matters
+            write_state(self.folder, **self.step)

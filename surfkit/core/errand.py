@@ -27,16 +27,27 @@ CARRIED = ("PYTHONPATH", "SURFKIT_PLUGINS")
 """Variables of whoever asks, without which another machine might run other code."""
 MINDER = f"""
 import os, signal, subprocess, sys
+agent = int(os.environ["{DRIVER}"])
+for number in (signal.SIGUSR1, signal.SIGUSR2):
+    signal.signal(number, signal.SIG_IGN)
 child = subprocess.Popen([sys.executable, *sys.argv[1:]], env=os.environ | {{"{DRIVER}": str(os.getpid())}})
 signal.signal(signal.SIGTERM, lambda *_: child.terminate())
-status = child.wait()
+while True:
+    try:
+        status = child.wait({POLL_S})
+        break
+    except subprocess.TimeoutExpired:
+        if agent and os.getppid() != agent:
+            agent = 0
+            child.terminate()
 if status < 0:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.kill(os.getpid(), -status)
 sys.exit(status)
 """
-"""Stands between an agent and the command. An agent of Ray that has to go kills its children, without a chance to save
-anything; so it kills this process, and the command notices that it is alone, saves its state and ends."""
+"""Stands between an agent and the command, and stops it when the agent is gone. An agent of Ray that has to go kills
+its children first, without a chance to save anything; that is this process, and the command notices that it is alone.
+By SIGUSR2, Slurm tells every process of a job that its time is nearly up; the agent knows what to do then."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +122,7 @@ class Errand:
         with open(self.log, "ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", MINDER, *self.words],
-                env={**os.environ, **self.carried, **limits},
+                env={**os.environ, **self.carried, **limits, DRIVER: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from surfkit.partition.executor import Ended, Executor, Job, largest_first, term
 from surfkit.partition.shared import errand, marked
 
 CRASHED = 70
+REACH_S = 10.0
 STORE_BYTES = 100 << 20
 """For Ray's object store on this machine, through which next to nothing goes."""
 
@@ -146,6 +148,8 @@ def _connected(address: str) -> Iterator[ModuleType]:
 
 
 def _connect(ray: ModuleType, address: str) -> None:
+    if ":" in address:
+        _reach(address)
     given: dict[str, Any] = {"address": address or "local", "log_to_driver": False, "logging_level": "ERROR"}
     if not address:
         count = len(os.sched_getaffinity(0))
@@ -155,6 +159,18 @@ def _connect(ray: ModuleType, address: str) -> None:
     except (ConnectionError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"executor: ray.address {address or 'left out'}: no connection: {reason}") from error
+
+
+def _reach(address: str) -> None:
+    """BadInput if nothing listens there; Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=REACH_S).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise BadInput(
+            f"executor: ray.address {address}: no connection ({error}); give HOST:PORT of the head, where "
+            "`ray start --head` was given"
+        ) from error
 
 
 def _ended(ray: ModuleType, ref: Any, job: Job) -> Ended:

@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,12 +22,19 @@ from surfkit.partition.shared import errand, marked
 from surfkit.partition.state import worked_on
 
 CRASHED = 70
+SLURM_POLL_S = 1.0
+SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T")
 JOBS = "jobs"
 """Folder of what submitit writes, beside the folders of the blocks."""
-ASK_S = 60.0
-"""Seconds between two questions to Slurm, about jobs that ended without a word."""
+ASK_S = 30.0
+"""Seconds between two questions to Slurm."""
 HOLD_S, LEAVE_S = 120.0, 60.0
 """How long a job that was told to end waits until Slurm ends it, and how long we wait for those that we cancelled."""
+ARRIVE_S = 90.0
+"""How long after its end the result of a job may take to be seen here."""
+ALIVE = ("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "COMPLETING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED")
+ALIVE += ("RESIZING", "SIGNALING", "STAGE_OUT", "STOPPED", "SPECIAL_EXIT", "PREEMPTED")
+"""States of jobs that may still come to a result."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ class Slurm(Executor):
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""
         self.ready()
-        waiting, queue = largest_first(jobs), Queue()
+        waiting, queue = largest_first(jobs), Queue(self.cluster)
         before = signal.getsignal(signal.SIGTERM)
         terminating()
         with marked(jobs) as mark:
@@ -114,7 +122,7 @@ class Slurm(Executor):
                         del waiting[:room]
                         queue.submit(executor, batch, [self._errand(job, mark) for job in batch])
                     yield from queue.ended()
-                    time.sleep(POLL_S)
+                    time.sleep(POLL_S if self.cluster != "slurm" else SLURM_POLL_S)
             finally:
                 queue.cancel()
                 signal.signal(signal.SIGTERM, before)
@@ -148,14 +156,16 @@ class Queue:
     """Jobs that were submitted, and what each works on.
 
     Attributes:
+        cluster: Whose.
         jobs: By submitit's handles.
-        states: What each was last heard to be.
-        asked: When Slurm was last asked, seconds of the monotonic clock.
+        states: What each was last heard to be, and since when, in seconds of the monotonic clock.
+        asked: When Slurm was last asked.
     """
 
+    cluster: str
     jobs: dict[Any, Job] = field(default_factory=dict)
-    states: dict[int, str] = field(default_factory=dict)
-    asked: float = field(default_factory=time.monotonic)
+    states: dict[Any, tuple[str, float]] = field(default_factory=dict)
+    asked: float = -math.inf
 
     def submit(self, executor: Any, batch: Sequence[Job], errands: Sequence[Errand]) -> None:
         """Submit some jobs; to Slurm, as one array."""
@@ -168,19 +178,35 @@ class Queue:
             raise BadInput(f"executor:slurm: Slurm does not take the jobs: {reason}") from error
         self.jobs |= dict(zip(handles, batch, strict=True))
         for handle, job in zip(handles, batch, strict=True):
-            say(f"block {job.index}: job {handle.job_id} of {executor.cluster}")
+            say(f"block {job.index}: job {handle.job_id}")
 
     def ended(self) -> Iterator[Ended]:
         """The jobs that have ended since it was last asked."""
-        if self.jobs and time.monotonic() - self.asked > ASK_S:
-            self.asked = time.monotonic()
-            next(iter(self.jobs)).watcher.update()
+        if self.cluster == "slurm":
+            self.ask()
         for handle, job in list(self.jobs.items()):
-            if handle.done():
+            state, since = self.states.get(handle, ("", math.inf))
+            if handle.paths.result_pickle.exists() if self.cluster == "slurm" else handle.done():
                 del self.jobs[handle]
                 yield _ended(handle, job)
-            elif (state := handle.state) not in ("UNKNOWN", self.states.get(job.index)):
-                self.states[job.index] = state
+            elif state and state not in ALIVE and time.monotonic() - since > ARRIVE_S:
+                del self.jobs[handle]
+                why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
+                yield Ended(job, CRASHED, why)
+
+    def ask(self) -> None:
+        """Ask Slurm where the jobs are; by squeue, for not every cluster keeps accounts of what is over."""
+        if time.monotonic() - self.asked < ASK_S:
+            return
+        self.asked = time.monotonic()
+        told = subprocess.run([*SQUEUE, "--me"], capture_output=True, text=True)
+        if told.returncode:  # the controller is away; it comes back
+            return
+        found = dict(line.split(maxsplit=1) for line in told.stdout.splitlines())
+        for handle, job in self.jobs.items():
+            state = found.get(handle.job_id, "gone")
+            if state != self.states.get(handle, ("", 0.0))[0]:
+                self.states[handle] = state, self.asked
                 say(f"block {job.index}: job {handle.job_id} is {state}")
 
     def cancel(self) -> None:
@@ -207,6 +233,6 @@ def _ended(handle: Any, job: Job) -> Ended:
     if error is None:
         found = handle.result()
         return Ended(job, found.status, found.why)
-    told = str(error).strip().splitlines()
-    why = f"job {handle.job_id} ended as {handle.state} without a result: {told[-1] if told else 'no log'}"
-    return Ended(job, CRASHED, f"{why}; see {handle.paths.stderr}")
+    told = [line for line in str(error).splitlines() if line.strip(" -")]
+    last = next((line for line in reversed(told) if "Error" in line), told[0] if told else "no log")
+    return Ended(job, CRASHED, f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}")
