@@ -123,21 +123,34 @@ def test_the_driver_is_killed(cluster, tmp_path):
     wait_for(lambda: not psutil.pid_exists(int((tmp_path / "000" / "began").read_text())))
 
 
-def test_a_run_that_was_begun_here_goes_on_there(undisturbed, data, recipe, workers, tmp_path, monkeypatch):  # noqa: F811
-    guarded = blocks.guarded
+def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):  # noqa: F811
+    """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
+    guarded, command = blocks.guarded, blocks.job_of
 
     def stopped(site, plan, index):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
             return guarded(site, plan, index)
 
+    def failing(site, plan, index, hands):
+        made = command(site, plan, index, hands)
+        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
+
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(blocks, "guarded", stopped)
         run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert read_state(tmp_path / "blocks" / "000").step == 6
-    run(recipe, data, tmp_path, Hands("cpu", workers), EVERY)
-    assert same(tmp_path, undisturbed)
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        pytest.raises(Unfinished, match="1 failed: machine .*elsewhere") as told,
+    ):
+        patch.setattr(blocks, "job_of", failing)
+        run(recipe, data, tmp_path, Hands("cpu", workers), EVERY)
+    states = [read_state(tmp_path / "blocks" / f"00{at}") for at in (0, 1)]
+    assert told.value.status == 3 and [state.status for state in states] == ["done", "failed"]
     assert "going on after step 6 of 12" in (tmp_path / "blocks" / "000" / LOG).read_text()
+    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert same(tmp_path, undisturbed)
 
 
 def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch):  # noqa: F811
@@ -172,22 +185,6 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     assert gone.exists() and same(tmp_path / "run", undisturbed)
     logs = "".join((tmp_path / "run" / "blocks" / name / LOG).read_text() for name in ("000", "001"))
     assert "stopped after step 7 of 12" in logs and "going on after step 7 of 12" in logs
-
-
-def test_a_block_that_always_fails(undisturbed, data, recipe, workers, tmp_path, monkeypatch):  # noqa: F811
-    command = blocks.job_of
-
-    def failing(site, plan, index, hands):
-        made = command(site, plan, index, hands)
-        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
-
-    with monkeypatch.context() as patch, pytest.raises(Unfinished, match="block 1 failed: machine .*elsewhere") as told:
-        patch.setattr(blocks, "job_of", failing)
-        run(recipe, data, tmp_path, Hands("cpu", workers), EVERY)
-    assert told.value.status == 3 and [read_state(tmp_path / "blocks" / f"00{at}").status for at in (0, 1)] == [
-        "done",
-        "failed",
-    ]
 
 
 NODES = [{"CPU": 16, "memory": 64e9, "GPU": 2}, {"CPU": 8, "memory": 16e9}]

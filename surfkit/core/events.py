@@ -175,6 +175,7 @@ Event = (
     | StageEnded
 )
 
+
 def say(text: str) -> None:
     """Tell the person who watches."""
     print(text, file=sys.stderr)

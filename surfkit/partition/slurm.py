@@ -85,7 +85,7 @@ class Slurm(Executor):
         if self.gpus not in (0, 1):
             raise BadInput(f"executor: slurm.gpus is {self.gpus}; a block uses one at most, so give 0 or 1")
         for option in self.extra:
-            if not re.fullmatch(r"[a-z][a-z-]*(=.+)?", option):
+            if not re.fullmatch(r"[a-z][a-z-]*(=[^\n]+)?", option):
                 raise BadInput(f"executor: slurm.extra {option!r}: give NAME=VALUE or NAME, without dashes before it")
 
     @property
@@ -192,7 +192,7 @@ class Queue:
             elif state and state not in ALIVE and time.monotonic() - since > ARRIVE_S:
                 del self.jobs[handle]
                 why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
-                yield Ended(job, CRASHED, why)
+                yield Ended(job, 1 if state == "CANCELLED" else CRASHED, why)  # what a person cancels stays so
 
     def ask(self) -> None:
         """Ask Slurm where the jobs are; by squeue, for not every cluster keeps accounts of what is over."""
