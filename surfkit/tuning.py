@@ -91,7 +91,7 @@ def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> in
     try:
         with held(folder):
             if other := heard_elsewhere(folder):
-                raise BadInput(f"{folder}: {other} was heard of less than {STALE_S:.0f} s ago; wait for its end")
+                raise BadInput(f"{folder}: {other} was heard of in the last {STALE_S:.0f} s; wait for its end")
             return _begun(site, blocks, index)
     except BadInput as error:  # another process works there, and the state is its
         say(f"block {index}: {error}")

@@ -155,7 +155,7 @@ def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, r
     assert same(tmp_path, undisturbed)
 
 
-def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch):  # noqa: F811
+def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):  # noqa: F811
     """It is killed while a block is between two steps, which is saved there, and finished on the other node."""
     node = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"], memory=SMALL["memory"])
     agent = node.all_processes["raylet"][0].process.pid
@@ -185,6 +185,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     run(recipe, data, tmp_path / "run", Hands("cpu", workers), EVERY)
     thread.join()
     assert gone.exists() and same(tmp_path / "run", undisturbed)
+    assert "is tried again" not in capsys.readouterr().err, "Ray did that, and waits where no machine is free"
     logs = "".join((tmp_path / "run" / "blocks" / name / LOG).read_text() for name in ("000", "001"))
     assert "stopped after step 7 of 12" in logs and "going on after step 7 of 12" in logs
 

@@ -45,7 +45,7 @@ def test_how_each_ended_the_largest_first(cluster, tmp_path):
     assert [(end.job.index, end.status) for end in ends] == [(1, 1), (2, -9), (0, 0), (3, 2)]
     assert f"{tmp_path / 'elsewhere'} is not there; run folder and data set must lie" in ends[3].why
     printed = [(tmp_path / f"{index:03}" / LOG).read_text().split() for index in range(3)]
-    assert [words[1] for words in printed] == ["3"] * 3
+    assert [words[1] for words in printed] == [str(min(3, len(os.sched_getaffinity(0))))] * 3
     assert sorted(path.name for path in tmp_path.iterdir()) == ["000", "001", "002", "003", "jobs"]
 
 
@@ -149,7 +149,7 @@ def cluster(tmp_path, monkeypatch):
     for name, lines in programs.items():
         (folder / name).write_text(f'#!/bin/sh\nHERE={tmp_path}\necho {name} "$@" >> "$HERE/asked"\n{lines}\n')
         (folder / name).chmod(0o755)
-    (tmp_path / "queue").write_text("17_0 PENDING\n17_1 PENDING\n")
+    (tmp_path / "queue").write_text("17_0 PENDING Priority\n17_1 PENDING PartitionTimeLimit\n")
     monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
     monkeypatch.setattr(slurm, "SLURM_POLL_S", 0.01)
     monkeypatch.setattr(slurm, "ASK_S", 0.05)
@@ -165,7 +165,7 @@ def test_what_slurm_is_told(cluster, capsys):
 
     def later():
         wait_for(lambda: (cluster / "asked").exists() and "squeue" in (cluster / "asked").read_text())
-        (cluster / "queue").write_text("17_0 RUNNING\n17_1 OUT_OF_MEMORY\n3_0 FAILED\n")
+        (cluster / "queue").write_text("17_0 RUNNING None\n17_1 OUT_OF_MEMORY OutOfMemory\n3_0 FAILED None\n")
 
     thread = threading.Thread(target=later)
     thread.start()
@@ -179,11 +179,15 @@ def test_what_slurm_is_told(cluster, capsys):
     for option in [*wanted, "account=maps", "signal=USR2@90", "job-name='surfkit-my run'"]:
         assert f"#SBATCH --{option}\n" in script, option
     assert "#SBATCH --exclusive\n" in script and "#SBATCH --requeue\n" in script
-    assert (lost.job.index, lost.status) == (0, slurm.CRASHED) and "job 17_1 is OUT_OF_MEMORY in Slurm" in lost.why
+    assert (lost.job.index, lost.status) == (
+        0,
+        slurm.CRASHED,
+    ) and "job 17_1 is OUT_OF_MEMORY (OutOfMemory) in Slurm" in lost.why
     asked = (cluster / "asked").read_text().splitlines()
     assert asked[-1] == "scancel 17_0" and "scancel 17_1" not in asked
     said = capsys.readouterr().err
-    assert "block 1: job 17_0 is PENDING" in said and "block 1: job 17_0 is RUNNING" in said
+    assert "block 1: job 17_0 is PENDING\n" in said and "block 1: job 17_0 is RUNNING\n" in said
+    assert "block 0: job 17_1 is PENDING (PartitionTimeLimit)\n" in said
 
 
 def test_what_slurm_does_not_take(cluster):
@@ -193,7 +197,7 @@ def test_what_slurm_does_not_take(cluster):
 
 
 def test_what_a_person_cancels_stays_so(cluster, monkeypatch):
-    (cluster / "queue").write_text("17 CANCELLED\n")
+    (cluster / "queue").write_text("17 CANCELLED None\n")
     monkeypatch.setattr(slurm, "ARRIVE_S", 0.3)
     (end,) = Slurm().run([job(cluster / "blocks", 0)])
     assert end.status == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import shutil
 import signal
@@ -23,7 +24,10 @@ from surfkit.partition.state import worked_on
 
 CRASHED = 70
 SLURM_POLL_S = 1.0
-SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T")
+SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T %r")
+"""States and reasons of jobs, also of those that are over."""
+USUAL = ("None", "Priority", "Resources", "BeginTime")
+"""Reasons to wait that need no word."""
 JOBS = "jobs"
 """Folder of what submitit writes, beside the folders of the blocks."""
 ASK_S = 30.0
@@ -128,8 +132,9 @@ class Slurm(Executor):
                 signal.signal(signal.SIGTERM, before)
 
     def _errand(self, job: Job, mark: Path) -> Errand:
-        made = errand(job, mark, self.cpus, self.gpus > 0)
-        return replace(made, hold_s=HOLD_S) if self.cluster == "slurm" else made
+        if self.cluster == "slurm":
+            return replace(errand(job, mark, self.cpus, self.gpus > 0), hold_s=HOLD_S)
+        return errand(job, mark, min(self.cpus, max(1, len(os.sched_getaffinity(0)) // self._limit)), self.gpus > 0)
 
     def _submitter(self, folder: Path, jobs: Sequence[Job]) -> Any:
         """What submits the jobs."""
@@ -158,7 +163,7 @@ class Queue:
     Attributes:
         cluster: Whose.
         jobs: By submitit's handles.
-        states: What each was last heard to be, and since when, in seconds of the monotonic clock.
+        states: What each was last heard to be and why, and since when, in seconds of the monotonic clock.
         asked: When Slurm was last asked.
     """
 
@@ -189,10 +194,10 @@ class Queue:
             if handle.paths.result_pickle.exists() if self.cluster == "slurm" else handle.done():
                 del self.jobs[handle]
                 yield _ended(handle, job)
-            elif state and state not in ALIVE and time.monotonic() - since > ARRIVE_S:
+            elif state and state.split()[0] not in ALIVE and time.monotonic() - since > ARRIVE_S:
                 del self.jobs[handle]
                 why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
-                yield Ended(job, 1 if state == "CANCELLED" else CRASHED, why)  # what a person cancels stays so
+                yield Ended(job, 1 if state.startswith("CANCELLED") else CRASHED, why)  # what a person cancels stays so
 
     def ask(self) -> None:
         """Ask Slurm where the jobs are; by squeue, for not every cluster keeps accounts of what is over."""
@@ -204,7 +209,8 @@ class Queue:
             return
         found = dict(line.split(maxsplit=1) for line in told.stdout.splitlines())
         for handle, job in self.jobs.items():
-            state = found.get(handle.job_id, "gone")
+            state, _, reason = found.get(handle.job_id, "gone").partition(" ")
+            state += f" ({reason})" if reason and reason not in USUAL else ""
             if state != self.states.get(handle, ("", 0.0))[0]:
                 self.states[handle] = state, self.asked
                 say(f"block {job.index}: job {handle.job_id} is {state}")
