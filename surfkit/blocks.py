@@ -17,14 +17,15 @@ import torch
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
-from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.folder import Run, discard_results, say
+from surfkit.core.errand import POLL_S
+from surfkit.core.events import FileWritten, Warned, emit, say
+from surfkit.folder import Run, discard_results
 from surfkit.partition import executor
 from surfkit.partition.executor import Executor, Inline
 from surfkit.partition.merge import Merge, Pieces, Share
 from surfkit.partition.picture import plan_picture
 from surfkit.partition.plan import Fewest, Plan, plan
-from surfkit.partition.state import read_state, worked_on, write_state
+from surfkit.partition.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
 from surfkit.scene import extract
@@ -45,6 +46,10 @@ PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
 moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
+PATIENCE_S = STALE_S + LEAVE_S
+"""How long a worker on another machine waits for one before it, whose machine may be gone."""
+ARRIVE_S = 90.0
+"""How long what was written on another machine may take until it is seen here."""
 
 
 @dataclass(frozen=True)
@@ -178,12 +183,16 @@ def left(site: Site, blocks: Plan) -> list[int]:
 
 
 def await_workers(site: Site) -> None:
-    """Wait for workers of an earlier driver, which stop when they notice that it is gone."""
-    until = time.monotonic() + LEAVE_S
+    """Wait for workers of an earlier driver, which stop when they notice that it is gone.
+
+    Those of another machine may have died with it; this shows when they have not been heard of for long enough.
+    """
+    began = time.monotonic()
     while busy := [folder for folder in site.folders() if worked_on(folder)]:
-        if time.monotonic() > until:
-            raise BadInput(f"{busy[0]}: the block is being worked on; wait for its end, or stop it")
-        time.sleep(0.2)
+        patience = LEAVE_S + (STALE_S if any(map(heard_elsewhere, busy)) else 0)
+        if time.monotonic() - began > patience:
+            raise BadInput(f"{busy[0]}: {worked_on(busy[0])} works on the block; wait for its end, or stop it")
+        time.sleep(POLL_S)
 
 
 def work(site: Site, blocks: Plan, hands: Hands) -> None:
@@ -198,10 +207,10 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
         for ended in hands.workers.run(jobs):
             index = ended.job.index
             attempts[index] += 1
-            if ended.status == 0:
+            if ended.status == 0 and arrived(site, blocks, index):
                 say(f"block {index} is done")
                 continue
-            reason = told(site, index, ended.status)
+            reason = told(site, ended)
             again = ended.status not in (1, 2) and attempts[index] < ATTEMPTS
             emit(Warned(f"block {index} {reason}" + ("; it is tried again" if again else "")))
             if again:
@@ -213,9 +222,24 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
         raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
 
 
-def told(site: Site, index: int, status: int) -> str:
+def arrived(site: Site, blocks: Plan, index: int) -> bool:
+    """Whether a block that is done somewhere is so here; a network's file system may take a while."""
+    until = time.monotonic() + ARRIVE_S
+    while index in left(site, blocks):
+        if time.monotonic() > until:
+            return False
+        time.sleep(POLL_S)
+    return True
+
+
+def told(site: Site, ended: executor.Ended) -> str:
     """What became of a block, in a few words; also noted in its state."""
+    index, status = ended.job.index, ended.status
     state = read_state(site.place(index))
+    if ended.why is not None or status == 0:
+        why = ended.why or f"nothing of its work has come to {site.place(index)}"
+        write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
+        return f"failed: {why}"
     if status < 0:
         name = signal.Signals(-status).name
         write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}")
@@ -232,12 +256,16 @@ def told(site: Site, index: int, status: int) -> str:
 def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     """The work on one block."""
     block = blocks.blocks[index]
-    share = site.store.bytes() // hands.workers.at_once
+    elsewhere = hands.workers.at_once is None
+    share = site.store.bytes() // (hands.workers.at_once or 1)
     command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
-    command += ["--cache", f"{share}", "--checkpoint-every", f"{site.every.checkpoint}"]
+    command += ["--cache", site.store.cache if elsewhere else f"{share}"]
+    command += ["--checkpoint-every", f"{site.every.checkpoint}"]
     command += ["--resized-copies"] * site.store.copies
+    command += ["--patience", f"{PATIENCE_S}"] * elsewhere
     pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
-    photos = 3 * sum(view.camera.width * view.camera.height for view in site.scene.train if view.name in block.views)
+    mine = [view for view in site.scene.train if view.name in block.views]
+    photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
     growth = 1 if site.this.recipe.tune.densify is None else 3
     return executor.Job(
         index=index,
@@ -245,7 +273,11 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         call=lambda: guarded(site, blocks, index),
         command=tuple(command),
         cost=block.work,
-        memory_bytes=PROGRAM_BYTES + growth * POINT_BYTES * block.points + PIXEL_BYTES * pixels + min(share, photos),
+        memory_bytes=PROGRAM_BYTES
+        + growth * POINT_BYTES * block.points
+        + PIXEL_BYTES * pixels
+        + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
+        needs=(site.this.data.path, mine[0].path),
     )
 
 

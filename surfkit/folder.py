@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, emit
+from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, emit, say
 from surfkit.core.registry import hookimpl, plugins, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
@@ -355,11 +354,6 @@ def discard_results(this: Run) -> None:
         path.unlink(missing_ok=True)
     for part in this.parts[this.parts.index(this.part) + 1 :]:
         checkpoint.discard(replace(this, part=part).checkpoint)
-
-
-def say(text: str) -> None:
-    """Tell the person who watches."""
-    print(text, file=sys.stderr)
 
 
 def short(value: Any) -> str:

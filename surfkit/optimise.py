@@ -9,14 +9,11 @@ from dataclasses import dataclass
 import torch
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit
+from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.evaluate.along import Along
 from surfkit.evaluate.images import Draw
-from surfkit.folder import (
-    Run,
-    say,
-)
+from surfkit.folder import Run
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select

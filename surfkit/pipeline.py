@@ -12,7 +12,7 @@ from torch import Tensor
 from surfkit.blocks import Hands, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit
+from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
@@ -33,7 +33,6 @@ from surfkit.folder import (
     refuse_file,
     refuse_no_run,
     refuse_other,
-    say,
 )
 from surfkit.mesh.base import Subject
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
@@ -98,6 +97,8 @@ def run(
         every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_file(out)
     store.bytes()  # or BadInput, before anything is done
+    if recipe.partition is not None:
+        hands.workers.ready()
     with noted() as notes, held(out), in_one_line(out), bars():
         sweep(out, out / "blocks")
         refuse_other(this)

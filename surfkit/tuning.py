@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
+import threading
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,17 +16,18 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import StepDone
+from surfkit.core.errand import DRIVER, INTERRUPTED, POLL_S
+from surfkit.core.events import StepDone, say
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.folder import Run, say
+from surfkit.folder import Run
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition.base import Sight
-from surfkit.partition.executor import DRIVER
+from surfkit.partition.executor import terminating
 from surfkit.partition.plan import Plan
-from surfkit.partition.state import read_state, write_state
+from surfkit.partition.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
 from surfkit.scene import extract
@@ -38,7 +39,7 @@ from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
 """Seconds between signs of life of a block."""
-CRASHED, BUSY, INTERRUPTED = 70, 75, 130
+CRASHED, BUSY = 70, 75
 """Exit statuses beside those of `surfkit train`: an error that nobody foresaw, and a block that another works on."""
 
 
@@ -87,11 +88,22 @@ def views_file(out: Path, index: int) -> Path:
     return out / "blocks" / f"{index:03}" / "views.npz"
 
 
-def guarded(site: Site, blocks: Plan, index: int) -> int:
-    """Tune a block and return an exit status; what goes wrong is told, and is in the block's state."""
-    folder = site.place(index)
+def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> int:
+    """Tune a block and return an exit status; what goes wrong is told, and is in the block's state.
+
+    Args:
+        site: Where.
+        blocks: All of them.
+        index: Which one.
+        patience_s: How long to wait for another process that works on it.
+    """
+    folder, until = site.place(index), time.monotonic() + patience_s
+    while time.monotonic() < until and worked_on(folder):
+        time.sleep(POLL_S)
     try:
         with held(folder):
+            if other := heard_elsewhere(folder):
+                raise BadInput(f"{folder}: {other} was heard of in the last {STALE_S:.0f} s; wait for its end")
             return _begun(site, blocks, index)
     except BadInput as error:  # another process works there, and the state is its
         say(f"block {index}: {error}")
@@ -181,28 +193,37 @@ def sight_of(site: Site, coarse: StageState) -> Sight:
 
 @contextmanager
 def signs(folder: Path) -> Iterator[None]:
-    """Within, steps become signs of life of a block; a worker whose driver is gone stops as if it were asked to.
+    """Within, a block gives signs of life; a worker whose driver is gone stops as if it were asked to.
 
     Raises:
-        KeyboardInterrupt: The driver is gone already.
+        KeyboardInterrupt: The driver is gone already, or it is now, or someone sent SIGTERM.
     """
     watch = Watch(folder)
     if watch.alone():
         raise KeyboardInterrupt
+    before = terminating()
     plugins().register(watch, f"signs of {folder}")
+    thread = threading.Thread(target=watch.look, daemon=True)
+    thread.start()
     try:
         yield
     finally:
+        watch.over.set()
+        thread.join()
+        watch.sign()
         plugins().unregister(watch)
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
 
 
 class Watch:
-    """Writes where a block stands, every few seconds."""
+    """Writes where a block stands, every few seconds, also while photographs are read and no step is made."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.driver = int(os.environ.get(DRIVER, 0))
-        self.next = -math.inf
+        self.step: dict[str, int] = {}
+        self.over = threading.Event()
 
     def alone(self) -> bool:
         """Whether a driver began this process and is gone."""
@@ -211,11 +232,21 @@ class Watch:
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
-        if not isinstance(event, StepDone):
-            return
-        if self.alone():
-            self.driver = 0
-            os.kill(os.getpid(), signal.SIGTERM)
-        if time.monotonic() >= self.next:
-            self.next = time.monotonic() + ALIVE_S
-            write_state(self.folder, status="running", step=event.index)
+        if isinstance(event, StepDone):
+            self.step = {"step": event.index}
+
+    def look(self) -> None:
+        """Look for the driver and give signs of life, until it is over."""
+        since = time.monotonic()
+        while not self.over.wait(POLL_S):
+            if self.alone():
+                self.driver = 0
+                os.kill(os.getpid(), signal.SIGTERM)
+            if time.monotonic() - since >= ALIVE_S:
+                since = time.monotonic()
+                self.sign()
+
+    def sign(self) -> None:
+        """Give a sign of life."""
+        with suppress(OSError):  # a full disk is told where it matters
+            write_state(self.folder, **self.step)

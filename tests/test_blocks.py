@@ -200,6 +200,15 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
     assert same(tmp_path, undisturbed)
 
 
+def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
+    """By a worker that does not see our disk, say; nothing of its work is here."""
+    command = blocks.job_of
+    monkeypatch.setattr(blocks, "ARRIVE_S", 0.2)
+    monkeypatch.setattr(blocks, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
+    with pytest.raises(Unfinished, match="block 1 failed: nothing of its work has come to"):
+        run(recipe, data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+
+
 def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_path):
     """Its workers notice, save and leave; the same command finishes to the same bits."""
     recipe_file = undisturbed / "recipe.json"

@@ -26,8 +26,9 @@ from surfkit.tuning import Site, guarded, views_file
 class Tune:
     """Tune one block of a run to its end, from where it stands.
 
-    `surfkit train` does this for all blocks, with `executor:pool` several at a time. By hand it serves to share the
-    work among machines that see the same folder: then give the `surfkit train` command once more, to merge them.
+    `surfkit train` does this for all blocks, several at a time with another executor than `inline`. By hand it serves
+    to share the work among machines that see the same folder: then give the `surfkit train` command once more, to merge
+    them.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -48,6 +49,9 @@ class Tune:
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints."""
 
+    patience: float = 0.0
+    """Seconds to wait for another process that works on the block, before this one gives up."""
+
     def run(self) -> int:
         """Tune; the exit status is that of `surfkit train`."""
         this, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
@@ -67,7 +71,7 @@ class Tune:
         with noted(), in_one_line(self.run_folder), bars():
             rasterizer, _ = drawer(self.device)
             scene = extract.load(views_file(this.out, self.block)).scene  # the data set may be much larger
-            return guarded(Site(this, scene, rasterizer, every, store), plan, self.block)
+            return guarded(Site(this, scene, rasterizer, every, store), plan, self.block, self.patience)
 
 
 COMMAND = Tune

@@ -175,6 +175,12 @@ Event = (
     | StageEnded
 )
 
+
+def say(text: str) -> None:
+    """Tell the person who watches."""
+    print(text, file=sys.stderr)
+
+
 _silenced: set[tuple[str, int]] = set()
 """Observers that raised, by plugin name and identity of the plugin."""
 

@@ -10,6 +10,8 @@ from surfkit.partition.base import Cells, Partition, Sight
 from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.executor import Executor, Inline, Pool
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
+from surfkit.partition.ray import Ray
+from surfkit.partition.slurm import Slurm
 
 
 @hookimpl
@@ -25,6 +27,8 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "airspace": Airspace,
         "inline": Inline,
         "pool": Pool,
+        "ray": Ray,
+        "slurm": Slurm,
     }
 
 
@@ -41,6 +45,8 @@ __all__ = [
     "PictureShare",
     "Pool",
     "QuantileGrid",
+    "Ray",
     "SSIMDifference",
     "Sight",
+    "Slurm",
 ]

@@ -16,13 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput
+from surfkit.core.errand import DRIVER, INTERRUPTED, POLL_S
 from surfkit.core.registry import Component
 from surfkit.scene.memory import free_bytes
 
-POLL_S = 0.2
-DRIVER = "SURFKIT_DRIVER"
-"""Names the process that a worker works for; without it, the worker stops."""
-INTERRUPTED = 130
 LOG = "log.txt"
 """What a worker process prints, in the folder of its block."""
 
@@ -38,6 +35,7 @@ class Job:
         command: Does it in a process of its own.
         cost: Expected work, in any unit.
         memory_bytes: Expected at its peak; 0 if unknown.
+        needs: Paths that it reads, beside its folder.
     """
 
     index: int
@@ -46,6 +44,7 @@ class Job:
     command: tuple[str, ...]
     cost: float = 1.0
     memory_bytes: int = 0
+    needs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,12 @@ class Ended:
     Attributes:
         job: Which.
         status: 0 when done; negative for the signal that ended it, as `subprocess` has it.
+        why: What the job itself could not tell, such as that its machine is gone.
     """
 
     job: Job
     status: int
+    why: str | None = None
 
 
 class Executor(Component):
@@ -66,8 +67,16 @@ class Executor(Component):
 
     @property
     @abstractmethod
-    def at_once(self) -> int:
-        """How many jobs share this machine at a time."""
+    def at_once(self) -> int | None:
+        """How many jobs share this machine at a time; None if they run on others, and look there for what is free."""
+
+    @abstractmethod
+    def ready(self) -> None:
+        """Look, before hours are spent, whether it can work.
+
+        Raises:
+            BadInput: Something is missing on this machine.
+        """
 
     @abstractmethod
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
@@ -86,6 +95,9 @@ class Inline(Executor):
     def at_once(self) -> int:
         """See `Executor.at_once`."""
         return 1
+
+    def ready(self) -> None:
+        """See `Executor.ready`; it always can."""
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""
@@ -120,9 +132,12 @@ class Pool(Executor):
         """See `Executor.at_once`."""
         return self.workers
 
+    def ready(self) -> None:
+        """See `Executor.ready`; it always can."""
+
     def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
         """See `Executor.run`."""
-        waiting = sorted(jobs, key=lambda job: (-job.cost, job.index))
+        waiting = largest_first(jobs)
         crew = Crew(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
         room = self.memory_share * free_bytes()
         before = terminating()
@@ -140,6 +155,11 @@ class Pool(Executor):
             crew.stop()
             if before is not None:
                 signal.signal(signal.SIGTERM, before)
+
+
+def largest_first(jobs: Sequence[Job]) -> list[Job]:
+    """In the order to begin them, so that none of the long ones is left for the end."""
+    return sorted(jobs, key=lambda job: (-job.cost, job.index))
 
 
 def terminating() -> Any:
@@ -164,9 +184,7 @@ class Crew:
     def begin(self, job: Job) -> None:
         """Start a process; it gets no Ctrl-C of its own, but is told by `stop`."""
         job.folder.mkdir(parents=True, exist_ok=True)
-        limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} | {
-            DRIVER: str(os.getpid())
-        }
+        limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         with open(job.folder / LOG, "ab") as log:
             process = subprocess.Popen(
                 [sys.executable, *job.command],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ Kind = Literal["data", "fault", "crash", "interrupted"]
 
 STALE_S = 120.0
 """Seconds without a sign of life after which a block of another machine counts as abandoned."""
+_WRITING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,17 @@ class BlockState:
     heard: float = 0.0
 
 
-def worked_on(folder: Path) -> bool:
-    """Whether some process works on the block in a folder: it holds the lock, or was heard of lately elsewhere."""
+def worked_on(folder: Path) -> str | None:
+    """Who works on the block in a folder, as "process PID on HOST": it holds the lock, or was heard of elsewhere."""
+    return heard_elsewhere(folder) or holder(folder)
+
+
+def heard_elsewhere(folder: Path) -> str | None:
+    """Who works on the block on another machine, as far as signs of life tell: not all file systems share locks."""
     state = read_state(folder)
-    elsewhere = state.status == "running" and state.host != platform.node() and time.time() - state.heard < STALE_S
-    return elsewhere or holder(folder) is not None
+    if state.status != "running" or state.host == platform.node() or time.time() - state.heard >= STALE_S:
+        return None
+    return f"process {state.pid} on {state.host}"
 
 
 def state_path(folder: Path) -> Path:
@@ -65,8 +73,9 @@ def read_state(folder: Path) -> BlockState:
 
 
 def write_state(folder: Path, **changes: object) -> BlockState:
-    """Change some of the state of a block, and sign it."""
+    """Change some of the state of a block, and sign it. Only one process does, but any of its threads."""
     signed = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
-    state = replace(read_state(folder), **(signed | changes))
-    write_json(state_path(folder), state)
+    with _WRITING:
+        state = replace(read_state(folder), **(signed | changes))
+        write_json(state_path(folder), state)
     return state

@@ -1,0 +1,235 @@
+"""Blocks on a Ray cluster: two nodes of it, all on this machine, with real agents that really die."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # noqa: F401 (fixtures)
+
+from surfkit import blocks, tuning
+from surfkit.blocks import Hands, Unfinished
+from surfkit.core.check import BadInput
+from surfkit.partition import Ray
+from surfkit.partition.executor import LOG, Job
+from surfkit.partition.state import read_state
+from surfkit.pipeline import run
+
+pytest.importorskip("ray", reason="pip install 'surfkit[ray]'")
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+SMALL = {"object_store_memory": 80_000_000, "memory": 2_000_000_000, "include_dashboard": False}
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head of one processor, and room for more nodes."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    from ray.cluster_utils import Cluster
+
+    before = signal.getsignal(signal.SIGTERM)
+    for left in (2, 1, 0):  # Ray gives itself 30 s to start, which a busy machine may miss
+        made = Cluster()
+        try:
+            made.add_node(num_cpus=1, **SMALL)
+            break
+        except Exception:
+            made.shutdown()
+            if not left:
+                raise
+    yield made
+    made.shutdown()
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture
+def workers(cluster):
+    return Ray(address=cluster.address, cpus=1, memory_gb=0.1)
+
+
+def job(folder: Path, index: int, code: str = "pass", **more) -> Job:
+    place = folder / f"{index:03}"
+    return Job(index, place, lambda: index, ("-c", f"import os; os.chdir({str(place)!r}); exec({code!r})"), **more)
+
+
+def wait_for(what, seconds=60):
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.05)
+
+
+def test_how_each_ended_the_largest_first(workers, tmp_path):
+    say = "import time; print(time.time(), os.environ['OMP_NUM_THREADS'], repr(os.environ['CUDA_VISIBLE_DEVICES']))"
+    codes = [say, f"{say}\nraise SystemExit(1)", f"{say}\nos.kill(os.getpid(), 9)"]
+    jobs = [job(tmp_path, at, code, cost=cost) for at, (code, cost) in enumerate(zip(codes, (1, 9, 5), strict=True))]
+    jobs.append(job(tmp_path, 3, needs=(tmp_path / "elsewhere",)))
+    ends = {end.job.index: end for end in workers.run(jobs)}
+    assert {index: end.status for index, end in ends.items()} == {0: 0, 1: 1, 2: -9, 3: 2}
+    assert f"{tmp_path / 'elsewhere'} is not there; run folder and data set must lie" in ends[3].why
+    assert ends[3].why.startswith(f"machine {os.uname().nodename}: ")
+    printed = [(tmp_path / f"{index:03}" / LOG).read_text().split() for index in range(3)]
+    assert sorted(range(3), key=lambda at: float(printed[at][0])) == [1, 2, 0]
+    assert [words[1:] for words in printed] == [["1", "''"]] * 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000", "001", "002", "003"]
+
+
+SAVING = (
+    "import signal, sys, time\nfrom pathlib import Path\n"
+    "def save(*_):\n    Path('saved').touch()\n    sys.exit(130)\n"
+    "signal.signal(signal.SIGTERM, save)\nPath('began').write_text(str(os.getpid()))\n"
+    "while os.getppid() == int(os.environ['SURFKIT_DRIVER']): time.sleep(0.05)\n"
+    "save()"
+)
+
+
+def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
+    jobs = [job(tmp_path, at, SAVING) for at in (0, 1)]
+    running = workers.run(jobs)
+
+    class Stop(Exception):
+        pass
+
+    def began():
+        if (tmp_path / "000" / "began").exists():
+            raise Stop
+        return [], []
+
+    import ray
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
+        real = ray.wait
+        patch.setattr(ray, "wait", lambda refs, timeout=None, **more: began() if timeout else real(refs, **more))
+        next(running)
+    assert (tmp_path / "000" / "saved").exists() and not (tmp_path / "001" / "began").exists()
+
+
+def test_the_driver_is_killed(cluster, tmp_path):
+    """Ray kills the agents of a driver that is gone; what works for them notices, and saves."""
+    here, folder = str(Path(__file__).parent), str(tmp_path)
+    code = (
+        f"import sys; sys.path.insert(0, {here!r})\nfrom pathlib import Path\nfrom test_ray import SAVING, job\n"
+        "from surfkit.partition import Ray\n"
+        f"list(Ray(address={cluster.address!r}, cpus=1, memory_gb=0.1).run([job(Path({folder!r}), 0, SAVING)]))"
+    )
+    driver = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for((tmp_path / "000" / "began").exists)
+    driver.kill()
+    driver.wait()
+    wait_for((tmp_path / "000" / "saved").exists)
+    wait_for(lambda: not psutil.pid_exists(int((tmp_path / "000" / "began").read_text())))
+
+
+def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):  # noqa: F811
+    """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
+    guarded, command = blocks.guarded, blocks.job_of
+
+    def stopped(site, plan, index):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
+            return guarded(site, plan, index)
+
+    def failing(site, plan, index, hands):
+        made = command(site, plan, index, hands)
+        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(blocks, "guarded", stopped)
+        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert read_state(tmp_path / "blocks" / "000").step == 6
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        pytest.raises(Unfinished, match="1 failed: machine .*elsewhere") as told,
+    ):
+        patch.setattr(blocks, "job_of", failing)
+        run(recipe, data, tmp_path, Hands("cpu", workers), EVERY)
+    states = [read_state(tmp_path / "blocks" / f"00{at}") for at in (0, 1)]
+    assert told.value.status == 3 and [state.status for state in states] == ["done", "failed"]
+    assert "going on after step 6 of 12" in (tmp_path / "blocks" / "000" / LOG).read_text()
+    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    assert same(tmp_path, undisturbed)
+
+
+def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):  # noqa: F811
+    """It is killed while a block is between two steps, which is saved there, and finished on the other node."""
+    node = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"], memory=SMALL["memory"])
+    agent = node.all_processes["raylet"][0].process.pid
+    reached, gone, command = tmp_path / "reached", tmp_path / "gone", blocks.job_of
+    code = (
+        "import os, psutil, sys, time, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+        f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
+        "class K(D):\n    def show(self, done):\n        super().show(done)\n        if there and done.index == 7:\n"
+        f"            Path({str(reached)!r}).touch()\n"
+        f"            while not Path({str(gone)!r}).exists(): time.sleep(0.05)\n"
+        "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
+    )
+
+    def lingering(site, plan, index, hands):
+        made = command(site, plan, index, hands)
+        return replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
+
+    def lose():
+        wait_for(reached.exists)
+        cluster.remove_node(node, allow_graceful=False)
+        time.sleep(2)  # until the worker has noticed
+        gone.touch()
+
+    thread = threading.Thread(target=lose)
+    thread.start()
+    monkeypatch.setattr(blocks, "job_of", lingering)
+    run(recipe, data, tmp_path / "run", Hands("cpu", workers), EVERY)
+    thread.join()
+    assert gone.exists() and same(tmp_path / "run", undisturbed)
+    assert "is tried again" not in capsys.readouterr().err, "Ray did that, and waits where no machine is free"
+    logs = "".join((tmp_path / "run" / "blocks" / name / LOG).read_text() for name in ("000", "001"))
+    assert "stopped after step 7 of 12" in logs and "going on after step 7 of 12" in logs
+
+
+NODES = [{"CPU": 16, "memory": 64e9, "GPU": 2}, {"CPU": 8, "memory": 16e9}]
+
+
+@pytest.mark.parametrize(
+    "workers, jobs, wanted",
+    [
+        (Ray(), 3, {"num_cpus": 8, "num_gpus": 0, "memory": 10e9}),
+        (Ray(), 100, {"num_cpus": 3, "num_gpus": 0, "memory": 10e9}),  # six and one at a time, by their memory
+        (Ray(), 1, {"num_cpus": 16, "num_gpus": 0, "memory": 10e9}),
+        (Ray(gpus=0.5), 100, {"num_cpus": 6, "num_gpus": 0.5, "memory": 10e9}),
+        (Ray(cpus=2, memory_gb=1), 100, {"num_cpus": 2, "num_gpus": 0, "memory": 1e9}),
+    ],
+)
+def test_what_each_block_reserves(workers, jobs, wanted, tmp_path):
+    assert workers.share(NODES, [job(tmp_path, at, memory_bytes=10**10) for at in range(jobs)]) == wanted
+
+
+def test_what_no_machine_has(tmp_path):
+    for settings, said in (({"cpus": 17}, "has 16"), ({"memory_gb": 65}, "has 64")):
+        with pytest.raises(BadInput, match=said):
+            Ray(**settings).share(NODES, [job(tmp_path, 0)])
+    assert Ray().share(NODES, [job(tmp_path, 0, memory_bytes=10**12)])["memory"] == 64e9  # as much as there is
+    with pytest.raises(BadInput, match="has 0"):
+        Ray(gpus=1).share(NODES[1:], [job(tmp_path, 0)])
+
+
+@pytest.mark.parametrize(
+    "settings", [{"cpus": -1}, {"gpus": 2.0}, {"memory_gb": -1}, {"retries": -1}, {"address": "ray://head:10001"}]
+)
+def test_bad_settings(settings):
+    with pytest.raises(BadInput, match="ray"):
+        Ray(**settings)
+
+
+def test_no_cluster_there(tmp_path):
+    with pytest.raises(BadInput, match=r"ray.address 127.0.0.1:1: no connection"):
+        list(Ray(address="127.0.0.1:1").run([job(tmp_path, 0)]))
+
+
+def test_without_the_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(BadInput, match=r"pip install 'surfkit\[ray\]'"):
+        Ray().ready()

@@ -1,0 +1,229 @@
+"""Blocks as jobs of submitit, which needs no Slurm for its executors local and debug; and what Slurm would be told."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+
+from surfkit import blocks
+from surfkit.blocks import Hands, Unfinished
+from surfkit.core.check import BadInput
+from surfkit.partition import Slurm, slurm
+from surfkit.partition.executor import LOG, Job
+from surfkit.partition.state import read_state
+from surfkit.pipeline import run
+
+pytest.importorskip("submitit", reason="pip install 'surfkit[slurm]'")
+
+
+def job(folder: Path, index: int, code: str = "pass", **more) -> Job:
+    place = folder / f"{index:03}"
+    return Job(index, place, lambda: index, ("-c", f"import os; os.chdir({str(place)!r}); exec({code!r})"), **more)
+
+
+def wait_for(what, seconds=60):
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("cluster", ["local", "debug"])
+def test_how_each_ended_the_largest_first(cluster, tmp_path):
+    say = "import time; print(time.time(), os.environ['OMP_NUM_THREADS'])"
+    codes = [say, f"{say}\nraise SystemExit(1)", f"{say}\nos.kill(os.getpid(), 9)"]
+    jobs = [job(tmp_path, at, code, cost=cost) for at, (code, cost) in enumerate(zip(codes, (1, 9, 5), strict=True))]
+    jobs.append(job(tmp_path, 3, cost=0.0, needs=(tmp_path / "elsewhere",)))
+    ends = list(Slurm(cluster, cpus=3).run(jobs))
+    assert [(end.job.index, end.status) for end in ends] == [(1, 1), (2, -9), (0, 0), (3, 2)]
+    assert f"{tmp_path / 'elsewhere'} is not there; run folder and data set must lie" in ends[3].why
+    printed = [(tmp_path / f"{index:03}" / LOG).read_text().split() for index in range(3)]
+    assert [words[1] for words in printed] == [str(min(3, len(os.sched_getaffinity(0))))] * 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["000", "001", "002", "003", "jobs"]
+
+
+SAVING = (
+    "import signal, sys, time\nfrom pathlib import Path\n"
+    "def save(*_):\n    time.sleep(0.3)\n    Path('saved').touch()\n    sys.exit(130)\n"
+    "signal.signal(signal.SIGTERM, save)\n"
+    "Path('began').write_text(str(os.getppid()) + ' ' + str(os.getpid()))\ntime.sleep(60)"
+)
+
+
+def processes(folder: Path) -> list[psutil.Process]:
+    """That work on a job, outermost first: submitit's, ours that minds the command, and the command."""
+    minder, command = map(int, (folder / "began").read_text().split())
+    return [psutil.Process(minder).parent(), psutil.Process(minder), psutil.Process(command)]
+
+
+def test_leaving_stops_the_jobs(tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    found: list[psutil.Process] = []
+
+    def ended(queue):
+        if len(list(tmp_path.glob("*/began"))) == 2:
+            found.extend(process for at in (0, 1) for process in processes(tmp_path / f"00{at}"))
+            raise Stop
+        return iter(())
+
+    monkeypatch.setattr(slurm.Queue, "ended", ended)
+    with pytest.raises(Stop):
+        next(Slurm("local", parallel=2).run([job(tmp_path, at, SAVING) for at in (0, 1, 2)]))
+    assert not psutil.wait_procs(found, timeout=20)[1]
+    assert all((tmp_path / f"00{at}" / "saved").exists() for at in (0, 1)) and not (tmp_path / "002" / LOG).exists()
+
+
+def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
+    """Its command notices, and saves."""
+    import submitit
+
+    monkeypatch.setattr(submitit.Job, "_results_timeout_s", 1)
+    folder = tmp_path / "000"
+
+    def kill():
+        wait_for(lambda: (folder / "began").exists() and len((folder / "began").read_text().split()) == 2)
+        processes(folder)[0].kill()
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    (end,) = Slurm("local").run([job(tmp_path, 0, SAVING)])
+    thread.join()
+    assert end.status == slurm.CRASHED and "came to no result" in end.why
+    wait_for((folder / "saved").exists)
+
+
+def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):  # noqa: F811
+    """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
+    reached, command = tmp_path / "reached", blocks.job_of
+    code = (
+        "import os, sys, time, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+        "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
+        f"            Path({str(reached)!r}).write_text(str(os.getppid())); time.sleep(1)\n"
+        "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
+    )
+
+    def lingering(site, plan, index, hands):
+        made = command(site, plan, index, hands)
+        if index == 0 and not reached.exists():
+            made = replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
+        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
+
+    def preempt():
+        wait_for(lambda: reached.exists() and reached.read_text())
+        psutil.Process(int(reached.read_text())).parent().send_signal(signal.SIGUSR2)
+
+    thread = threading.Thread(target=preempt)
+    thread.start()
+    with monkeypatch.context() as patch, pytest.raises(Unfinished, match="block 1 failed: machine .* is not there"):
+        patch.setattr(blocks, "job_of", lingering)
+        run(recipe, data, tmp_path / "run", Hands("cpu", Slurm("local", cpus=1, parallel=2)), EVERY)
+    thread.join()
+    log = (tmp_path / "run" / "blocks" / "000" / LOG).read_text()
+    assert "stopped after step 7 of 12" in log and "going on after step 7 of 12" in log
+    assert read_state(tmp_path / "run" / "blocks" / "000").attempts == 2
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert same(tmp_path / "run", undisturbed)
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Programs that answer like those of Slurm; what they were asked is in `asked`, what squeue says in `queue`."""
+    programs = {
+        "sbatch": 'cp "$1" "$HERE/script"; [ -e "$HERE/full" ] && { echo "no such partition" >&2; exit 1; }\n'
+        "echo Submitted batch job 17",
+        "squeue": 'cat "$HERE/queue"',
+        "scancel": "",
+        "srun": "",
+    }
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name, lines in programs.items():
+        (folder / name).write_text(f'#!/bin/sh\nHERE={tmp_path}\necho {name} "$@" >> "$HERE/asked"\n{lines}\n')
+        (folder / name).chmod(0o755)
+    (tmp_path / "queue").write_text("17_0 PENDING Priority\n17_1 PENDING PartitionTimeLimit\n")
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setattr(slurm, "SLURM_POLL_S", 0.01)
+    monkeypatch.setattr(slurm, "ASK_S", 0.05)
+    return tmp_path
+
+
+def test_what_slurm_is_told(cluster, capsys):
+    workers = Slurm(
+        partition="gpu", account="maps", hours=1.5, cpus=4, gpus=1, parallel=3, extra=("qos=long", "exclusive")
+    )
+    jobs = [job(cluster / "my run" / "blocks", at, cost=at, memory_bytes=2_500_000_000) for at in range(2)]
+    running = workers.run(jobs)
+
+    def later():
+        wait_for(lambda: (cluster / "asked").exists() and "squeue" in (cluster / "asked").read_text())
+        (cluster / "queue").write_text("17_0 RUNNING None\n17_1 OUT_OF_MEMORY OutOfMemory\n3_0 FAILED None\n")
+
+    thread = threading.Thread(target=later)
+    thread.start()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(slurm, "ARRIVE_S", 0.3)
+        lost = next(running)
+    thread.join()
+    running.close()
+    script = (cluster / "script").read_text()
+    wanted = ["array=0-1%2", "time=90", "cpus-per-task=4", "gpus-per-node=1", "mem=3GB", "partition=gpu", "qos=long"]
+    for option in [*wanted, "account=maps", "signal=USR2@90", "job-name='surfkit-my run'"]:
+        assert f"#SBATCH --{option}\n" in script, option
+    assert "#SBATCH --exclusive\n" in script and "#SBATCH --requeue\n" in script
+    assert (lost.job.index, lost.status) == (
+        0,
+        slurm.CRASHED,
+    ) and "job 17_1 is OUT_OF_MEMORY (OutOfMemory) in Slurm" in lost.why
+    asked = (cluster / "asked").read_text().splitlines()
+    assert asked[-1] == "scancel 17_0" and "scancel 17_1" not in asked
+    said = capsys.readouterr().err
+    assert "block 1: job 17_0 is PENDING\n" in said and "block 1: job 17_0 is RUNNING\n" in said
+    assert "block 0: job 17_1 is PENDING (PartitionTimeLimit)\n" in said
+
+
+def test_what_slurm_does_not_take(cluster):
+    (cluster / "full").touch()
+    with pytest.raises(BadInput, match="does not take the jobs: no such partition"):
+        next(Slurm().run([job(cluster / "blocks", 0)]))
+
+
+def test_what_a_person_cancels_stays_so(cluster, monkeypatch):
+    (cluster / "queue").write_text("17 CANCELLED None\n")
+    monkeypatch.setattr(slurm, "ARRIVE_S", 0.3)
+    (end,) = Slurm().run([job(cluster / "blocks", 0)])
+    assert end.status == 1
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"hours": 0}, {"cpus": 0}, {"gpus": 2}, {"memory_gb": -1}, {"requeues": -1}, {"parallel": -1}]
+    + [{"extra": (option,)} for option in ("--a", "a=", "A=b", "a\nb=c")],
+)
+def test_bad_settings(settings):
+    with pytest.raises(BadInput, match="slurm"):
+        Slurm(**settings)
+
+
+def test_without_slurm_or_the_package(monkeypatch, tmp_path):
+    with monkeypatch.context() as patch, pytest.raises(BadInput, match="sbatch is not on this machine"):
+        patch.setenv("PATH", str(tmp_path))
+        Slurm().ready()
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(BadInput, match=r"pip install 'surfkit\[slurm\]'"):
+        Slurm("local").ready()
+
+
+def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BadInput, match="sbatch is not on this machine"):
+        run(recipe, data, tmp_path / "run", Hands("cpu", Slurm()), EVERY)
+    assert not (tmp_path / "run").exists()

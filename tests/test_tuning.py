@@ -1,0 +1,77 @@
+"""Signs of life of a block, and who keeps away from it because of them."""
+
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+
+from surfkit import blocks, tuning
+from surfkit.blocks import Hands
+from surfkit.cli import main
+from surfkit.core.check import BadInput
+from surfkit.core.errand import DRIVER
+from surfkit.partition.state import STALE_S, read_state, write_state
+from surfkit.pipeline import run
+from surfkit.tuning import signs
+
+
+def test_signs_of_life_while_no_step_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning, "ALIVE_S", 0.0)
+    write_state(tmp_path, status="running", step=3, heard=0.0)
+    with signs(tmp_path):
+        until = time.monotonic() + 20
+        while not read_state(tmp_path).heard and time.monotonic() < until:
+            time.sleep(0.02)
+        state = read_state(tmp_path)
+    assert time.time() - state.heard < 20 and (state.status, state.step) == ("running", 3)
+
+
+def test_a_driver_that_goes_while_no_step_is_made(tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setenv(DRIVER, str(os.getppid()))
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), signs(tmp_path):
+        monkeypatch.setattr(os, "getppid", lambda: 1)
+        time.sleep(20)
+    assert time.monotonic() - began < 15 and signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.fixture
+def elsewhere(undisturbed, tmp_path):  # noqa: F811
+    """A run whose first block was heard of on another machine, and how to say when."""
+    shutil.copytree(undisturbed, tmp_path / "run")
+
+    def heard(seconds_ago: float) -> Path:
+        write_state(
+            tmp_path / "run" / "blocks" / "000", status="running", host="far", pid=7, heard=time.time() - seconds_ago
+        )
+        return tmp_path / "run"
+
+    return heard
+
+
+def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
+    folder = elsewhere(10)
+    assert main(["tune", str(folder), "0"]) == tuning.BUSY
+    assert (
+        "process 7 on far was heard of" in capsys.readouterr().err and read_state(folder / "blocks/000").host == "far"
+    )
+    elsewhere(STALE_S - 3)
+    assert main(["tune", str(folder), "0", "--patience", "60"]) == 0
+    assert read_state(folder / "blocks" / "000").host != "far"
+
+
+def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(blocks, "LEAVE_S", 0.2)
+    folder = elsewhere(STALE_S - 3)
+    run(recipe, data, folder, Hands("cpu"), EVERY)
+    assert same(folder, undisturbed)
+    elsewhere(0)
+    monkeypatch.setattr(blocks, "STALE_S", 0.2)
+    (folder / "tune" / "checkpoint.safetensors").unlink()
+    with pytest.raises(BadInput, match="000: process 7 on far works on the block; wait for its end"):
+        run(recipe, data, folder, Hands("cpu"), EVERY)
