@@ -6,32 +6,39 @@ come to, and whoever comes back to it goes on from there.
 
 from __future__ import annotations
 
+import itertools
 import os
-import shutil
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
+from surfkit.board import Board, Standing, standing
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.folder import Run, discard, say
+from surfkit.folder import Run, discard, relay, say
+from surfkit.foresight import need, tell
+from surfkit.ladder import following, lesser
 from surfkit.partition import executor
-from surfkit.partition.executor import Executor, Inline
+from surfkit.partition.executor import Ended, Executor, Inline
 from surfkit.partition.merge import Share, merge
 from surfkit.partition.picture import plan_picture
 from surfkit.partition.plan import Fewest, Plan, plan
 from surfkit.partition.state import read_state, worked_on, write_state
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
+from surfkit.scene.memory import oom_kills
 from surfkit.train import checkpoint
+from surfkit.train.faults import DiskFull
 from surfkit.train.look import fresh_looks
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
-from surfkit.tuning import BUSY, Site, guarded, sight_of
+from surfkit.tuning import BUSY, FULL, Site, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
@@ -94,7 +101,10 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     discard(final.metrics, final.cloud, final.mesh_record)
     while state is None:
         await_workers(site)
+        foresee(site, record.plan, coarse, hands)
         work(site, record.plan, hands)
+        for folder in site.folders():  # also of blocks that were tuned by hand
+            relay(site.this.out, folder, f"block {int(folder.name)}: ")
         state = put_together(site, record.plan, coarse)
     checkpoint.save(final.checkpoint, state)
     emit(FileWritten(final.checkpoint, "merged blocks"))
@@ -115,9 +125,7 @@ def planned(site: Site, coarse: StageState) -> Record:
             return record
     if site.folders():  # of another coarse model, or of a plan that is gone
         await_workers(site)
-        aside = site.this.out / "blocks-before"
-        shutil.rmtree(aside, ignore_errors=True)
-        os.replace(site.folder, aside)
+        aside = put_aside(site)
         checkpoint.discard(replace(site.this, part="tune").checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
     recipe = site.this.recipe
@@ -134,6 +142,14 @@ def planned(site: Site, coarse: StageState) -> Record:
             f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
         )
     return made
+
+
+def put_aside(site: Site) -> Path:
+    """Rename the folder of the blocks, and leave alone what was put aside before; its new name."""
+    names = itertools.chain(["blocks-before"], (f"blocks-before-{number}" for number in itertools.count(2)))
+    aside = next(path for path in (site.this.out / name for name in names) if not path.exists())
+    os.replace(site.folder, aside)
+    return aside
 
 
 def merged(site: Site, record: Record) -> StageState | None:
@@ -169,24 +185,41 @@ def await_workers(site: Site) -> None:
         time.sleep(0.2)
 
 
+def foresee(site: Site, blocks: Plan, coarse: StageState, hands: Hands) -> None:
+    """Say what the blocks that are left will take; BadInput if there is certainly no room for them."""
+    indices = left(site, blocks)
+    memory = [job_of(site, blocks, index, hands).memory_bytes for index in indices]
+    if indices:
+        tell(site, need(site, [blocks.blocks[index] for index in indices], coarse, memory))
+
+
 def work(site: Site, blocks: Plan, hands: Hands) -> None:
-    """Have all blocks tuned that are not; one that crashes is tried again."""
-    attempts = dict.fromkeys(left(site, blocks), 0)
-    waiting = list(attempts)
+    """Have all blocks tuned that are not.
+
+    One that crashes is tried again, and one whose memory gave out too, with less and with the machine for itself.
+    """
+    waiting = left(site, blocks)
+    attempts, kills = dict.fromkeys(waiting, 0), oom_kills()
     failed: dict[int, str] = {}
     while waiting:
-        jobs = [job_of(site, blocks, index, hands) for index in waiting]
-        say(f"{len(jobs)} of {len(blocks.blocks)} blocks to tune")
-        waiting = []
-        for ended in hands.workers.run(jobs):
+        batch = [index for index in waiting if not short(site, index)]
+        batch = batch or (waiting[:1] if hands.workers.at_once > 1 else list(waiting))
+        waiting = [index for index in waiting if index not in batch]
+        say(f"{len(batch)} of {len(blocks.blocks)} blocks to tune")
+        for ended in done_by(hands, site, [job_of(site, blocks, index, hands) for index in batch]):
             index = ended.job.index
             attempts[index] += 1
+            relay(site.this.out, site.place(index), f"block {index}: ")
             if ended.status == 0:
-                say(f"block {index} is done")
+                say(f"block {index} is done; {seen(site, attempts).heading()}")
                 continue
-            reason = told(site, index, ended.status)
-            again = ended.status not in (1, 2) and attempts[index] < ATTEMPTS
-            emit(Warned(f"block {index} {reason}" + ("; it is tried again" if again else "")))
+            starved = ended.status == -signal.SIGKILL and oom_kills() > kills
+            kills += starved
+            reason = told(site, index, ended.status, starved)
+            if ended.status == FULL:
+                raise DiskFull(f"block {index} {reason}")
+            again = another_way(site, index, ended.status, attempts[index])
+            emit(Warned(f"block {index} {reason}" + (f"; {again}" if again else "")))
             if again:
                 waiting.append(index)
             else:
@@ -196,13 +229,43 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
         raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
 
 
-def told(site: Site, index: int, status: int) -> str:
-    """What became of a block, in a few words; also noted in its state."""
+def done_by(hands: Hands, site: Site, jobs: Sequence[executor.Job]) -> Iterator[Ended]:
+    """The jobs as they end; where others do them, it is shown how far they are."""
+    inside = isinstance(hands.workers, Inline)
+    folders = {job.index: job.folder for job in jobs}
+    shown = nullcontext() if inside else Board(folders, site.this.recipe.tune.steps)
+    with shown, closing(hands.workers.run(jobs)) as ended:
+        yield from ended
+
+
+def seen(site: Site, indices: Iterable[int]) -> Standing:
+    """Where blocks stand."""
+    return standing({index: site.place(index) for index in indices}, site.this.recipe.tune.steps)
+
+
+def short(site: Site, index: int) -> bool:
+    """Whether memory gave out when a block was last worked on."""
+    return read_state(site.place(index)).kind == "oom"
+
+
+def another_way(site: Site, index: int, status: int, attempts: int) -> str | None:
+    """How a block that failed is tried again, in a few words; None if it is not."""
+    if short(site, index):
+        rung = following(read_state(site.place(index)), site.this.recipe.tune.densify)
+        return f"it is tried again: {rung.text}" if rung else None
+    return "it is tried again" if status not in (1, 2) and attempts < ATTEMPTS else None
+
+
+def told(site: Site, index: int, status: int, starved: bool = False) -> str:
+    """What became of a block, in a few words; also noted in its state.
+
+    `starved`: the system has ended processes for want of memory meanwhile.
+    """
     state = read_state(site.place(index))
     if status < 0:
-        name = signal.Signals(-status).name
-        write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}")
-        return f"was ended by {name}"
+        error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved
+        write_state(site.place(index), status="failed", kind="oom" if starved else "crash", error=error)
+        return f"was {error}"
     if status == BUSY:
         return "is worked on by another process"
     if state.status != "failed":
@@ -283,5 +346,9 @@ def sound(site: Site, index: int) -> StageState | None:
 def note(site: Site, shares: Sequence[Share]) -> None:
     """Write down what each block gave, and say where the coarse model had to fill in."""
     write_json(site.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
+    for share in shares:
+        less = lesser(read_state(site.place(share.index)))
+        if less and not share.filled:
+            emit(Warned(f"block {share.index} was tuned with less than the recipe says, for want of memory: {less}"))
     if filled := [str(share.index) for share in shares if share.filled]:
         emit(Warned(f"blocks {', '.join(filled)} have no views, and are as they were in the coarse model"))

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import torch
 
+from surfkit.core import journal
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, emit
@@ -29,6 +30,8 @@ from surfkit.train.stage import Stage
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
 FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress")
+NOTES = "notes of the run"
+"""Name of the plugin."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,19 @@ class Run:
         data: Part of it in run.json.
         part: The stage that is spoken of: "pretrain" for the whole scene at once, "tune" for a block, and for all of
             them when they are merged.
+        block: Number of the block, if it is one's.
     """
 
     out: Path
     recipe: Recipe
     data: Data
     part: Literal["pretrain", "tune"] = "pretrain"
+    block: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What is being done, for people."""
+        return self.part if self.block is None else f"block {self.block}"
 
     @property
     def stage(self) -> Stage:
@@ -271,6 +281,7 @@ class Notes:
         self.memory: dict[str, int] = {}
         self.path: Path | None = None
         self.facts: dict[str, Any] = {}
+        self.prefix = ""
 
     def begin(self, path: Path, facts: dict[str, Any], before: dict[str, Any]) -> None:
         """Keep all in a file from now on, after what a run that was interrupted had kept there `before`."""
@@ -290,8 +301,10 @@ class Notes:
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
         if isinstance(event, Warned):
-            say(f"note: {event.text}")
-            self.keep(self.texts, event.text)
+            if self.prefix and event.text in self.texts:
+                return  # it has been said of the whole run
+            say(f"note: {self.prefix}{event.text}")
+            self.keep(self.texts, self.prefix + event.text)
         elif isinstance(event, MemoryTaken):
             if event.parts["peak"] >= self.memory.get("peak", 0):
                 self.memory = dict(event.parts)
@@ -312,11 +325,38 @@ class Notes:
 def noted() -> Iterator[Notes]:
     """Within, warnings are printed and kept."""
     notes = Notes()
-    plugins().register(notes, "notes of the run")
+    plugins().register(notes, NOTES)
     try:
         yield notes
     finally:
         plugins().unregister(notes)
+
+
+@contextmanager
+def naming(prefix: str) -> Iterator[None]:
+    """Within, warnings are noted as those of a part of the run, which they begin with."""
+    notes = plugins().get_plugin(NOTES)
+    if notes is not None:
+        notes.prefix = prefix
+    try:
+        yield
+    finally:
+        if notes is not None:
+            notes.prefix = ""
+
+
+def relay(out: Path, folder: Path, prefix: str) -> None:
+    """Note for the run in `out` what the journal of a part of it, written by another process, has been warned of."""
+    record = read_record(out)
+    notes, skipped = set(record.get("notes", [])), set(record.get("skipped", []))
+    for line in journal.read(folder / journal.NAME):
+        text, name = line.get("text"), line.get("name")
+        if line["event"] == "Warned" and isinstance(text, str) and not {text, prefix + text} & notes:
+            notes.add(text)
+            emit(Warned(prefix + text))
+        elif line["event"] == "PhotoSkipped" and isinstance(name, str) and name not in skipped:
+            skipped.add(name)
+            emit(PhotoSkipped(name, str(line.get("reason"))))
 
 
 def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:

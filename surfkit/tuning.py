@@ -8,18 +8,19 @@ import signal
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import StepDone
+from surfkit.core.events import StageBegan, StepDone
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.folder import Run, say
+from surfkit.folder import Run, naming, say
+from surfkit.ladder import climb, eased
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition.base import Sight
 from surfkit.partition.executor import DRIVER
@@ -29,14 +30,16 @@ from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
+from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
 """Seconds between signs of life of a block."""
-CRASHED, BUSY, INTERRUPTED = 70, 75, 130
-"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, and a block that another works on."""
+CRASHED, FULL, BUSY, INTERRUPTED = 70, 74, 75, 130
+"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, a full disk, and a block that another
+works on."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Site:
 
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
-        return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+        return Run(self.place(index), self.this.recipe, self.this.data, "tune", index)
 
 
 def guarded(site: Site, blocks: Plan, index: int) -> int:
@@ -90,13 +93,16 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
     folder = site.place(index)
     sweep(folder)
     try:
-        with kept(folder), signs(folder):
+        with naming(f"block {index}: "), kept(folder), signs(folder), in_one_line(folder):
             tune(site, blocks, index)
     except (BadInput, Fault) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join((error.what if isinstance(error, OutOfMemory) else str(error)).split())
         say(f"block {index}: {reason}")
-        write_state(folder, status="failed", kind="data" if isinstance(error, BadInput) else "fault", error=reason)
-        return 2 if isinstance(error, BadInput) else 1
+        with suppress(OSError):  # the disk may be full
+            write_state(
+                folder, status="failed", kind="data" if isinstance(error, BadInput) else error.kind, error=reason
+            )
+        return 2 if isinstance(error, BadInput) else FULL if isinstance(error, DiskFull) else 1
     except KeyboardInterrupt:
         write_state(folder, status="failed", kind="interrupted", error="interrupted")
         return INTERRUPTED
@@ -109,7 +115,8 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
 
 def tune(site: Site, blocks: Plan, index: int) -> None:
     """Tune one block from where it stands to its end."""
-    block = site.block(index)
+    climb(site.block(index))
+    block, store = eased(site.block(index), site.store)
     wanted = set(blocks.blocks[index].views)
     views = tuple(view for view in site.scene.train if view.name in wanted)
     scene = replace(site.scene, train=views, held_out=())
@@ -117,9 +124,11 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
     state = saved(block, scene, repair=True)
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
-    write_state(folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None)
+    write_state(
+        folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None, first=done, began=0.0
+    )
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, site.store)
+        given = read_ahead(site.this.data, scene, block.stage.losses, store)
         every = replace(site.every, pictures=0)
         start = Start(site, blocks, index, views)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
@@ -193,6 +202,9 @@ class Watch:
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
+        if isinstance(event, StageBegan):
+            fresh = {"begun_points": event.points} if event.first == 1 else {}
+            write_state(self.folder, began=time.time(), **fresh)
         if not isinstance(event, StepDone):
             return
         if self.alone():

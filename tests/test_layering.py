@@ -9,6 +9,7 @@ import surfkit
 ROOT = Path(surfkit.__file__).parent
 FLOORS = (
     "core",
+    "outlook",
     "scene",
     "raster",
     "primitives losses depth",
@@ -16,8 +17,9 @@ FLOORS = (
     "train partition compress mesh evaluate",
     "recipe",
     "folder",
-    "optimise",
-    "tuning",
+    "optimise ladder",
+    "tuning board",
+    "foresight",
     "blocks",
     "surface",
     "pipeline",

@@ -13,7 +13,9 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.lock import holder
 
 Status = Literal["planned", "running", "done", "failed"]
-Kind = Literal["data", "fault", "crash", "interrupted"]
+Kind = Literal["oom", "nan", "disk", "data", "fault", "crash", "interrupted"]
+"""Why a block failed: memory, numbers or disk gave out, its data cannot be used, something else that was foreseen, or
+was not, or someone asked it to stop."""
 
 STALE_S = 120.0
 """Seconds without a sign of life after which a block of another machine counts as abandoned."""
@@ -33,6 +35,12 @@ class BlockState:
         host: The machine that works or worked on it.
         pid: The process.
         heard: When it last gave a sign of life, seconds since 1970.
+        began: When it was last begun.
+        first: Step after which it was.
+        begun_points: At its first step.
+        rung: Of the ladder that it has come down for want of memory; 0 for none.
+        most_points: Beyond which it does not grow, on its rung.
+        eased: What each rung has changed, in a few words.
     """
 
     status: Status = "planned"
@@ -44,6 +52,12 @@ class BlockState:
     host: str | None = None
     pid: int | None = None
     heard: float = 0.0
+    began: float = 0.0
+    first: int = 0
+    begun_points: int = 0
+    rung: int = 0
+    most_points: int | None = None
+    eased: tuple[str, ...] = ()
 
 
 def worked_on(folder: Path) -> bool:
