@@ -10,18 +10,18 @@ import itertools
 import os
 import signal
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from surfkit.board import Board, Standing, standing
+from surfkit.board import Board, Standing, state_since
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.folder import Run, discard, relay, say
+from surfkit.folder import Run, discard, naming, relay, say
 from surfkit.foresight import need, tell
 from surfkit.ladder import following, lesser
 from surfkit.partition import executor
@@ -38,7 +38,7 @@ from surfkit.train.faults import DiskFull
 from surfkit.train.look import fresh_looks
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
-from surfkit.tuning import BUSY, FULL, Site, guarded, sight_of
+from surfkit.tuning import BUSY, FULL, Site, aligned, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
@@ -56,10 +56,12 @@ class Hands:
     Attributes:
         device: Where.
         workers: Who tunes the blocks, where the recipe cuts the scene into some.
+        tensorboard: Whether workers in processes of their own write scalars for TensorBoard.
     """
 
     device: Device = "auto"
     workers: Executor = Inline()
+    tensorboard: bool = False
 
 
 class Unfinished(Fault):
@@ -102,6 +104,8 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
     while state is None:
         await_workers(site)
         foresee(site, record.plan, coarse, hands)
+        with naming("blocks: "):  # what the coarse stage has said already is not said again
+            aligned(site)
         work(site, record.plan, hands)
         for folder in site.folders():  # also of blocks that were tuned by hand
             relay(site.this.out, folder, f"block {int(folder.name)}: ")
@@ -200,18 +204,19 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
     """
     waiting = left(site, blocks)
     attempts, kills = dict.fromkeys(waiting, 0), oom_kills()
+    look = looking(site, hands, waiting)
     failed: dict[int, str] = {}
     while waiting:
         batch = [index for index in waiting if not short(site, index)]
         batch = batch or (waiting[:1] if hands.workers.at_once > 1 else list(waiting))
         waiting = [index for index in waiting if index not in batch]
         say(f"{len(batch)} of {len(blocks.blocks)} blocks to tune")
-        for ended in done_by(hands, site, [job_of(site, blocks, index, hands) for index in batch]):
+        for ended in done_by(hands, [job_of(site, blocks, index, hands) for index in batch], look):
             index = ended.job.index
             attempts[index] += 1
             relay(site.this.out, site.place(index), f"block {index}: ")
             if ended.status == 0:
-                say(f"block {index} is done; {seen(site, attempts).heading()}")
+                say(f"block {index} is done; {look().heading()}")
                 continue
             starved = ended.status == -signal.SIGKILL and oom_kills() > kills
             kills += starved
@@ -229,18 +234,22 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
         raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
 
 
-def done_by(hands: Hands, site: Site, jobs: Sequence[executor.Job]) -> Iterator[Ended]:
+def done_by(hands: Hands, jobs: Sequence[executor.Job], look: Callable[[], Standing]) -> Iterator[Ended]:
     """The jobs as they end; where others do them, it is shown how far they are."""
-    inside = isinstance(hands.workers, Inline)
-    folders = {job.index: job.folder for job in jobs}
-    shown = nullcontext() if inside else Board(folders, site.this.recipe.tune.steps)
+    shown = nullcontext() if isinstance(hands.workers, Inline) else Board(look)
     with shown, closing(hands.workers.run(jobs)) as ended:
         yield from ended
 
 
-def seen(site: Site, indices: Iterable[int]) -> Standing:
-    """Where blocks stand."""
-    return standing({index: site.place(index) for index in indices}, site.this.recipe.tune.steps)
+def looking(site: Site, hands: Hands, indices: Iterable[int]) -> Callable[[], Standing]:
+    """What tells where blocks stand that are tuned from now on."""
+    since, indices = time.time(), tuple(indices)
+
+    def look() -> Standing:
+        states = {index: state_since(site.place(index), since) for index in indices}
+        return Standing(states, site.this.recipe.tune.steps, hands.workers.at_once)
+
+    return look
 
 
 def short(site: Site, index: int) -> bool:
@@ -281,7 +290,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     share = site.store.bytes() // hands.workers.at_once
     command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
     command += ["--cache", f"{share}", "--checkpoint-every", f"{site.every.checkpoint}"]
-    command += ["--resized-copies"] * site.store.copies
+    command += ["--resized-copies"] * site.store.copies + ["--tensorboard"] * hands.tensorboard
     pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
     photos = 3 * sum(view.camera.width * view.camera.height for view in site.scene.train if view.name in block.views)
     growth = 1 if site.this.recipe.tune.densify is None else 3

@@ -7,6 +7,9 @@ from typing import Protocol
 
 from surfkit.core.clock import clock
 
+LEAST_S = 3.0
+"""The first steps are slower than the others."""
+
 
 class Clocked(Protocol):
     """What a block tells of itself; see `surfkit.partition.state.BlockState`."""
@@ -25,9 +28,9 @@ def so_far(block: Clocked) -> float | None:
 
 
 def pace(block: Clocked) -> float | None:
-    """Steps a second since it was last begun."""
-    seconds, made = so_far(block), block.step - block.first
-    return made / seconds if seconds and made > 0 else None
+    """Steps a second since it was last begun; None before there is something to tell from."""
+    seconds, made = so_far(block) or 0.0, block.step - block.first
+    return made / seconds if made > 0 and (seconds > LEAST_S or block.status == "done" and seconds > 0) else None
 
 
 def seconds_left(block: Clocked) -> float | None:
@@ -36,20 +39,25 @@ def seconds_left(block: Clocked) -> float | None:
     return (block.steps - block.step) / speed if speed and block.status == "running" else None
 
 
-def all_left(blocks: Sequence[Clocked], steps: int) -> float | None:
-    """Seconds until all blocks are done, at the pace of those that are worked on; None where none tells it.
+def all_left(blocks: Sequence[Clocked], steps: int, at_once: int = 1) -> float | None:
+    """Seconds until all blocks are done, at the pace of those that are worked on, or else of those that are done.
 
     Args:
         blocks: Those that are tuned at all.
         steps: That each has to make, also if it has not been begun.
+        at_once: How many are worked on at a time, where it is not more.
+
+    Returns:
+        None where no block tells its pace, and when all are done.
     """
-    running = [block for block in blocks if block.status == "running"]
-    paces = [speed for speed in map(pace, running) if speed]
-    if not paces:
+    rest = [block for block in blocks if block.status != "done"]
+    running = [block for block in rest if block.status == "running"]
+    paces = [speed for speed in map(pace, running) if speed] or [speed for speed in map(pace, blocks) if speed]
+    if not paces or not rest:
         return None
-    together = sum(paces) * len(running) / len(paces)
+    together = sum(paces) / len(paces) * max(len(running), min(at_once, len(rest)))
     lasts = max((left for left in map(seconds_left, running) if left), default=0.0)
-    return max(lasts, sum(steps - block.step for block in blocks if block.status != "done") / together)
+    return max(lasts, sum(max(0, steps - block.step) for block in rest) / together)
 
 
 def in_words(block: Clocked) -> str:

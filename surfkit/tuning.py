@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput, Fault
+from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import StageBegan, StepDone
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
@@ -28,10 +29,11 @@ from surfkit.partition.plan import Plan
 from surfkit.partition.state import read_state, write_state
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
+from surfkit.scene.depth_prior import Alignment, alignment
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
-from surfkit.train.material import Store, read_ahead
+from surfkit.train.material import Store, needs_priors, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
 
@@ -128,11 +130,24 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
         folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None, first=done, began=0.0
     )
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, store)
+        given = read_ahead(site.this.data, scene, block.stage.losses, store, aligned(site))
         every = replace(site.every, pictures=0)
         start = Start(site, blocks, index, views)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
     write_state(folder, status="done", step=state.index, steps=steps)
+
+
+def aligned(site: Site) -> Alignment | None:
+    """How the depth priors of the whole scene are aligned, kept for all blocks; None if no loss needs any.
+
+    A block's own views would give another scale to its loss, and another judgement of failed alignments.
+    """
+    if not needs_priors(site.this.recipe.tune.losses):
+        return None
+    path = site.folder / "priors.json"
+    if not path.exists():
+        write_json(path, alignment(site.this.data, site.scene))
+    return read_json(path, Alignment)
 
 
 @dataclass(frozen=True)

@@ -193,7 +193,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
     assert read_state(tmp_path / "blocks" / "000").status == "done"
     assert main(["status", str(tmp_path)]) == 3
     said = capsys.readouterr().out
-    assert "1 of 2 done" in said and "failed: numbers are not finite, step 0 of 12" in said
+    assert "1 of 2 done" in said and "failed (fault): numbers are not finite, step 0 of 12" in said
     run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert same(tmp_path, undisturbed)
 
