@@ -67,7 +67,7 @@ def climb(block: Run) -> None:
     elif rung.number == ANEW:
         checkpoint.discard(block.checkpoint)
         most, text = state.begun_points, f"begun anew, at most {state.begun_points:,} points"
-    emit(Warned(f"{state.error or 'out of memory'}: {rung.text} ({text})"))
+    emit(Warned(f"for want of memory: {text}"))
     write_state(
         block.out,
         status="planned",

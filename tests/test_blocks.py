@@ -228,6 +228,11 @@ def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
     run(longer, data, tmp_path, Hands("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
+    before = read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record)
+    (tmp_path / "blocks" / "plan.json").unlink()
+    run(longer, data, tmp_path, Hands("cpu"), EVERY)
+    assert read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record) == before, "nothing is overwritten"
+    assert (tmp_path / "blocks-before-2" / "000").is_dir() and "blocks-before-2" in (tmp_path / "run.json").read_text()
 
 
 def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_path):
