@@ -21,6 +21,7 @@ from surfkit.board import Board, Standing, state_since
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit
+from surfkit.core.files import sweep
 from surfkit.folder import Run, discard, naming, relay, say
 from surfkit.foresight import need, tell
 from surfkit.ladder import following, lesser
@@ -96,6 +97,7 @@ def tuned(site: Site, coarse: StageState, hands: Hands) -> tuple[Run, StageState
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
     final = replace(site.this, part="tune")
+    sweep(site.folder, deep=False)  # a block's own folder is its worker's
     record = planned(site, coarse)
     state = merged(site, record)
     if state is not None:

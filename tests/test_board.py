@@ -53,8 +53,6 @@ def test_a_table_on_a_terminal():
     text = console.file.getvalue()
     assert "1 of 4 blocks done" in text and "at most 9 points" in text and "numbers" in text
     assert text.count("/300") == 3 and "silent for" in text, "heard of long ago"
-    with Board(lambda: Standing(STATES, 300), console):
-        assert not console.file.getvalue().count("blocks done, about 1:10") > 1
 
 
 def test_a_larger_display_gets_the_sum(monkeypatch):
