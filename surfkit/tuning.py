@@ -20,7 +20,7 @@ from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.folder import Run, naming, say
+from surfkit.folder import Run, naming, refuse_file, say
 from surfkit.ladder import climb, eased
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition.base import Sight
@@ -83,11 +83,13 @@ class Site:
 def guarded(site: Site, blocks: Plan, index: int) -> int:
     """Tune a block and return an exit status; what goes wrong is told, and is in the block's state."""
     folder = site.place(index)
+    refuse_file(folder)
+    read_state(folder)  # or BadInput: what is damaged cannot be written on
     try:
         with held(folder):
             return _begun(site, blocks, index)
     except BadInput as error:  # another process works there, and the state is its
-        say(f"block {index}: {error}")
+        say(f"surfkit: block {index}: {error}")
         return BUSY
 
 
@@ -99,7 +101,7 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
             tune(site, blocks, index)
     except (BadInput, Fault) as error:
         reason = " ".join((error.what if isinstance(error, OutOfMemory) else str(error)).split())
-        say(f"block {index}: {reason}")
+        say(f"surfkit: block {index}: {reason}")
         with suppress(OSError):  # the disk may be full
             write_state(
                 folder, status="failed", kind="data" if isinstance(error, BadInput) else error.kind, error=reason

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.lock import holder
 
@@ -73,9 +74,16 @@ def state_path(folder: Path) -> Path:
 
 
 def read_state(folder: Path) -> BlockState:
-    """The state of the block in a folder; planned if nothing is there."""
+    """The state of the block in a folder; planned if nothing is there.
+
+    Raises:
+        BadInput: The file is damaged.
+    """
     path = state_path(folder)
-    return read_json(path, BlockState) if path.exists() else BlockState()
+    try:
+        return read_json(path, BlockState) if path.exists() else BlockState()
+    except BadInput as error:
+        raise BadInput(f"{error}; delete it, and the block goes on from its last checkpoint") from error
 
 
 def write_state(folder: Path, **changes: object) -> BlockState:
