@@ -233,6 +233,8 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
                 failed[index] = reason
     if failed:
         what = "; ".join(f"block {index} {reason}" for index, reason in sorted(failed.items()))
+        if any(short(site, index) for index in failed):
+            what += "; more blocks or smaller photographs need less memory, in a folder of their own"
         raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
 
 

@@ -34,7 +34,7 @@ from surfkit.scene.depth_files import map_path, write_map, write_record
 from surfkit.scene.depth_prior import Alignment, alignment
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.faults import DiskFull, OutOfMemory
+from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
 from surfkit.train.stage import Stage, Trainer
 
 STEPS = 12
@@ -140,7 +140,9 @@ def test_a_block_too_large_since_its_checkpoint_begins_anew(data, recipe, tmp_pa
 def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         short_above(100, patch)
-        with pytest.raises(Unfinished, match="block 0 failed: out of memory .*; the others are done"):
+        with pytest.raises(
+            Unfinished, match="block 0 failed: out of memory .*; more blocks or smaller .*; the others are done"
+        ):
             run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     state = read_state(tmp_path / "blocks" / "000")
     assert (state.kind, state.rung, state.attempts) == ("oom", HELD, 3), "it has not grown: nothing to begin anew for"
@@ -319,6 +321,27 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
         assert {prior.typical for prior in priors.values() if prior is not None} == {whole.typical}
         assert alignment(Data(tmp_path / "data"), scene).typical != whole.typical
     assert sum("train without a depth prior" in text for text in notes(tmp_path / "run")) == 1
+
+
+def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeypatch):
+    """It goes back to its checkpoint twice, and is not begun again."""
+    optimise, step = tuning.optimise, Trainer.step
+
+    def optimising(job, state):
+        def spoilt(self, state):
+            if job.this.block == 1 and state.index == 7:
+                raise Diverged(8, "view_001.png", "the losses are nan")
+            return step(self, state)
+
+        monkeypatch.setattr(Trainer, "step", spoilt)
+        return optimise(job, state)
+
+    monkeypatch.setattr(tuning, "optimise", optimising)
+    with pytest.raises(Unfinished, match="block 1 failed: .*the losses are nan, also after .* halved 2 times"):
+        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    states = [read_state(tmp_path / "blocks" / name) for name in ("000", "001")]
+    assert [(state.status, state.kind, state.attempts) for state in states] == [("done", None, 1), ("failed", "nan", 1)]
+    assert sum("block 1: step 8" in text and "back to step 6" in text for text in notes(tmp_path)) == 2
 
 
 def test_faults_have_kinds(tmp_path):
