@@ -215,8 +215,8 @@ def odm(here: Path) -> None:
     (data / "opensfm" / "reconstruction.json").write_text(json.dumps(model))
 
 
-def run_folder(here: Path, finished: bool = True) -> None:
-    """A run that is finished, or stopped after its first step."""
+def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
+    """A run that is finished, or stopped after the first step of a stage, such as "pretrain" or "block 1"."""
     from surfkit import optimise
     from surfkit.cli import main
 
@@ -225,15 +225,15 @@ def run_folder(here: Path, finished: bool = True) -> None:
 
     class Stopping(display):
         def show(self, done: Any) -> None:
-            os.kill(os.getpid(), signal.SIGTERM)
+            if self.stage == stop:
+                os.kill(os.getpid(), signal.SIGTERM)
 
-    if not finished:
-        optimise.Display = Stopping
+    optimise.Display = Stopping
     try:
-        status = main(TRAIN.replace("--steps 2", "--steps 2 --checkpoint-every 1").format(here=here).split())
+        status = main(words.replace("--steps 2", "--steps 2 --checkpoint-every 1").format(here=here).split())
     finally:
         optimise.Display = display
-    assert status == (0 if finished else 130), status
+    assert status == (130 if stop else 0), status
 
 
 def recipe_file(here: Path) -> None:
@@ -246,6 +246,7 @@ def recipe_file(here: Path) -> None:
 
 
 MODEL = ("data/sparse/0/*",)
+BLOCKS = f"{TRAIN} partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 COMMANDS = ("status {here}/out --json", "export {here}/out", "evaluate {here}/out --device cpu", TRAIN)
 TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
@@ -261,7 +262,12 @@ TARGETS = {
     "odm": Target(odm, (TRAIN,), ("data/opensfm/*",)),
     "recipe": Target(recipe_file, (TRAIN.replace("recipe:2dgs", "recipe:{here}/r.json"),), ("r.json",)),
     "run": Target(run_folder, COMMANDS, ("out/*", "out/*", "out/pretrain/*", "out/pretrain/*")),
-    "stopped-run": Target(lambda here: run_folder(here, finished=False), COMMANDS[::3], ("out/*", "out/pretrain/*")),
+    "stopped-run": Target(lambda here: run_folder(here, stop="pretrain"), COMMANDS[::3], ("out/*", "out/pretrain/*")),
+    "blocks": Target(
+        lambda here: run_folder(here, BLOCKS, "block 1"),
+        (BLOCKS, COMMANDS[0], "tune {here}/out 1 --device cpu --cache 1MB"),
+        ("out/blocks/*.json", "out/blocks/*.json", "out/blocks/0*/*", "out/blocks/0*/tune/*"),
+    ),
 }
 """By name."""
 

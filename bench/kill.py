@@ -1,12 +1,13 @@
 """Kills a training run at random moments until it is done, and compares its end with that of an undisturbed one.
 
-    python bench/kill.py [--kills 20] [--seed 0] [--out kill.json]
+    python bench/kill.py [--kills 20] [--seed 0] [--blocks] [--out kill.json]
 
 Every attempt is a process of its own that runs the command line. It ends by SIGKILL after a random time, at a random
 file operation inside the run folder (open, rename, remove, make a folder, before or after a flush to the disk), or in
 the middle of writing a checkpoint, of which a random part is then on the disk. The same command goes on from there.
 The comparison is of every byte of the points, of the optimiser's state, of the random generator and of the journal's
-list of steps. Exits 1 if anything differs.
+list of steps. With --blocks, the run is one in two blocks, and each of them is compared too.
+Exits 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from pathlib import Path
 STEPS = 40
 WORDS = f"train recipe:2dgs --steps {STEPS} --checkpoint-every 7 --pictures-every 20 --device cpu"
 SETTINGS = "--primitive.sh-degree 1 --pretrain.densify.every 5 --pretrain.densify.start 10"
+BLOCKS = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share --tune.sh-every 1"
 KINDS = ("time", "operation", "torn")
 
 
@@ -88,7 +90,7 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def attempt(data: Path, out: Path, prepare: Callable[[], object], after_s: float | None = None) -> int:
+def attempt(words: list[str], prepare: Callable[[], object], after_s: float | None = None) -> int:
     """Exit status of one process that trains, negative for the signal that ended it; killed `after_s` if given."""
     pid = os.fork()
     if pid == 0:
@@ -99,7 +101,6 @@ def attempt(data: Path, out: Path, prepare: Callable[[], object], after_s: float
                 prepare()
                 from surfkit.cli import main
 
-                words = [*WORDS.split(), *SETTINGS.split(), "--data", str(data), "--out", str(out)]
                 status = main(words)
         finally:
             os._exit(status)
@@ -117,12 +118,16 @@ def digests(out: Path) -> dict[str, str]:
     from safetensors import safe_open
 
     found = {"points": hashlib.sha256((out / "point_cloud.ply").read_bytes()).hexdigest()}
-    with safe_open(out / "pretrain" / "checkpoint.safetensors", framework="pt") as file:
-        for name in file.keys():
-            found[name] = hashlib.sha256(file.get_tensor(name).numpy().tobytes()).hexdigest()
-    lines = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
-    steps = [(line["index"], line["losses"], line["points"]) for line in lines if line["event"] == "StepDone"]
-    found["journal"] = hashlib.sha256(json.dumps(steps).encode()).hexdigest()
+    for path in sorted(out.rglob("checkpoint.safetensors")):
+        of = "" if path.parent.name == "pretrain" else f"{path.parent.relative_to(out)}: "
+        with safe_open(path, framework="pt") as file:
+            for name in file.keys():
+                found[of + name] = hashlib.sha256(file.get_tensor(name).numpy().tobytes()).hexdigest()
+    for path in sorted(out.rglob("events.jsonl")):
+        of = "" if path.parent == out else f"{path.parent.relative_to(out)}: "
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        steps = [(line["index"], line["losses"], line["points"]) for line in lines if line["event"] == "StepDone"]
+        found[of + "journal"] = hashlib.sha256(json.dumps(steps).encode()).hexdigest()
     found["metrics"] = json.dumps(json.loads((out / "metrics.json").read_text())["images"])
     found["left over"] = " ".join(sorted(path.name for path in out.rglob(".*")))
     return found
@@ -135,12 +140,17 @@ class Kills:
     data: Path
     folder: Path
     draw: random.Random
+    more: str = ""
     wanted: dict[str, str] = field(default_factory=dict)
     operations: int = 0
     seconds: float = 0.0
     kills: list[dict[str, object]] = field(default_factory=list)
     runs: int = 0
     differing: list[str] = field(default_factory=list)
+
+    def words(self, out: Path) -> list[str]:
+        """The command line of a run."""
+        return [*f"{WORDS} {SETTINGS} {self.more}".split(), "--data", str(self.data), "--out", str(out)]
 
     def undisturbed(self) -> None:
         """Run once without a kill: what must come out, how long it takes, and how many file operations it has."""
@@ -157,7 +167,7 @@ class Kills:
 
             os._exit = noted
 
-        if attempt(self.data, out, prepare) != 0:
+        if attempt(self.words(out), prepare) != 0:
             raise SystemExit("the undisturbed run failed; KILL_SHOW=1 shows why")
         self.seconds, self.operations = time.perf_counter() - start, int(count.read_text())
         self.wanted = digests(out)
@@ -173,7 +183,7 @@ class Kills:
                 out = self.compared(out)
             else:
                 raise SystemExit(f"exit status {status} after {self.kills[-1:]}; KILL_SHOW=1 shows why")
-        if (status := attempt(self.data, out, lambda: None)) != 0:
+        if (status := attempt(self.words(out), lambda: None)) != 0:
             raise SystemExit(f"exit status {status} after {self.kills[-1:]}; KILL_SHOW=1 shows why")
         self.compared(out)
 
@@ -182,10 +192,10 @@ class Kills:
         kind = KINDS[len(self.kills) % len(KINDS)]
         if kind == "time":
             after = self.draw.uniform(0, 0.8 * self.seconds)
-            return attempt(self.data, out, lambda: None, after), kind, after
-        at = self.draw.randint(1, self.operations * 4 // 5 if kind == "operation" else 4)
+            return attempt(self.words(out), lambda: None, after), kind, after
+        at = self.draw.randint(1, self.operations * 4 // 5 if kind == "operation" else 12 if self.more else 4)
         deadly = Deadly(out, at) if kind == "operation" else Deadly(out, torn=at, share=self.draw.random())
-        return attempt(self.data, out, deadly.install), kind, at
+        return attempt(self.words(out), deadly.install), kind, at
 
     def compared(self, out: Path) -> Path:
         """Note what differs at the end of a run; the folder of the next."""
@@ -202,6 +212,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--blocks", action="store_true")
     parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
     os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
@@ -216,7 +227,7 @@ def main() -> int:
         data = Path(folder) / "data"
         flight = Flight(width=48, height=36, points=200)
         write_colmap(data, photograph(flight))
-        job = Kills(data, Path(folder), random.Random(chosen.seed))
+        job = Kills(data, Path(folder), random.Random(chosen.seed), BLOCKS if chosen.blocks else "")
         job.undisturbed()
         job.disturbed(chosen.kills)
     report = {

@@ -6,38 +6,41 @@ come to, and whoever comes back to it goes on from there.
 
 from __future__ import annotations
 
+import itertools
 import os
-import shutil
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
+from pathlib import Path
 
-import torch
-
+from surfkit.board import Board, Standing, state_since
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.errand import POLL_S
 from surfkit.core.events import FileWritten, Warned, emit, say
-from surfkit.folder import Run, discard_results
+from surfkit.core.files import sweep
+from surfkit.folder import Run, discard_results, relay
+from surfkit.foresight import need, tell
+from surfkit.ladder import following
+from surfkit.merging import put_together
+from surfkit.notes import naming
 from surfkit.partition import executor
-from surfkit.partition.executor import Executor, Inline
-from surfkit.partition.merge import Merge, Pieces, Share
+from surfkit.partition.executor import Ended, Executor, Inline
 from surfkit.partition.picture import plan_picture
 from surfkit.partition.plan import Fewest, Plan, plan
 from surfkit.partition.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
-from surfkit.primitives.points import Points
 from surfkit.raster.select import Device
 from surfkit.scene import extract
-from surfkit.scene.depth_prior import Anchors, prior_files, typical_inverse_depth
-from surfkit.scene.read import observations
-from surfkit.train import checkpoint, pieces
-from surfkit.train.look import fresh_looks
-from surfkit.train.material import need_priors
+from surfkit.scene.depth_prior import alignment
+from surfkit.scene.memory import oom_kills
+from surfkit.train import checkpoint
+from surfkit.train.faults import DiskFull
+from surfkit.train.material import needs_priors
 from surfkit.train.pieces import Stored
-from surfkit.train.stage import Stage, StageState
-from surfkit.train.views import Order
-from surfkit.tuning import BUSY, Site, coarse_model, guarded, sight_of
+from surfkit.train.stage import StageState
+from surfkit.tuning import BUSY, FULL, Site, coarse_model, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
@@ -59,10 +62,12 @@ class Hands:
     Attributes:
         device: Where.
         workers: Who tunes the blocks, where the recipe cuts the scene into some.
+        tensorboard: Whether workers in processes of their own write scalars for TensorBoard.
     """
 
     device: Device = "auto"
     workers: Executor = Inline()
+    tensorboard: bool = False
 
 
 class Unfinished(Fault):
@@ -96,15 +101,19 @@ def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
     final, coarse = replace(site.this, part="tune"), coarse_model(site.this)
+    sweep(site.folder, deep=False)  # a block's own folder is its worker's
     record = planned(site, coarse)
-    extract_views(site, record.plan)
     state = merged(site, record)
     if state is not None:
         return final, state
     discard_results(final)
     while state is None:
         await_workers(site)
+        foresee(site, record.plan, coarse, hands)
+        extract_views(site, record.plan)
         work(site, record.plan, hands)
+        for folder in site.folders():  # also of blocks that were tuned by hand
+            relay(site.this.out, folder, f"block {int(folder.name)}: ")
         if put_together(site, record.plan, coarse):
             state = checkpoint.load(final.checkpoint)
     return final, state
@@ -124,9 +133,7 @@ def planned(site: Site, coarse: Stored) -> Record:
             return record
     if site.folders():  # of another coarse model, or of a plan that is gone
         await_workers(site)
-        aside = site.this.out / "blocks-before"
-        shutil.rmtree(aside, ignore_errors=True)
-        os.replace(site.folder, aside)
+        aside = put_aside(site)
         checkpoint.discard(replace(site.this, part="tune").checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
     recipe = site.this.recipe
@@ -146,16 +153,26 @@ def planned(site: Site, coarse: Stored) -> Record:
 
 
 def extract_views(site: Site, blocks: Plan) -> None:
-    """Write the views of each block into its folder, with what sparse points say of their depths if a loss asks."""
+    """Write the views of each block into its folder, with the alignment of their depth priors if a loss asks for any.
+
+    The priors are aligned as those of the whole scene: a block's own views would give another scale to its loss, and
+    another judgement of failed alignments.
+    """
     missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
-    data, scene = site.this.data, site.scene
-    needed = missing and need_priors(site.this.recipe.tune.losses) and prior_files(data, scene)
-    tracks = observations(data, scene) if needed else None
+    priors = None
+    if missing and needs_priors(site.this.recipe.tune.losses):
+        with naming("blocks: "):  # what the coarse stage has said already is not said again
+            priors = alignment(site.this.data, site.scene)
     for block in missing:
-        part, anchors = extract.part_of(scene, block.views), None
-        if tracks is not None:
-            anchors = Anchors(tracks.of_views(part.train), typical_inverse_depth(part.train, tracks, scene))
-        extract.save(site.views(block.index), extract.Extract(part, anchors))
+        extract.save(site.views(block.index), extract.of(site.scene, block.views, priors))
+
+
+def put_aside(site: Site) -> Path:
+    """Rename the folder of the blocks, and leave alone what was put aside before; its new name."""
+    names = itertools.chain(["blocks-before"], (f"blocks-before-{number}" for number in itertools.count(2)))
+    aside = next(path for path in (site.this.out / name for name in names) if not path.exists())
+    os.replace(site.folder, aside)
+    return aside
 
 
 def merged(site: Site, record: Record) -> StageState | None:
@@ -195,30 +212,50 @@ def await_workers(site: Site) -> None:
         time.sleep(POLL_S)
 
 
+def foresee(site: Site, blocks: Plan, coarse: Stored, hands: Hands) -> None:
+    """Say what the blocks that are left will take; BadInput if there is certainly no room for them."""
+    indices = left(site, blocks)
+    memory = [job_of(site, blocks, index, hands).memory_bytes for index in indices]
+    if indices:
+        tell(site, need(site, [blocks.blocks[index] for index in indices], coarse.state, memory))
+
+
 def work(site: Site, blocks: Plan, hands: Hands) -> None:
-    """Have all blocks tuned that are not; one that crashes is tried again."""
-    attempts = dict.fromkeys(left(site, blocks), 0)
-    waiting = list(attempts)
+    """Have all blocks tuned that are not.
+
+    One that crashes is tried again, and one whose memory gave out too, with less and with the machine for itself.
+    """
+    waiting = left(site, blocks)
+    attempts, kills = dict.fromkeys(waiting, 0), oom_kills()
+    look = looking(site, hands, waiting)
     failed: dict[int, str] = {}
     while waiting:
-        jobs = [job_of(site, blocks, index, hands) for index in waiting]
-        say(f"{len(jobs)} of {len(blocks.blocks)} blocks to tune")
-        waiting = []
-        for ended in hands.workers.run(jobs):
+        batch = [index for index in waiting if not short(site, index)]
+        batch = batch or (waiting[:1] if (hands.workers.at_once or 1) > 1 else list(waiting))
+        waiting = [index for index in waiting if index not in batch]
+        say(f"{len(batch)} of {len(blocks.blocks)} blocks to tune")
+        for ended in done_by(hands, [job_of(site, blocks, index, hands) for index in batch], look):
             index = ended.job.index
             attempts[index] += 1
+            relay(site.this.out, site.place(index), f"block {index}: ")
             if ended.status == 0 and arrived(site, blocks, index):
-                say(f"block {index} is done")
+                say(f"block {index} is done; {look().heading()}")
                 continue
-            reason = told(site, ended)
-            again = ended.status not in (1, 2) and attempts[index] < ATTEMPTS
-            emit(Warned(f"block {index} {reason}" + ("; it is tried again" if again else "")))
+            starved = ended.status == -signal.SIGKILL and oom_kills() > kills
+            kills += starved
+            reason = told(site, ended, starved)
+            if ended.status == FULL:
+                raise DiskFull(f"block {index} {reason}")
+            again = another_way(site, index, ended.status, attempts[index])
+            emit(Warned(f"block {index} {reason}" + (f"; {again}" if again else "")))
             if again:
                 waiting.append(index)
             else:
                 failed[index] = reason
     if failed:
         what = "; ".join(f"block {index} {reason}" for index, reason in sorted(failed.items()))
+        if any(short(site, index) for index in failed):
+            what += "; more blocks or smaller photographs need less memory, in a folder of their own"
         raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
 
 
@@ -232,8 +269,42 @@ def arrived(site: Site, blocks: Plan, index: int) -> bool:
     return True
 
 
-def told(site: Site, ended: executor.Ended) -> str:
-    """What became of a block, in a few words; also noted in its state."""
+def done_by(hands: Hands, jobs: Sequence[executor.Job], look: Callable[[], Standing]) -> Iterator[Ended]:
+    """The jobs as they end; where others do them, it is shown how far they are."""
+    shown = nullcontext() if isinstance(hands.workers, Inline) else Board(look)
+    with shown, closing(hands.workers.run(jobs)) as ended:
+        yield from ended
+
+
+def looking(site: Site, hands: Hands, indices: Iterable[int]) -> Callable[[], Standing]:
+    """What tells where blocks stand that are tuned from now on."""
+    since, indices = time.time(), tuple(indices)
+
+    def look() -> Standing:
+        states = {index: state_since(site.place(index), since) for index in indices}
+        return Standing(states, site.this.recipe.tune.steps, hands.workers.at_once or len(indices))
+
+    return look
+
+
+def short(site: Site, index: int) -> bool:
+    """Whether memory gave out when a block was last worked on."""
+    return read_state(site.place(index)).kind == "oom"
+
+
+def another_way(site: Site, index: int, status: int, attempts: int) -> str | None:
+    """How a block that failed is tried again, in a few words; None if it is not."""
+    if short(site, index):
+        rung = following(read_state(site.place(index)), site.this.recipe.tune.densify)
+        return f"it is tried again: {rung.text}" if rung else None
+    return "it is tried again" if status not in (1, 2) and attempts < ATTEMPTS else None
+
+
+def told(site: Site, ended: Ended, starved: bool = False) -> str:
+    """What became of a block, in a few words; also noted in its state.
+
+    `starved`: the system has ended processes for want of memory meanwhile.
+    """
     index, status = ended.job.index, ended.status
     state = read_state(site.place(index))
     if ended.why is not None or status == 0:
@@ -241,9 +312,9 @@ def told(site: Site, ended: executor.Ended) -> str:
         write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
         return f"failed: {why}"
     if status < 0:
-        name = signal.Signals(-status).name
-        write_state(site.place(index), status="failed", kind="crash", error=f"ended by {name}")
-        return f"was ended by {name}"
+        error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved
+        write_state(site.place(index), status="failed", kind="oom" if starved else "crash", error=error)
+        return f"was {error}"
     if status == BUSY:
         return "is worked on by another process"
     if state.status != "failed":
@@ -261,7 +332,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
     command += ["--cache", site.store.cache if elsewhere else f"{share}"]
     command += ["--checkpoint-every", f"{site.every.checkpoint}"]
-    command += ["--resized-copies"] * site.store.copies
+    command += ["--resized-copies"] * site.store.copies + ["--tensorboard"] * hands.tensorboard
     command += ["--patience", f"{PATIENCE_S}"] * elsewhere
     pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
     mine = [view for view in site.scene.train if view.name in block.views]
@@ -279,72 +350,3 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
         needs=(site.this.data.path, mine[0].path),
     )
-
-
-def put_together(site: Site, blocks: Plan, coarse: Stored) -> bool:
-    """Write all blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
-
-    False if a result is not what its state says; that block is planned again.
-    """
-    recipe, final = site.this.recipe, replace(site.this, part="tune")
-    skipped = frozenset(block.index for block in blocks.blocks if not block.views)
-    results = {index: sound(site, index) for index in range(len(blocks.blocks)) if index not in skipped}
-    found = {index: result for index, result in results.items() if result is not None}
-    if len(found) < len(results):
-        return False
-    tuned_pieces = {index: finished(recipe.tune, result) for index, result in found.items()}
-    merge = Merge(blocks.cells, finished(recipe.pretrain, coarse), tuned_pieces, skipped)
-    shares = merge.shares()
-    note(site, shares)
-    points = sum(share.kept for share in shares)
-    parts = [result.state for result in (coarse, *found.values())]
-    pieces.save(final.checkpoint, together(site, parts, points), merge.pieces())
-    emit(FileWritten(final.checkpoint, "merged blocks"))
-    return True
-
-
-def finished(stage: Stage, stored: Stored) -> Pieces:
-    """The points of a state as they leave its stage."""
-    return lambda: (stage.finished(piece) for piece in stored.pieces())
-
-
-def together(site: Site, parts: Sequence[StageState], points: int) -> StageState:
-    """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
-    recipe = site.this.recipe
-    like = parts[0].points.params
-    params = {
-        name: torch.empty(points, *value.shape[1:], dtype=value.dtype, device="meta") for name, value in like.items()
-    }
-    order, generator = Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed)
-    state = StageState(Points(params, {}, {}), order, generator, index=recipe.tune.steps)
-    state.seconds = sum(part.seconds for part in parts)
-    state.cpu_seconds = sum(part.cpu_seconds for part in parts)
-    state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
-    state.sh_degree = max(part.sh_degree for part in parts)
-    if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
-        state.looks = fresh_looks(recipe.tune.appearance, len(site.scene.train))
-    return state
-
-
-def sound(site: Site, index: int) -> Stored | None:
-    """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
-    path, steps = site.block(index).checkpoint, site.this.recipe.tune.steps
-    try:
-        found = pieces.open_last(path)
-    except BadInput as error:
-        emit(Warned(f"block {index} is tuned from its beginning again: {error}"))
-        checkpoint.discard(path)
-        found = None
-    step = found[0].state.index if found else 0
-    if found is not None and step >= steps:
-        return found[0]
-    emit(Warned(f"block {index} has lost steps: its checkpoint is of {step}, not of {steps}"))
-    write_state(site.place(index), status="planned", step=step)
-    return None
-
-
-def note(site: Site, shares: Sequence[Share]) -> None:
-    """Write down what each block gave, and say where the coarse model had to fill in."""
-    write_json(site.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
-    if filled := [str(share.index) for share in shares if share.filled]:
-        emit(Warned(f"blocks {', '.join(filled)} have no views, and are as they were in the coarse model"))

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from surfkit.core import journal
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import FileWritten, MemoryTaken, PhotoSkipped, Warned, emit, say
-from surfkit.core.registry import hookimpl, plugins, records
+from surfkit.core.events import FileWritten, PhotoSkipped, Warned, emit
+from surfkit.core.registry import records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
+from surfkit.notes import Notes
 from surfkit.primitives.base import Primitive
 from surfkit.recipe import Recipe
 from surfkit.refine.base import Refine
@@ -43,12 +43,19 @@ class Run:
         data: Part of it in run.json.
         part: The stage that is spoken of: "pretrain" for the whole scene at once, "tune" for a block, and for all of
             them when they are merged; then "refine0", "refine1" and so on.
+        block: Number of the block, if it is one's.
     """
 
     out: Path
     recipe: Recipe
     data: Data
     part: str = "pretrain"
+    block: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What is being done, for people."""
+        return self.part if self.block is None else f"block {self.block}"
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -283,61 +290,18 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Fra
     write_json(this.out / "recipe.json", this.recipe)
 
 
-class Notes:
-    """Prints the warnings of a run, and keeps them, the photographs it passed over and its memory in run.json."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-        self.skipped: list[str] = []
-        self.memory: dict[str, int] = {}
-        self.path: Path | None = None
-        self.facts: dict[str, Any] = {}
-
-    def begin(self, path: Path, facts: dict[str, Any], before: dict[str, Any]) -> None:
-        """Keep all in a file from now on, after what a run that was interrupted had kept there `before`."""
-        self.path, self.facts = path, facts
-        self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
-        self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
-        self.memory = before.get("memory_bytes") or {}
-        self.write()
-
-    def write(self) -> None:
-        """Save what there is."""
-        if self.path is not None:
-            found = {"notes": self.texts, "skipped": self.skipped, "memory_bytes": self.memory}
-            write_json(self.path, self.facts | found)
-
-    @hookimpl
-    def surfkit_event(self, event: Any) -> None:
-        """See one event."""
-        if isinstance(event, Warned):
-            say(f"note: {event.text}")
-            self.keep(self.texts, event.text)
-        elif isinstance(event, MemoryTaken):
-            if event.parts["peak"] >= self.memory.get("peak", 0):
-                self.memory = dict(event.parts)
-                self.write()
-        elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
-            say(f"note: {event.reason}; the run goes on without this photograph")
-
-    def keep(self, kept: list[str], text: str) -> bool:
-        """Keep a text unless it is there already; whether it is new."""
-        if text in kept:
-            return False
-        kept.append(text)
-        self.write()
-        return True
-
-
-@contextmanager
-def noted() -> Iterator[Notes]:
-    """Within, warnings are printed and kept."""
-    notes = Notes()
-    plugins().register(notes, "notes of the run")
-    try:
-        yield notes
-    finally:
-        plugins().unregister(notes)
+def relay(out: Path, folder: Path, prefix: str) -> None:
+    """Note for the run in `out` what the journal of a part of it, written by another process, has been warned of."""
+    record = read_record(out)
+    notes, skipped = set(record.get("notes", [])), set(record.get("skipped", []))
+    for line in journal.read(folder / journal.NAME):
+        text, name = line.get("text"), line.get("name")
+        if line["event"] == "Warned" and isinstance(text, str) and not {text, prefix + text} & notes:
+            notes.add(text)
+            emit(Warned(prefix + text))
+        elif line["event"] == "PhotoSkipped" and isinstance(name, str) and name not in skipped:
+            skipped.add(name)
+            emit(PhotoSkipped(name, str(line.get("reason"))))
 
 
 def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from surfkit.core.check import BadInput, Fault
+from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.evaluate.along import Along
@@ -20,7 +20,7 @@ from surfkit.raster.select import Device, select
 from surfkit.scene.memory import free_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train import checkpoint
-from surfkit.train.faults import MOST_HALVINGS, Diverged, is_out_of_memory, out_of_memory
+from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
 from surfkit.train.material import Material
 from surfkit.train.meter import Meter
@@ -135,8 +135,8 @@ def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | Non
     """Take the steps that are left, and write checkpoints and pictures on the way."""
     this, every, meter = job.this, job.every, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
-    emit(StageBegan(this.part, steps, len(state.points), state.index + 1))
-    with graceful() as request, Display(this.part, steps) as display:
+    emit(StageBegan(this.part, steps, len(state.points), state.index + 1, this.block))
+    with graceful() as request, Display(this.title, steps) as display:
         for done in trainer.run(state):
             display.show(done)
             meter.step(state, job.given)
@@ -186,10 +186,10 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
     """The last good state, or a new beginning, with half the learning rates; it is saved, so that nothing forgets it.
 
     Raises:
-        Fault: They have been halved often enough.
+        NotFinite: They have been halved often enough.
     """
     if halvings >= MOST_HALVINGS:
-        raise Fault(
+        raise NotFinite(
             f"{this.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
             f"and its camera, or lower {this.part}.rates in another folder; the last checkpoint is whole"
         ) from error

@@ -26,7 +26,6 @@ from surfkit.folder import (
     claim,
     discard_results,
     note_metrics,
-    noted,
     read_data,
     read_record,
     refuse_changed,
@@ -35,6 +34,7 @@ from surfkit.folder import (
     refuse_other,
 )
 from surfkit.mesh.base import Subject
+from surfkit.notes import noted
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer

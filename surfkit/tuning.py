@@ -17,12 +17,14 @@ import torch
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.errand import DRIVER, INTERRUPTED, POLL_S
-from surfkit.core.events import StepDone, say
+from surfkit.core.events import StageBegan, StepDone, say
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.folder import Run
+from surfkit.folder import Run, refuse_file
+from surfkit.ladder import climb, eased
+from surfkit.notes import naming
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition.base import Sight
 from surfkit.partition.executor import terminating
@@ -32,6 +34,7 @@ from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
 from surfkit.scene import extract
 from surfkit.scene.scene import Scene, View
+from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.pieces import Stored, open_last
@@ -39,8 +42,9 @@ from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
 """Seconds between signs of life of a block."""
-CRASHED, BUSY = 70, 75
-"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, and a block that another works on."""
+CRASHED, FULL, BUSY = 70, 74, 75
+"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, a full disk, and a block that another
+works on."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class Site:
 
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
-        return Run(self.place(index), self.this.recipe, self.this.data, "tune")
+        return Run(self.place(index), self.this.recipe, self.this.data, "tune", index)
 
 
 def views_file(out: Path, index: int) -> Path:
@@ -98,6 +102,8 @@ def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> in
         patience_s: How long to wait for another process that works on it.
     """
     folder, until = site.place(index), time.monotonic() + patience_s
+    refuse_file(folder)
+    read_state(folder)  # or BadInput: what is damaged cannot be written on
     while time.monotonic() < until and worked_on(folder):
         time.sleep(POLL_S)
     try:
@@ -106,7 +112,7 @@ def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> in
                 raise BadInput(f"{folder}: {other} was heard of in the last {STALE_S:.0f} s; wait for its end")
             return _begun(site, blocks, index)
     except BadInput as error:  # another process works there, and the state is its
-        say(f"block {index}: {error}")
+        say(f"surfkit: block {index}: {error}")
         return BUSY
 
 
@@ -114,13 +120,16 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
     folder = site.place(index)
     sweep(folder)
     try:
-        with kept(folder), signs(folder):
+        with naming(f"block {index}: "), kept(folder), signs(folder), in_one_line(folder):
             tune(site, blocks, index)
     except (BadInput, Fault) as error:
-        reason = " ".join(str(error).split())
-        say(f"block {index}: {reason}")
-        write_state(folder, status="failed", kind="data" if isinstance(error, BadInput) else "fault", error=reason)
-        return 2 if isinstance(error, BadInput) else 1
+        reason = " ".join((error.what if isinstance(error, OutOfMemory) else str(error)).split())
+        say(f"surfkit: block {index}: {reason}")
+        with suppress(OSError):  # the disk may be full
+            write_state(
+                folder, status="failed", kind="data" if isinstance(error, BadInput) else error.kind, error=reason
+            )
+        return 2 if isinstance(error, BadInput) else FULL if isinstance(error, DiskFull) else 1
     except KeyboardInterrupt:
         write_state(folder, status="failed", kind="interrupted", error="interrupted")
         return INTERRUPTED
@@ -133,15 +142,18 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
 
 def tune(site: Site, blocks: Plan, index: int) -> None:
     """Tune one block from where it stands to its end."""
-    block = site.block(index)
+    climb(site.block(index))
+    block, store = eased(site.block(index), site.store)
     part = extract.load(site.views(index))
     scene, steps, folder = part.scene, block.stage.steps, block.out
     state = saved(block, scene, repair=True)
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
-    write_state(folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None)
+    write_state(
+        folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None, first=done, began=0.0
+    )
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, site.store, part.anchors)
+        given = read_ahead(site.this.data, scene, block.stage.losses, store, part.priors)
         every = replace(site.every, pictures=0)
         start = Start(site, blocks, index, scene.train)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
@@ -232,6 +244,9 @@ class Watch:
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
+        if isinstance(event, StageBegan):
+            fresh = {"begun_points": event.points} if event.first == 1 else {}
+            write_state(self.folder, began=time.time(), **fresh)
         if isinstance(event, StepDone):
             self.step = {"step": event.index}
 

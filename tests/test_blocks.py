@@ -195,7 +195,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
     assert read_state(tmp_path / "blocks" / "000").status == "done"
     assert main(["status", str(tmp_path)]) == 3
     said = capsys.readouterr().out
-    assert "1 of 2 done" in said and "failed: numbers are not finite, step 0 of 12" in said
+    assert "1 of 2 done" in said and "failed (fault): numbers are not finite, step 0 of 12" in said
     run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert same(tmp_path, undisturbed)
 
@@ -239,14 +239,20 @@ def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
     run(longer, data, tmp_path, Hands("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
+    before = read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record)
+    (tmp_path / "blocks" / "plan.json").unlink()
+    run(longer, data, tmp_path, Hands("cpu"), EVERY)
+    assert read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record) == before, "nothing is overwritten"
+    assert (tmp_path / "blocks-before-2" / "000").is_dir() and "blocks-before-2" in (tmp_path / "run.json").read_text()
 
 
 def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_path):
     shutil.copytree(undisturbed, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "blocks" / "001")
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
+    (tmp_path / "run" / "blocks" / ".merge.json.7.part").write_bytes(b"of a process that is gone")
     run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
-    assert same(tmp_path / "run", undisturbed)
+    assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".*.part"))
 
 
 def test_a_damaged_result_is_not_merged(undisturbed, data, recipe, tmp_path):

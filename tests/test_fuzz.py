@@ -12,7 +12,7 @@ BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (
     "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
-    "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run",
+    "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run", "blocks",
 )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import surfkit
 ROOT = Path(surfkit.__file__).parent
 FLOORS = (
     "core",
+    "outlook",
     "scene",
     "raster",
     "primitives losses depth",
@@ -16,10 +17,11 @@ FLOORS = (
     "train partition compress mesh evaluate",
     "refine",
     "recipe",
+    "notes",
     "folder",
-    "optimise",
-    "tuning",
-    "refining",
+    "optimise ladder",
+    "tuning board",
+    "refining foresight merging",
     "blocks",
     "surface",
     "pipeline",

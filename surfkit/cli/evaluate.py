@@ -13,7 +13,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.evaluate.comparison import Comparison
 from surfkit.evaluate.geometry import measure_geometry
-from surfkit.folder import Run, note_metrics, noted, refuse_no_run
+from surfkit.folder import Run, note_metrics, refuse_no_run
+from surfkit.notes import noted
 from surfkit.pipeline import drawer, evaluate, load_run, opened
 from surfkit.raster.select import Device
 from surfkit.scene.data import Data

@@ -15,9 +15,10 @@ from surfkit.core.codec import read_json
 from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import choice
-from surfkit.folder import Run, noted
+from surfkit.folder import Run
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
+from surfkit.notes import noted
 from surfkit.pipeline import drawer, load_run
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe

@@ -9,6 +9,8 @@ from typing import Annotated
 import tyro
 
 from surfkit.cli.table import print_table
+from surfkit.core.clock import clock
+from surfkit.outlook import seconds_left, so_far
 from surfkit.report.status import Block, Status, as_json, status
 
 UNFINISHED = 3
@@ -68,8 +70,15 @@ def rows(found: Status) -> list[tuple[str, str]]:
 def _where(block: Block) -> str:
     if not block.views:
         return "no views; stays as it is in the coarse model"
-    reason = f": {block.error}" if block.error else ""
-    return f"{block.status}{reason}, step {block.step:,} of {block.steps:,}, {block.views} views"
+    kind = f" ({block.kind})" if block.kind else ""
+    parts = [f"{block.status}{kind}{f': {block.error}' if block.error else ''}"]
+    parts.append(f"step {block.step:,} of {block.steps:,}")
+    parts += [clock(seconds) for seconds in [so_far(block)] if seconds is not None]
+    parts += [f"{clock(seconds)} left" for seconds in [seconds_left(block)] if seconds is not None]
+    parts.append(f"{block.views} views")
+    parts += [f"attempt {block.attempts}"] * (block.attempts > 1)
+    parts += [f"for want of memory {'; then '.join(block.eased)}"] * bool(block.eased)
+    return ", ".join(parts)
 
 
 COMMAND = StatusOf

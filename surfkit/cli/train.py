@@ -111,7 +111,8 @@ class Train:
     default, 0 for none."""
 
     tensorboard: bool = False
-    """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder."""
+    """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder;
+    every block has a folder of its own there."""
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
@@ -138,7 +139,7 @@ class Train:
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
             every, store = Every(self.checkpoint_every, self.pictures_every), Store(self.cache, self.resized_copies)
-            metrics = run(recipe, data, out, Hands(self.device, self.executor), every, store)
+            metrics = run(recipe, data, out, Hands(self.device, self.executor, self.tensorboard), every, store)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,10 +12,11 @@ import tyro
 from surfkit.blocks import Record
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.optimise import CHECKPOINT_EVERY, Every, drawer
 from surfkit.pipeline import opened
 from surfkit.raster.select import Device
+from surfkit.report.tensorboard import tensorboard
 from surfkit.scene import extract
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
@@ -52,6 +54,9 @@ class Tune:
     patience: float = 0.0
     """Seconds to wait for another process that works on the block, before this one gives up."""
 
+    tensorboard: bool = False
+    """Also write losses, points and memory for TensorBoard, to tensorboard/block-NNN in the run folder."""
+
     def run(self) -> int:
         """Tune; the exit status is that of `surfkit train`."""
         this, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
@@ -68,7 +73,8 @@ class Tune:
             raise BadInput(f"block {self.block} has no views; it stays as it is in the coarse model")
         store, every = Store(self.cache, self.resized_copies), Every(self.checkpoint_every, 0)
         store.bytes()
-        with noted(), in_one_line(self.run_folder), bars():
+        scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
+        with scalars, noted(), in_one_line(self.run_folder), bars():
             rasterizer, _ = drawer(self.device)
             scene = extract.load(views_file(this.out, self.block)).scene  # the data set may be much larger
             return guarded(Site(this, scene, rasterizer, every, store), plan, self.block, self.patience)

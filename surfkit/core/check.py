@@ -23,6 +23,8 @@ class Fault(RuntimeError):
 
     status = 1
     """Exit status of the command line."""
+    kind = "fault"
+    """What gave out, in a word."""
 
 
 _KEPT: ContextVar[list[BadInput] | None] = ContextVar("kept", default=None)

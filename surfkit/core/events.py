@@ -23,12 +23,14 @@ class StageBegan:
         steps: How many it will have made at its end.
         points: At this moment.
         first: Index of the first step to come; above 1 when the run goes on from a checkpoint.
+        block: Number of the block that it is run on, if not on the whole scene.
     """
 
     stage: str
     steps: int
     points: int
     first: int = 1
+    block: int | None = None
 
 
 @dataclass(frozen=True)

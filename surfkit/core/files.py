@@ -39,9 +39,12 @@ def sync_folder(folder: Path) -> None:
             os.close(here)
 
 
-def sweep(folder: Path, but: Path | None = None) -> None:
-    """Delete what dead processes left unfinished in a folder that no other process works in, `but` for one inside."""
+def sweep(folder: Path, but: Path | None = None, deep: bool = True) -> None:
+    """Delete what dead processes left unfinished in a folder that no other process works in, `but` for one inside.
+
+    `deep`: also in the folders inside.
+    """
     for pattern in UNFINISHED:
-        for path in folder.rglob(pattern):
+        for path in folder.rglob(pattern) if deep else folder.glob(pattern):
             if but is None or not path.is_relative_to(but):
                 path.unlink(missing_ok=True)

@@ -10,11 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.lock import holder
 
 Status = Literal["planned", "running", "done", "failed"]
-Kind = Literal["data", "fault", "crash", "interrupted"]
+Kind = Literal["oom", "nan", "disk", "data", "fault", "crash", "interrupted"]
+"""Why a block failed: memory, numbers or disk gave out, its data cannot be used, something else that was foreseen, or
+was not, or someone asked it to stop."""
 
 STALE_S = 120.0
 """Seconds without a sign of life after which a block of another machine counts as abandoned."""
@@ -35,6 +38,12 @@ class BlockState:
         host: The machine that works or worked on it.
         pid: The process.
         heard: When it last gave a sign of life, seconds since 1970.
+        began: When it was last begun.
+        first: Step after which it was.
+        begun_points: At its first step.
+        rung: Of the ladder that it has come down for want of memory; 0 for none.
+        most_points: Beyond which it does not grow, on its rung.
+        eased: What each rung has changed, in a few words.
     """
 
     status: Status = "planned"
@@ -46,6 +55,12 @@ class BlockState:
     host: str | None = None
     pid: int | None = None
     heard: float = 0.0
+    began: float = 0.0
+    first: int = 0
+    begun_points: int = 0
+    rung: int = 0
+    most_points: int | None = None
+    eased: tuple[str, ...] = ()
 
 
 def worked_on(folder: Path) -> str | None:
@@ -67,9 +82,16 @@ def state_path(folder: Path) -> Path:
 
 
 def read_state(folder: Path) -> BlockState:
-    """The state of the block in a folder; planned if nothing is there."""
+    """The state of the block in a folder; planned if nothing is there.
+
+    Raises:
+        BadInput: The file is damaged.
+    """
     path = state_path(folder)
-    return read_json(path, BlockState) if path.exists() else BlockState()
+    try:
+        return read_json(path, BlockState) if path.exists() else BlockState()
+    except BadInput as error:
+        raise BadInput(f"{error}; delete it, and the block goes on from its last checkpoint") from error
 
 
 def write_state(folder: Path, **changes: object) -> BlockState:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
 from surfkit.core.lock import holder
 from surfkit.evaluate.metrics import read_metrics
+from surfkit.outlook import all_left
 
 NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
 """What lines of the journal may have, and of what kind it is."""
@@ -29,7 +30,13 @@ class Block:
         status: planned, running, done or failed, as last heard of.
         step: Done.
         steps: To make.
+        kind: Of the failure.
         error: Why it failed.
+        attempts: How often it was begun.
+        first: Step after which it was last begun.
+        began: When, seconds since 1970.
+        heard: When it last gave a sign of life, likewise.
+        eased: What it was given less of when memory gave out, one after the other.
     """
 
     index: int
@@ -37,7 +44,17 @@ class Block:
     status: str = "planned"
     step: int = 0
     steps: int = 0
+    kind: str | None = None
     error: str | None = None
+    attempts: int = 0
+    first: int = 0
+    began: float = 0.0
+    heard: float = 0.0
+    eased: tuple[str, ...] = ()
+
+
+KNOWN = tuple(field.name for field in fields(Block) if field.name not in ("index", "views"))
+"""What a block's state says of it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +69,7 @@ class Status:
         steps: Of the stage.
         saved_step: Of the last checkpoint.
         steps_per_second: Over the last steps.
-        seconds_left: To the end of the stage, at this speed; None when nothing runs.
+        seconds_left: To the end of the stage, or of all blocks, at this speed; None when nothing runs.
         points: After the last step.
         loss: Of the last step.
         peak_memory_bytes: Most memory held.
@@ -93,7 +110,7 @@ def status(out: Path) -> Status:
     last, metrics = _last(lines), _metrics(out, lines)
     steps, step = last["StageBegan"].get("steps", _steps(recipe)), last["StepDone"].get("index", 0)
     finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
-    pace = _pace(lines)
+    pace, blocks = _pace(lines), _blocks(out / "blocks")
     return Status(
         state="finished" if finished and not process else "running" if process else "stopped",
         process=process,
@@ -102,14 +119,14 @@ def status(out: Path) -> Status:
         steps=steps,
         saved_step=_saved(lines),
         steps_per_second=pace,
-        seconds_left=round((steps - step) / pace, 1) if process and pace else None,
+        seconds_left=_left((steps - step) / pace if pace else None, blocks) if process else None,
         points=last["StepDone"].get("points"),
         loss=_total(last["StepDone"].get("losses")),
         peak_memory_bytes=last["StepDone"].get("peak_memory_bytes") or None,
         metrics=metrics,
         warnings=_texts(record, kept, "notes"),
         skipped=_texts(record, kept, "skipped"),
-        blocks=_blocks(out / "blocks"),
+        blocks=blocks,
     )
 
 
@@ -127,9 +144,16 @@ def _blocks(folder: Path) -> tuple[Block, ...]:
     for index, count in enumerate(views):
         state = folder / f"{index:03}" / "state.json"
         said = read_json(state, dict[str, Any]) if state.exists() else {}
-        known = {name: said[name] for name in ("status", "step", "steps", "error") if said.get(name) is not None}
+        known = {name: said[name] for name in KNOWN if said.get(name) is not None}
         found.append(load(Block, {"index": index, "views": count} | known, str(state)))
     return tuple(found)
+
+
+def _left(stage: float | None, blocks: tuple[Block, ...]) -> float | None:
+    """Seconds to the end of the blocks, once they are planned, else of the stage."""
+    tuned = [block for block in blocks if block.views]
+    found = all_left(tuned, max(block.steps for block in tuned)) if tuned else stage
+    return None if found is None else round(found, 1)
 
 
 def _steps(recipe: Path) -> int:

@@ -13,7 +13,10 @@ from surfkit.core.registry import hookimpl, plugins
 
 
 class Scalars:
-    """Writes losses, points, memory and held-out PSNR; steps that a run takes again replace those it lost."""
+    """Writes losses, points, memory and held-out PSNR; steps that a run takes again replace those it lost.
+
+    Every block has a folder of its own, which TensorBoard shows as a run of its own.
+    """
 
     def __init__(self, folder: Path, writer: type) -> None:
         self.folder, self.kind = folder, writer
@@ -24,7 +27,8 @@ class Scalars:
         """See one event."""
         if isinstance(event, StageBegan):
             self.close()
-            self.writer = self.kind(str(self.folder), purge_step=event.first, flush_secs=10)
+            folder = self.folder if event.block is None else self.folder / f"block-{event.block:03}"
+            self.writer = self.kind(str(folder), purge_step=event.first, flush_secs=10)
         elif self.writer is None:
             return
         elif isinstance(event, StepDone):

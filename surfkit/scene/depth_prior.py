@@ -46,16 +46,16 @@ Priors = Cache["DepthPrior | None"]
 
 
 @dataclass(frozen=True)
-class Anchors:
-    """What the sparse points say of the depths of some views.
+class Alignment:
+    """How the depth maps of a data set become inverse depths, whichever of its photographs are trained on.
 
     Attributes:
-        tracks: The points, and where the views show them.
         typical: See `DepthPrior`.
+        fits: Scale and offset of the map of each training photograph that has one which can be used, by name.
     """
 
-    tracks: Observations
     typical: float
+    fits: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,25 @@ def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
 
 
 def read_priors(
-    data: Data, scene: Scene, budget_bytes: int | None = None, anchors: Anchors | None = None
+    data: Data, scene: Scene, budget_bytes: int | None = None, known: Alignment | None = None
 ) -> Priors | None:
-    """The depth priors of a data set, aligned to its sparse points; None, and a warning, where there are none.
+    """The depth priors of a data set; None where there are none.
+
+    `known`: how they are aligned, where `scene` has only some of the photographs; by itself if None, see `alignment`.
+    """
+    known = known or alignment(data, scene)
+    if not any(view.name in known.fits for view in scene.train):
+        return None
+    maps = prior_files(data, scene)
+    lost = [view.name for view in scene.train if view.name in known.fits and view.name not in maps]
+    if lost:
+        raise BadInput(f"{data.path}: the depth map of {lost[0]} is gone; put it back")
+    fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
+    return prior_cache(scene.train, fits, known.typical, budget_bytes)
+
+
+def alignment(data: Data, scene: Scene) -> Alignment:
+    """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning. Without `anchors`, the sparse
     points are read from the data set.
@@ -111,8 +127,8 @@ def read_priors(
     maps = prior_files(data, scene)
     if not maps:
         emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
-        return None
-    tracks = observations(data, scene) if anchors is None else anchors.tracks
+        return Alignment(0.0, {})
+    tracks = observations(data, scene)
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
@@ -122,12 +138,12 @@ def read_priors(
         fits[at] = None
     if not any(fits):
         emit(Warned(f"no depth prior of {data.path} can be used, so the depth loss is off: {listed(reasons)}"))
-        return None
+        return Alignment(0.0, {})
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
     _warn_of_leaks(data, scene)
-    typical = typical_inverse_depth(scene.train, tracks, scene) if anchors is None else anchors.typical
-    return prior_cache(scene.train, fits, typical, budget_bytes)
+    found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
+    return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
 
 
 def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,7 @@ from surfkit.core.codec import dump
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import replacing
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_prior import Anchors
-from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.depth_prior import Alignment
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 
 
@@ -26,11 +25,11 @@ class Extract:
 
     Attributes:
         scene: With these for training, none held out, and no cloud.
-        anchors: What sparse points say of their depths, where that was asked for.
+        priors: How their depth maps are aligned, where that was asked for.
     """
 
     scene: Scene
-    anchors: Anchors | None
+    priors: Alignment | None
 
 
 @dataclass(frozen=True)
@@ -55,13 +54,15 @@ class Facts:
     metres: float | None
     crs: str | None
     shift: tuple[float, float, float]
-    typical: float | None
+    priors: Alignment | None
 
 
-def part_of(scene: Scene, names: Iterable[str]) -> Scene:
-    """The training views of these names alone."""
+def of(scene: Scene, names: Iterable[str], priors: Alignment | None) -> Extract:
+    """The training views of these names alone; `priors` are those of the whole scene."""
     wanted = set(names)
-    return _scene(scene.name, tuple(view for view in scene.train if view.name in wanted), scene.frame)
+    part = _scene(scene.name, tuple(view for view in scene.train if view.name in wanted), scene.frame)
+    fits = {} if priors is None else {name: fit for name, fit in priors.fits.items() if name in wanted}
+    return Extract(part, None if priors is None else replace(priors, fits=fits))
 
 
 def _scene(name: str, views: tuple[View, ...], frame: Frame) -> Scene:
@@ -70,20 +71,15 @@ def _scene(name: str, views: tuple[View, ...], frame: Frame) -> Scene:
 
 def save(path: Path, made: Extract) -> None:
     """Write an extract."""
-    scene, frame, tracks = made.scene, made.scene.frame, made.anchors and made.anchors.tracks
+    scene, frame = made.scene, made.scene.frame
     shots = tuple(
         Shot(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height))
         for v in scene.train
         for c in [v.camera]
     )
-    typical = made.anchors and made.anchors.typical
-    facts = Facts(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, typical)
+    facts = Facts(scene.name, shots, frame.scale, frame.metres, frame.crs, frame.shift, made.priors)
     poses = np.stack([view.camera.world_to_camera.numpy() for view in scene.train])
     arrays = {"facts": np.array(json.dumps(dump(facts))), "poses": poses, "origin": frame.origin}
-    if tracks:
-        seen = [tracks.seen.get(view.name, Seen(np.zeros(0, np.int64), np.zeros((0, 2)))) for view in scene.train]
-        arrays |= {"xyz": tracks.xyz, "error_px": tracks.error_px, "counts": np.array([len(s.points) for s in seen])}
-        arrays |= {"points": np.concatenate([s.points for s in seen]), "at": np.concatenate([s.at for s in seen])}
     with replacing(path) as file:
         np.savez(file, **arrays)
 
@@ -119,10 +115,4 @@ def _extract(arrays: dict[str, np.ndarray]) -> Extract:
         for s, pose in zip(facts.shots, arrays["poses"], strict=True)
     )
     frame = Frame(arrays["origin"], facts.scale, facts.metres, facts.crs, facts.shift)
-    scene = _scene(facts.name, views, frame)
-    if facts.typical is None:
-        return Extract(scene, None)
-    ends = arrays["counts"].cumsum()[:-1]
-    rows = zip(views, np.split(arrays["points"], ends), np.split(arrays["at"], ends), strict=True)
-    seen = {view.name: Seen(points, at) for view, points, at in rows}
-    return Extract(scene, Anchors(Observations(arrays["xyz"], arrays["error_px"], seen), facts.typical))
+    return Extract(_scene(facts.name, views, frame), facts.priors)

@@ -15,6 +15,7 @@ SHARE = 0.5
 UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
 GROUPS = Path("/sys/fs/cgroup")
 OWN = Path("/proc/self/cgroup")
+VMSTAT = Path("/proc/vmstat")
 
 
 def cache_bytes(text: str, flag: str = "--cache") -> int:
@@ -30,6 +31,15 @@ def cache_bytes(text: str, flag: str = "--cache") -> int:
 def free_bytes() -> int:
     """Memory that this process may still take: what the machine has free, and what its limits allow."""
     return max(0, min([psutil.virtual_memory().available, *_allowed(), *_unreserved()]))
+
+
+def oom_kills() -> int:
+    """How many processes the system has ended for want of memory so far: of our control group, else of the machine."""
+    for folder in _groups():
+        for name in ("memory.events", "memory.oom_control"):
+            if (found := _entry(folder / name, "oom_kill", -1)) >= 0:
+                return found
+    return _entry(VMSTAT, "oom_kill")
 
 
 def _allowed() -> Iterator[int]:
@@ -77,9 +87,9 @@ def _number(path: Path) -> int | None:
         return None
 
 
-def _entry(path: Path, name: str) -> int:
+def _entry(path: Path, name: str, lacking: int = 0) -> int:
     try:
         rows = (line.split() for line in path.read_text().splitlines())
-        return next((int(value) for key, value in rows if key == name), 0)
+        return next((int(value) for key, value in rows if key == name), lacking)
     except (OSError, ValueError):
-        return 0
+        return lacking

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,10 +55,3 @@ class Observations:
         inside = ((seen.at >= 0) & (seen.at <= 1)).all(1)
         good = inside & (z > 0) & (self.error_px[seen.points] < max_error_px)
         return seen.at[good], 1 / z[good]
-
-    def of_views(self, views: Sequence[View]) -> Observations:
-        """Those of some photographs alone, and the points that they show."""
-        seen = {view.name: self.seen[view.name] for view in views if view.name in self.seen}
-        shown = np.unique(np.concatenate([np.zeros(0, np.int64), *(one.points for one in seen.values())]))
-        fewer = {name: Seen(np.searchsorted(shown, one.points), one.at) for name, one in seen.items()}
-        return Observations(self.xyz[shown], self.error_px[shown], fewer)

@@ -13,7 +13,7 @@ from rich.progress import Progress as Live
 
 from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.train.progress import PLAIN_EVERY_S, drawn_elsewhere
+from surfkit.train.progress import PLAIN_EVERY_S, larger
 
 
 class Bars:
@@ -28,7 +28,7 @@ class Bars:
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
-        if not isinstance(event, Progress) or drawn_elsewhere():
+        if not isinstance(event, Progress) or larger() is not None:
             return
         if self.console.is_terminal:
             self.draw(event)

@@ -34,6 +34,32 @@ class Diverged(RuntimeError):
         self.index, self.view = index, view
 
 
+class OutOfMemory(Fault):
+    """Memory gave out.
+
+    Attributes:
+        what: Of that, without advice.
+    """
+
+    kind = "oom"
+
+    def __init__(self, text: str, what: str) -> None:
+        super().__init__(text)
+        self.what = what
+
+
+class NotFinite(Fault):
+    """Numbers stay infinite, or none, also with lower learning rates."""
+
+    kind = "nan"
+
+
+class DiskFull(Fault):
+    """There is no room for what a run has to write."""
+
+    kind = "disk"
+
+
 def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) -> None:
     """Diverged if the losses of a step are not finite."""
     if not math.isfinite(sum(losses.values())):
@@ -64,7 +90,7 @@ def in_one_line(out: Path) -> Iterator[None]:
         if error.errno not in DISK_FULL:
             raise
         where = error.filename or out
-        raise Fault(
+        raise DiskFull(
             f"{where}: the disk is full ({error.strerror}); the last checkpoint in {out} is whole: free some space, "
             "and the same command goes on from there"
         ) from error
@@ -74,11 +100,13 @@ def in_one_line(out: Path) -> Iterator[None]:
         raise out_of_memory(out) from error
 
 
-def out_of_memory(out: Path, also: str = "") -> Fault:
+def out_of_memory(out: Path, also: str = "") -> OutOfMemory:
     """What is said of a run in the folder `out` that cannot go on; `also` tells what has been tried."""
     held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
-    return Fault(
-        f"{out}: out of memory{held}{also}; smaller photographs (--longest, --scale) or fewer points (a higher "
+    what = f"out of memory{held}{also}"
+    return OutOfMemory(
+        f"{out}: {what}; smaller photographs (--longest, --scale) or fewer points (a higher "
         "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
-        "last checkpoint is whole, and where there is more memory the same command goes on from there"
+        "last checkpoint is whole, and where there is more memory the same command goes on from there",
+        what,
     )

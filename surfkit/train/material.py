@@ -12,7 +12,7 @@ from surfkit.losses.base import Loss
 from surfkit.scene.cache import Cache, share
 from surfkit.scene.copies import Copies
 from surfkit.scene.data import Data
-from surfkit.scene.depth_prior import Anchors, Priors, read_priors
+from surfkit.scene.depth_prior import Alignment, Priors, read_priors
 from surfkit.scene.masks import mask_cache, mask_sizes
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
@@ -79,23 +79,23 @@ class Material:
         return before, sum(cache.bytes for cache in self.caches())
 
 
-def need_priors(losses: Mapping[str, Loss]) -> bool:
-    """Whether any of them asks for estimated depths."""
+def needs_priors(losses: Mapping[str, Loss]) -> bool:
+    """Whether any loss looks at depth priors."""
     return any(loss.needs_prior for loss in losses.values())
 
 
 def read_ahead(
-    data: Data, scene: Scene, losses: Mapping[str, Loss], store: Store, anchors: Anchors | None = None
+    data: Data, scene: Scene, losses: Mapping[str, Loss], store: Store, known: Alignment | None = None
 ) -> Material:
     """The photographs, masks and depth priors of the training views, as far as losses need them.
 
-    `anchors` are those of the views, where the data set need not be read for them.
+    `known`: how the depth priors are aligned, where the scene has only some of the photographs.
     """
     budget = store.bytes()
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    needed = need_priors(losses)
+    needed = needs_priors(losses)
     wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
     for_photos, for_masks, for_priors = share(budget, wanted)
-    priors = read_priors(data, scene, for_priors, anchors) if needed else None
+    priors = read_priors(data, scene, for_priors, known) if needed else None
     copies = Copies(data.path) if store.copies and 3 * pixels > for_photos else None
     return Material(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from torch import Tensor
 
+from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.train.stage import Done
 
@@ -41,9 +42,9 @@ def outer(draw: Draw) -> Iterator[None]:
         _OUTER.reset(token)
 
 
-def drawn_elsewhere() -> bool:
-    """Whether a larger display has the terminal."""
-    return _OUTER.get() is not None
+def larger() -> Draw | None:
+    """The larger display that has the terminal, if there is one."""
+    return _OUTER.get()
 
 
 class Display:
@@ -125,10 +126,3 @@ def psnr(image: Tensor, photo: Tensor) -> float:
     """Peak signal-to-noise ratio in dB, of images (3, H, W) with peak 1; the first is clamped."""
     error = torch.mean((image.clamp(0, 1) - photo) ** 2)
     return float(-10 * torch.log10(error.clamp_min(1e-10)))
-
-
-def clock(seconds: float) -> str:
-    """Hours, minutes and seconds, as short as possible: 1:02:03, 2:03, 0:03."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -31,3 +31,16 @@ def test_scalars_of_steps_taken_again_replace_those_before(tmp_path):
         i: 1.0 if i < 4 else 0.5 for i in range(1, 9)
     }
     assert found.Scalars("psnr/a.jpg")[-1].value == 28 and found.Scalars("loss/l1")[0].value == 0.5
+
+
+def test_every_block_has_scalars_of_its_own(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator").EventAccumulator
+    with tensorboard(tmp_path):
+        for block in (None, 0, 1):
+            emit(StageBegan("pretrain" if block is None else "tune", 2, 10, block=block))
+            for index in (1, 2):
+                emit(StepDone(index, 2, {"l1": 0.5}, 10 * index + (9 if block is None else block), 1000))
+    for name, points in ((".", [19, 29]), ("block-000", [10, 20]), ("block-001", [11, 21])):
+        found = accumulator(str(tmp_path / "tensorboard" / name))
+        found.Reload()
+        assert [event.value for event in found.Scalars("points")] == points

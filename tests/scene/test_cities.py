@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import read_priors
 from surfkit.scene.read import RANDOM_POINTS, read

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene import copies, undistort
 from surfkit.scene.capture import library
 from surfkit.scene.data import Data

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data

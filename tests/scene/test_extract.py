@@ -11,15 +11,14 @@ from surfkit.core.check import BadInput
 from surfkit.scene import extract
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import map_path
-from surfkit.scene.depth_prior import Anchors, read_priors, typical_inverse_depth
-from surfkit.scene.extract import Extract, part_of
-from surfkit.scene.read import observations, read
+from surfkit.scene.depth_prior import alignment, read_priors
+from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module")
 def farm(tmp_path_factory):
-    """A data set with tracks, masks and depth maps that are off by a scale, its scene, and what its points say."""
+    """A data set with tracks, masks and depth maps that are off by a scale, its scene, and how they are aligned."""
     folder = tmp_path_factory.mktemp("made") / "farm"
     truth = photograph(Flight(views=8, width=64, height=48, points=250))
     write_colmap(folder, truth, tracks=True)
@@ -32,17 +31,16 @@ def farm(tmp_path_factory):
     scene = read(data)
     named = replace(scene.train[1], mask=folder / "mask.png", white=True)
     scene = replace(scene, train=(scene.train[0], named, *scene.train[2:]))
-    tracks = observations(data, scene)
-    return data, scene, Anchors(tracks, typical_inverse_depth(scene.train, tracks, scene))
+    return data, scene, alignment(data, scene)
 
 
 def test_views_come_back_to_the_last_bit(farm, tmp_path):
     _, scene, _ = farm
     names = [scene.train[at].name for at in (4, 1, 2)]
     frame = replace(scene.frame, metres=0.1, crs="EPSG:32634", shift=(1e6 / 3, 0.0, 7.0))
-    extract.save(tmp_path / "views.npz", Extract(part_of(replace(scene, frame=frame), names), None))
+    extract.save(tmp_path / "views.npz", extract.of(replace(scene, frame=frame), names, None))
     found = extract.load(tmp_path / "views.npz")
-    assert found.anchors is None and not found.scene.held_out and not len(found.scene.cloud.xyz)
+    assert found.priors is None and not found.scene.held_out and not len(found.scene.cloud.xyz)
     assert [view.name for view in found.scene.train] == sorted(names)
     for view in found.scene.train:
         true = next(other for other in scene.train if other.name == view.name)
@@ -55,25 +53,22 @@ def test_views_come_back_to_the_last_bit(farm, tmp_path):
 
 
 def test_priors_without_the_sparse_model(farm, tmp_path):
-    """The same as with it; and the points that no view shows are not in the file."""
-    data, scene, _ = farm
-    part = part_of(scene, [view.name for view in scene.train[:3]])
-    tracks = observations(data, scene)
-    anchors = Anchors(tracks.of_views(part.train), typical_inverse_depth(part.train, tracks, scene))
-    extract.save(tmp_path / "views.npz", Extract(part, anchors))
-    expected = read_priors(data, replace(scene, train=scene.train[:3], held_out=()))
+    """The same as with it."""
+    data, scene, whole = farm
+    names = [view.name for view in scene.train[:3]]
+    extract.save(tmp_path / "views.npz", extract.of(scene, names, whole))
+    expected = read_priors(data, scene)
     bare = Data(tmp_path / "bare")
     shutil.copytree(data.path, bare.path)
     for name in ("images.txt", "points3D.txt"):
         (bare.path / "sparse" / "0" / name).write_text("")
     found = extract.load(tmp_path / "views.npz")
-    priors = read_priors(bare, found.scene, None, found.anchors)
+    assert found.priors.fits.keys() == set(names) < whole.fits.keys()
+    priors = read_priors(bare, found.scene, None, found.priors)
     for at in range(3):
         assert torch.equal(priors[at].inverse, expected[at].inverse) and priors[at].inverse.any()
         assert torch.equal(priors[at].confidence, expected[at].confidence)
         assert priors[at].typical == expected[at].typical
-    shown = {int(row) for view in scene.train[:3] for row in tracks.seen[view.name].points}
-    assert len(found.anchors.tracks.xyz) == len(shown) < len(tracks.xyz)
 
 
 def test_files_that_cannot_be_used(farm, tmp_path):
@@ -81,8 +76,8 @@ def test_files_that_cannot_be_used(farm, tmp_path):
     with pytest.raises(BadInput, match=r"views.npz is not there; .*surfkit train"):
         extract.load(path)
     assert not extract.is_whole(path)
-    _, scene, anchors = farm
-    extract.save(path, Extract(part_of(scene, [scene.train[0].name]), anchors))
+    _, scene, priors = farm
+    extract.save(path, extract.of(scene, [scene.train[0].name], priors))
     content = path.read_bytes()
     assert extract.is_whole(path)
     rest = np.load(path)

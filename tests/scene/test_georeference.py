@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene.data import Data
 from surfkit.scene.georeference import placed, utm
 from surfkit.scene.ply import SplatTable, read_splats, read_vertices, write_splats

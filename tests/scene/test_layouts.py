@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene.data import Data
 from surfkit.scene.photos import view_photo
 from surfkit.scene.read import RANDOM_POINTS, observations, read

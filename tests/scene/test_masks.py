@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene.data import Data
 from surfkit.scene.masks import mask_cache, read_mask, view_mask
 from surfkit.scene.photos import view_photo

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.folder import noted
+from surfkit.notes import noted
 from surfkit.scene.data import Data
 from surfkit.scene.photos import read_photo, view_photo
 from surfkit.scene.read import read

@@ -1,0 +1,110 @@
+"""What the tuning of the blocks will take, told before it begins: time, disk and memory, from the coarse model."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from surfkit.core.check import BadInput
+from surfkit.core.clock import clock
+from surfkit.core.events import Warned, emit, say
+from surfkit.folder import Run
+from surfkit.partition.plan import Block
+from surfkit.partition.state import read_state
+from surfkit.scene.memory import free_bytes
+from surfkit.train.stage import StageState
+from surfkit.tuning import Site
+
+KEPT = 2
+"""Checkpoints of a block that stay."""
+GROWN = 3.0
+"""Times as many points as in the coarse model that a block may come to, where points multiply; a rule of thumb."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """What the blocks that are left will take.
+
+    Attributes:
+        steps: Of all of them.
+        seconds: At the mean pace of the coarse model, on this machine.
+        least_bytes: Of disk, for the last checkpoint of each if no point were added.
+        disk_bytes: Of disk, for all checkpoints if points multiply.
+        memory_bytes: Of the block that needs most.
+    """
+
+    steps: int
+    seconds: float
+    least_bytes: int
+    disk_bytes: int
+    memory_bytes: int
+
+
+def need(site: Site, left: Sequence[Block], coarse: StageState, memory: Sequence[int]) -> Need:
+    """What blocks will take.
+
+    Args:
+        site: Run and data.
+        left: Blocks with steps to make.
+        coarse: The coarse model.
+        memory: Bytes that each of them is expected to need.
+    """
+    tune = site.this.recipe.tune
+    steps = sum(max(0, tune.steps - read_state(site.place(block.index)).step) for block in left)
+    whole = replace(site.this, part="pretrain").checkpoint.stat().st_size
+    own = [whole * block.points // max(1, len(coarse.points)) for block in left]
+    there = [size_of(site.block(block.index)) for block in left]
+    kept = KEPT * (GROWN if tune.densify is not None else 1.0)
+    return Need(
+        steps=steps,
+        seconds=steps * coarse.seconds / max(1, coarse.index),
+        least_bytes=sum(max(0, size - found) for size, found in zip(own, there, strict=True)),
+        disk_bytes=sum(max(0, int(kept * size) - found) for size, found in zip(own, there, strict=True))
+        + int(kept * whole),  # of the blocks, and of all when they are merged
+        memory_bytes=max(memory, default=0),
+    )
+
+
+def size_of(block: Run) -> int:
+    """Bytes of the checkpoints of a block that are there."""
+    folder = block.checkpoint.parent
+    return sum(path.stat().st_size for path in folder.glob("*.safetensors")) if folder.exists() else 0
+
+
+def tell(site: Site, found: Need) -> None:
+    """Say what blocks will take, and warn where that is more than there is.
+
+    Raises:
+        BadInput: The disk is certainly too small.
+    """
+    disk, memory = shutil.disk_usage(site.this.out).free, free_bytes()
+    say(
+        f"{found.steps:,} steps to tune, about {clock(found.seconds)} at the pace of the coarse model; "
+        f"checkpoints take about {size(found.disk_bytes)} of disk, {size(disk)} are free; "
+        f"a block needs up to {size(found.memory_bytes)} of memory, {size(memory)} are free"
+    )
+    if found.least_bytes > disk:
+        raise BadInput(
+            f"{site.this.out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "
+            f"{size(disk)} are free; make room, and give the same command again"
+        )
+    if found.disk_bytes > disk:
+        emit(
+            Warned(
+                f"the blocks may need about {size(found.disk_bytes)} of disk, and {size(disk)} are free; make room "
+                "while they are tuned, or they stop at their last checkpoints and the same command goes on from there"
+            )
+        )
+    if found.memory_bytes > memory:
+        emit(
+            Warned(
+                f"a block may need about {size(found.memory_bytes)} of memory, and {size(memory)} are free; where it "
+                "gives out, the block is tried again with less, which will be told; more blocks need less each"
+            )
+        )
+
+
+def size(count: float) -> str:
+    """Bytes in words: 1.5 GB."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

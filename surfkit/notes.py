@@ -1,0 +1,88 @@
+"""What a run tells on its way: printed, and kept in run.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.codec import write_json
+from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, say
+from surfkit.core.registry import hookimpl, plugins
+
+NOTES = "notes of the run"
+"""Name of the plugin."""
+
+
+class Notes:
+    """Prints the warnings of a run, and keeps them, the photographs it passed over and its memory in run.json."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+        self.skipped: list[str] = []
+        self.memory: dict[str, int] = {}
+        self.path: Path | None = None
+        self.facts: dict[str, Any] = {}
+        self.prefix = ""
+
+    def begin(self, path: Path, facts: dict[str, Any], before: dict[str, Any]) -> None:
+        """Keep all in a file from now on, after what a run that was interrupted had kept there `before`."""
+        self.path, self.facts = path, facts
+        self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
+        self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
+        self.memory = before.get("memory_bytes") or {}
+        self.write()
+
+    def write(self) -> None:
+        """Save what there is."""
+        if self.path is not None:
+            found = {"notes": self.texts, "skipped": self.skipped, "memory_bytes": self.memory}
+            write_json(self.path, self.facts | found)
+
+    @hookimpl
+    def surfkit_event(self, event: Any) -> None:
+        """See one event."""
+        if isinstance(event, Warned):
+            if self.prefix and event.text in self.texts:
+                return  # it has been said of the whole run
+            say(f"note: {self.prefix}{event.text}")
+            self.keep(self.texts, self.prefix + event.text)
+        elif isinstance(event, MemoryTaken):
+            if event.parts["peak"] >= self.memory.get("peak", 0):
+                self.memory = dict(event.parts)
+                self.write()
+        elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
+            say(f"note: {event.reason}; the run goes on without this photograph")
+
+    def keep(self, kept: list[str], text: str) -> bool:
+        """Keep a text unless it is there already; whether it is new."""
+        if text in kept:
+            return False
+        kept.append(text)
+        self.write()
+        return True
+
+
+@contextmanager
+def noted() -> Iterator[Notes]:
+    """Within, warnings are printed and kept."""
+    notes = Notes()
+    plugins().register(notes, NOTES)
+    try:
+        yield notes
+    finally:
+        plugins().unregister(notes)
+
+
+@contextmanager
+def naming(prefix: str) -> Iterator[None]:
+    """Within, warnings are noted as those of a part of the run, which they begin with."""
+    notes = plugins().get_plugin(NOTES)
+    if notes is not None:
+        notes.prefix = prefix
+    try:
+        yield
+    finally:
+        if notes is not None:
+            notes.prefix = ""

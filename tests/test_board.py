@@ -1,0 +1,73 @@
+"""What is told of blocks while they are tuned."""
+
+import io
+import time
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from surfkit.board import Board, Standing, state_since, table
+from surfkit.outlook import all_left, in_words, pace, seconds_left, so_far
+from surfkit.partition.state import BlockState, write_state
+from surfkit.train import progress
+
+RUNNING = BlockState("running", step=130, steps=300, first=30, began=1000.0, heard=1020.0)
+DONE = BlockState("done", step=300, steps=300, began=1000.0, heard=1030.0)
+FAILED = BlockState("failed", step=70, steps=300, error="numbers", began=1000.0, heard=1020.0)
+STATES = {0: RUNNING, 1: DONE, 2: BlockState(), 3: FAILED}
+
+
+def test_time_left_of_a_block():
+    assert (so_far(RUNNING), pace(RUNNING), seconds_left(RUNNING)) == (20.0, 5.0, 34.0)
+    assert in_words(RUNNING) == "step 130/300, 0:20, 0:34 left"
+    early = replace(RUNNING, heard=1001.0)
+    assert pace(early) is None and in_words(early) == "step 130/300, 0:01"
+    assert so_far(FAILED) is None and seconds_left(DONE) is None
+
+
+def test_time_left_of_all_blocks():
+    blocks, rest = list(STATES.values()), (300 - 130) + 300 + (300 - 70)
+    assert all_left(blocks, 300) == pytest.approx(rest / 5)
+    assert all_left(blocks, 300, at_once=2) == pytest.approx(rest / 10)
+    assert all_left(blocks, 300, at_once=9) == pytest.approx(rest / 15), "three are left to work on"
+    assert all_left([RUNNING, replace(RUNNING, heard=1001.0)], 300) == pytest.approx(34), "the new one will be as fast"
+    assert all_left([DONE, BlockState()], 300) == pytest.approx(30), "as long as the one before"
+    assert all_left([DONE], 300) is None and all_left([BlockState()], 300) is None
+
+
+def test_lines_where_there_is_no_terminal(monkeypatch):
+    monkeypatch.setattr("surfkit.board.PLAIN_EVERY_S", 0.02)
+    text = io.StringIO()
+    with Board(lambda: Standing(STATES, 300, 2), Console(file=text)):
+        time.sleep(0.3)
+    lines = text.getvalue().splitlines()
+    assert set(lines) == {"1 of 4 blocks done, about 1:10 left; block 0: step 130/300, 0:20, 0:34 left"}
+    assert 1 < len(lines) < 16
+
+
+def test_a_table_on_a_terminal():
+    console = Console(file=io.StringIO(), force_terminal=True, width=110)
+    eased = replace(RUNNING, eased=("at most 9 points from step 3 on",))
+    console.print(table(Standing(STATES | {2: eased}, 300, 2)))
+    text = console.file.getvalue()
+    assert "1 of 4 blocks done" in text and "at most 9 points" in text and "numbers" in text
+    assert text.count("/300") == 3 and "silent for" in text, "heard of long ago"
+
+
+def test_a_larger_display_gets_the_sum(monkeypatch):
+    monkeypatch.setattr("surfkit.board.DRAW_EVERY_S", 0.01)
+    seen = []
+    with progress.outer(lambda *line: seen.append(line)), Board(lambda: Standing(STATES, 300)):
+        time.sleep(0.2)
+    assert seen[0] == ("blocks", 130 + 300 + 70, 1200, "1 of 4 blocks done, about 2:20 left")
+
+
+def test_what_an_earlier_attempt_has_left_is_not_told(tmp_path):
+    write_state(tmp_path, status="running", step=5)
+    now = time.time()
+    assert state_since(tmp_path, now - 60).status == "running" and state_since(tmp_path, now + 60).status == "planned"
+    write_state(tmp_path, status="done")
+    assert state_since(tmp_path, now + 60).status == "done"
+    (tmp_path / "state.json").write_text("{")
+    assert state_since(tmp_path, 0) == BlockState()
