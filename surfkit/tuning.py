@@ -27,7 +27,7 @@ from surfkit.ladder import climb, eased
 from surfkit.notes import naming
 from surfkit.optimise import Every, Job, optimise, saved
 from surfkit.partition.base import Sight
-from surfkit.partition.executor import terminating
+from surfkit.partition.executor import terminable
 from surfkit.partition.plan import Plan
 from surfkit.partition.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
 from surfkit.primitives.points import Columns
@@ -213,19 +213,17 @@ def signs(folder: Path) -> Iterator[None]:
     watch = Watch(folder)
     if watch.alone():
         raise KeyboardInterrupt
-    before = terminating()
     plugins().register(watch, f"signs of {folder}")
     thread = threading.Thread(target=watch.look, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        watch.over.set()
-        thread.join()
-        watch.sign()
-        plugins().unregister(watch)
-        if before is not None:
-            signal.signal(signal.SIGTERM, before)
+    with terminable():
+        thread.start()
+        try:
+            yield
+        finally:
+            watch.over.set()
+            thread.join()
+            watch.sign()
+            plugins().unregister(watch)
 
 
 class Watch:

@@ -81,7 +81,7 @@ def test_how_each_ended_the_largest_first(workers, tmp_path):
 
 SAVING = (
     "import signal, sys, time\nfrom pathlib import Path\n"
-    "def save(*_):\n    Path('saved').touch()\n    sys.exit(130)\n"
+    "def save(*_):\n    time.sleep(1)\n    Path('saved').touch()\n    sys.exit(130)\n"
     "signal.signal(signal.SIGTERM, save)\nPath('began').write_text(str(os.getpid()))\n"
     "while os.getppid() == int(os.environ['SURFKIT_DRIVER']): time.sleep(0.05)\n"
     "save()"

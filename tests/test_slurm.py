@@ -15,6 +15,7 @@ from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fi
 from surfkit import blocks
 from surfkit.blocks import Hands, Unfinished
 from surfkit.core.check import BadInput
+from surfkit.core.errand import Errand
 from surfkit.partition import Slurm, slurm
 from surfkit.partition.executor import LOG, Job
 from surfkit.partition.state import read_state
@@ -80,6 +81,16 @@ def test_leaving_stops_the_jobs(tmp_path, monkeypatch):
         next(Slurm("local", parallel=2).run([job(tmp_path, at, SAVING) for at in (0, 1, 2)]))
     assert not psutil.wait_procs(found, timeout=20)[1]
     assert all((tmp_path / f"00{at}" / "saved").exists() for at in (0, 1)) and not (tmp_path / "002" / LOG).exists()
+
+
+def test_it_is_saved_before_it_is_queued_again(tmp_path):
+    """What Slurm is asked to queue again, it ends at once."""
+    (tmp_path / "000").mkdir()
+    given = Errand(job(tmp_path, 0, SAVING).command, tmp_path / "000" / LOG)
+    given.begin()
+    wait_for(lambda: (tmp_path / "000" / "began").exists())
+    again = given.checkpoint().function
+    assert (tmp_path / "000" / "saved").exists() and again.process is None and again.words == given.words
 
 
 def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):

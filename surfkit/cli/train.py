@@ -101,7 +101,8 @@ class Train:
     """Where to compute."""
 
     executor: Annotated[Executor, choice(Executor)] = Inline()
-    """Who tunes the blocks, where the recipe cuts the scene into some; `executor:pool` takes several at a time."""
+    """Who tunes the blocks, where the recipe cuts the scene into some; `executor:pool` takes several at a time,
+    `executor:ray` and `executor:slurm` those of other machines."""
 
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints, of which the last two are kept; there is also one at an interruption."""

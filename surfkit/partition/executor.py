@@ -10,10 +10,9 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.errand import DRIVER, INTERRUPTED, POLL_S
@@ -140,21 +139,19 @@ class Pool(Executor):
         waiting = largest_first(jobs)
         crew = Crew(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
         room = self.memory_share * free_bytes()
-        before = terminating()
-        try:
-            while waiting or crew.busy:
-                while waiting and len(crew.busy) < self.workers:
-                    fits = [job for job in waiting if not crew.busy or crew.memory_bytes + job.memory_bytes <= room]
-                    if not fits:
-                        break
-                    waiting.remove(fits[0])
-                    crew.begin(fits[0])
-                yield from crew.ended()
-                time.sleep(POLL_S)
-        finally:
-            crew.stop()
-            if before is not None:
-                signal.signal(signal.SIGTERM, before)
+        with terminable():
+            try:
+                while waiting or crew.busy:
+                    while waiting and len(crew.busy) < self.workers:
+                        fits = [job for job in waiting if not crew.busy or crew.memory_bytes + job.memory_bytes <= room]
+                        if not fits:
+                            break
+                        waiting.remove(fits[0])
+                        crew.begin(fits[0])
+                    yield from crew.ended()
+                    time.sleep(POLL_S)
+            finally:
+                crew.stop()
 
 
 def largest_first(jobs: Sequence[Job]) -> list[Job]:
@@ -162,11 +159,17 @@ def largest_first(jobs: Sequence[Job]) -> list[Job]:
     return sorted(jobs, key=lambda job: (-job.cost, job.index))
 
 
-def terminating() -> Any:
-    """Let SIGTERM act as Ctrl-C, so that workers save their states; the handler before, or None if it stays."""
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Within, SIGTERM acts as Ctrl-C, so that workers save their states."""
     if threading.current_thread() is not threading.main_thread():
-        return None
-    return signal.signal(signal.SIGTERM, signal.default_int_handler)
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.errand import POLL_S, attend
-from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminating
+from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 
 CRASHED = 70
@@ -132,19 +131,18 @@ def _imported() -> ModuleType:
 
 @contextmanager
 def _connected(address: str) -> Iterator[ModuleType]:
-    """Ray, connected; within, SIGTERM acts as Ctrl-C does."""
+    """Ray, connected; within, SIGTERM acts as Ctrl-C does, and not as Ray would have it."""
     ray = _imported()
     own = not ray.is_initialized()
-    before = signal.getsignal(signal.SIGTERM)
-    if own:
-        _connect(ray, address)
-    terminating()
-    try:
-        yield ray
-    finally:
+    with terminable():
         if own:
-            ray.shutdown()
-        signal.signal(signal.SIGTERM, before)
+            _connect(ray, address)
+        try:
+            with terminable():
+                yield ray
+        finally:
+            if own:
+                ray.shutdown()
 
 
 def _connect(ray: ModuleType, address: str) -> None:

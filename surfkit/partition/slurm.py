@@ -6,7 +6,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
@@ -18,7 +17,7 @@ from typing import Any, Literal
 from surfkit.core.check import BadInput
 from surfkit.core.errand import POLL_S, Errand
 from surfkit.core.events import say
-from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminating
+from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 from surfkit.partition.state import worked_on
 
@@ -115,9 +114,7 @@ class Slurm(Executor):
         """See `Executor.run`."""
         self.ready()
         waiting, queue = largest_first(jobs), Queue(self.cluster)
-        before = signal.getsignal(signal.SIGTERM)
-        terminating()
-        with marked(jobs) as mark:
+        with terminable(), marked(jobs) as mark:
             executor = self._submitter(mark.parent / JOBS, jobs)
             try:
                 while waiting or queue.jobs:
@@ -129,7 +126,6 @@ class Slurm(Executor):
                     time.sleep(POLL_S if self.cluster != "slurm" else SLURM_POLL_S)
             finally:
                 queue.cancel()
-                signal.signal(signal.SIGTERM, before)
 
     def _errand(self, job: Job, mark: Path) -> Errand:
         if self.cluster == "slurm":
@@ -217,6 +213,8 @@ class Queue:
 
     def cancel(self) -> None:
         """Cancel every job, and wait until none works on a block any more."""
+        if self.jobs:
+            say(f"{len(self.jobs)} jobs are cancelled; the same command goes on with their blocks")
         for handle in self.jobs:
             handle.cancel(check=False)
         until = time.monotonic() + LEAVE_S
