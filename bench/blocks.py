@@ -94,7 +94,7 @@ def main() -> None:
     plans: dict[str, Partition] = {
         "contracted 8x5": ContractedGrid((8, 5)),
         "quantile 8x5": QuantileGrid((8, 5)),
-        "balanced 40": Balanced(40),
+        "balanced 40": Balanced(40, threshold=0.02),
     }
     for name, partition in plans.items():
         costs = [block.work for block in plan(sight, partition, PictureShare(0.02), Fewest(1, 0, 0)).blocks]

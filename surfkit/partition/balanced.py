@@ -22,7 +22,7 @@ class Balanced(Partition):
     count: int = 4
     """Blocks."""
 
-    threshold: float = 0.02
+    threshold: float = 0.05
     """A view is expected to join a block that makes up more than this share of its picture."""
 
     def __post_init__(self) -> None:
