@@ -252,7 +252,7 @@ def test_blocks_do_not_begin_without_room(undisturbed, data, recipe, tmp_path, m
     whole = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
     usage = type("Usage", (), {"free": whole // 2})
     monkeypatch.setattr(foresight.shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(BadInput, match=r"blocks need at least \d+ MB of disk .* are free; make room"):
+    with pytest.raises(BadInput, match=r"blocks need at least \S+ MB of disk .* are free; make room"):
         run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert not list((tmp_path / "blocks").glob("00*"))
     usage.free = 2 * whole
@@ -347,6 +347,6 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 
 
 def test_faults_have_kinds(tmp_path):
-    assert Fault("x").kind == "fault" and OutOfMemory("x", "y").kind == "oom" and DiskFull("x").kind == "disk"
+    assert Fault("x").kind == "fault" and OutOfMemory("x", "y").kind == "oom" and DiskFull(tmp_path, "x").kind == "disk"
     for kind in ("oom", "nan", "disk", "data", "fault", "crash", "interrupted"):
         assert write_state(tmp_path, kind=kind) and read_state(tmp_path).kind == kind
