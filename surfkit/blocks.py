@@ -245,7 +245,7 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
             kills += starved
             reason = told(site, ended, starved)
             if ended.status == FULL:
-                raise DiskFull(f"block {index} {reason}")
+                raise DiskFull(site.place(index), f"block {index} {reason}")
             again = another_way(site, index, ended.status, attempts[index])
             emit(Warned(f"block {index} {reason}" + (f"; {again}" if again else "")))
             if again:

@@ -107,4 +107,4 @@ def tell(site: Site, found: Need) -> None:
 
 def size(count: float) -> str:
     """Bytes in words: 1.5 GB."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.{0 if count >= 1e7 else 1}f} MB"

@@ -123,7 +123,8 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
         with naming(f"block {index}: "), kept(folder), signs(folder), in_one_line(folder):
             tune(site, blocks, index)
     except (BadInput, Fault) as error:
-        reason = " ".join((error.what if isinstance(error, OutOfMemory) else str(error)).split())
+        brief = error.what if isinstance(error, (OutOfMemory, DiskFull)) else str(error)
+        reason = " ".join(brief.split())
         say(f"surfkit: block {index}: {reason}")
         with suppress(OSError):  # the disk may be full
             write_state(

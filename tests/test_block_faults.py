@@ -252,7 +252,7 @@ def test_blocks_do_not_begin_without_room(undisturbed, data, recipe, tmp_path, m
     whole = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
     usage = type("Usage", (), {"free": whole // 2})
     monkeypatch.setattr(foresight.shutil, "disk_usage", lambda path: usage)
-    with pytest.raises(BadInput, match=r"blocks need at least \d+ MB of disk .* are free; make room"):
+    with pytest.raises(BadInput, match=r"blocks need at least \S+ MB of disk .* are free; make room"):
         run(recipe, data, tmp_path, Hands("cpu"), EVERY)
     assert not list((tmp_path / "blocks").glob("00*"))
     usage.free = 2 * whole
@@ -293,7 +293,7 @@ def test_two_drivers_in_one_folder(undisturbed, data, tmp_path, capsys):
     assert same(out, undisturbed)
 
 
-def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkeypatch):
+def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkeypatch, capsys):
     """Each block's typical depth is that of all photographs, and a map far from the others stays out in both."""
     truth = photograph(Flight(views=12, width=32, height=24, points=300))
     write_colmap(tmp_path / "data", truth, tracks=True)
@@ -309,8 +309,9 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
         return given[-1][1]
 
     monkeypatch.setattr(tuning, "read_ahead", reading)
-    tune = replace(recipe.tune, losses=recipe.tune.losses | {"depth": DepthRegression()})
-    apart = replace(recipe, tune=tune, assign=PictureShare(0.6))
+    deep = {"losses": recipe.tune.losses | {"depth": DepthRegression()}}
+    pretrain, tune = replace(recipe.pretrain, **deep), replace(recipe.tune, **deep)
+    apart = replace(recipe, pretrain=pretrain, tune=tune, assign=PictureShare(0.6))
     run(apart, Data(tmp_path / "data"), tmp_path / "run", Hands("cpu"), EVERY)
     whole = alignment(Data(tmp_path / "data"), read_scene(Data(tmp_path / "data")))
     assert len(given) == 2 and len(whole.fits) == 9
@@ -321,6 +322,7 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
         assert {prior.typical for prior in priors.values() if prior is not None} == {whole.typical}
         assert alignment(Data(tmp_path / "data"), scene).typical != whole.typical
     assert sum("train without a depth prior" in text for text in notes(tmp_path / "run")) == 1
+    assert capsys.readouterr().err.count("train without a depth prior") == 1, "and not by every block"
 
 
 def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeypatch):
@@ -345,6 +347,6 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 
 
 def test_faults_have_kinds(tmp_path):
-    assert Fault("x").kind == "fault" and OutOfMemory("x", "y").kind == "oom" and DiskFull("x").kind == "disk"
+    assert Fault("x").kind == "fault" and OutOfMemory("x", "y").kind == "oom" and DiskFull(tmp_path, "x").kind == "disk"
     for kind in ("oom", "nan", "disk", "data", "fault", "crash", "interrupted"):
         assert write_state(tmp_path, kind=kind) and read_state(tmp_path).kind == kind

@@ -38,7 +38,7 @@ class OutOfMemory(Fault):
     """Memory gave out.
 
     Attributes:
-        what: Of that, without advice.
+        what: Has happened, without advice.
     """
 
     kind = "oom"
@@ -55,9 +55,19 @@ class NotFinite(Fault):
 
 
 class DiskFull(Fault):
-    """There is no room for what a run has to write."""
+    """There is no room for what a run has to write.
+
+    Attributes:
+        what: Has happened, without advice.
+    """
 
     kind = "disk"
+
+    def __init__(self, out: Path, what: str) -> None:
+        super().__init__(
+            f"{what}; the last checkpoint in {out} is whole: free some space, and the same command goes on from there"
+        )
+        self.what = what
 
 
 def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) -> None:
@@ -90,10 +100,7 @@ def in_one_line(out: Path) -> Iterator[None]:
         if error.errno not in DISK_FULL:
             raise
         where = error.filename or out
-        raise DiskFull(
-            f"{where}: the disk is full ({error.strerror}); the last checkpoint in {out} is whole: free some space, "
-            "and the same command goes on from there"
-        ) from error
+        raise DiskFull(out, f"{where}: the disk is full ({error.strerror})") from error
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
