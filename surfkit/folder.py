@@ -317,7 +317,9 @@ def discard_results(this: Run) -> None:
     for path in (this.metrics, this.cloud, this.mesh_record):
         path.unlink(missing_ok=True)
     for part in this.parts[this.parts.index(this.part) + 1 :]:
-        checkpoint.discard(replace(this, part=part).checkpoint)
+        later = replace(this, part=part).checkpoint
+        checkpoint.discard(later)
+        (later.parent / journal.NAME).unlink(missing_ok=True)
 
 
 def short(value: Any) -> str:

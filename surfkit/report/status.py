@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -106,7 +107,7 @@ def status(out: Path) -> Status:
     if not recipe.exists() or not record.exists():
         doing = f"; {process} is about to begin one" if process else ""
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it){doing}")
-    kept, lines = read_json(record, dict[str, Any]), _sound(journal.read(out / journal.NAME))
+    kept, lines = read_json(record, dict[str, Any]), _sound(journal.read(_latest(out)))
     last, metrics = _last(lines), _metrics(out, lines)
     steps, step = last["StageBegan"].get("steps", _steps(recipe)), last["StepDone"].get("index", 0)
     finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
@@ -128,6 +129,12 @@ def status(out: Path) -> Status:
         skipped=_texts(record, kept, "skipped"),
         blocks=blocks,
     )
+
+
+def _latest(out: Path) -> Path:
+    """The journal of the stage that the run is in: refinements have their own, as their steps are counted anew."""
+    refined = (out / f"refine{at}" / journal.NAME for at in itertools.count())
+    return [out / journal.NAME, *itertools.takewhile(Path.exists, refined)][-1]
 
 
 def _blocks(folder: Path) -> tuple[Block, ...]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit import optimise
+from surfkit import optimise, pipeline
 from surfkit.blocks import Hands
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
@@ -20,6 +20,7 @@ from surfkit.recipe import Recipe
 from surfkit.recipes.city import FIRST
 from surfkit.refine import Distil, Recover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
+from surfkit.report.status import status
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
 from surfkit.scene.read import read
@@ -75,6 +76,8 @@ def test_what_is_left(finished):
     for folder, steps in ((finished, 6), (finished / "refine0", 4), (finished / "refine1", 6)):
         lines = map(json.loads, (folder / "events.jsonl").read_text().splitlines())
         assert [line["index"] for line in lines if line["event"] == "StepDone"] == [*range(1, steps + 1)]
+    told = status(finished)
+    assert (told.state, told.stage, told.step, told.steps, told.points) == ("finished", "refine1", 6, 6, 100)
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["points"] == 100
     spent = [state_of(finished, part).cpu_seconds for part in ("tune", "refine0", "refine1")]
@@ -127,12 +130,20 @@ def test_interrupted_and_continued(finished, data, recipe, tmp_path, monkeypatch
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
 
 
-def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path):
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path, monkeypatch):
     import shutil
 
     out = tmp_path / "run"
     shutil.copytree(finished, out)
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=8))
+    with pytest.raises(KeyboardInterrupt), monkeypatch.context() as patch:
+        patch.setattr(pipeline, "tuned", interrupt)
+        run(longer, data, out, Hands("cpu"), EVERY)
+    assert status(out).stage == "pretrain"
     run(longer, data, out, Hands("cpu"), EVERY)
     assert not torch.equal(
         state_of(out, "refine0").points.params["sh0"], state_of(finished, "refine0").points.params["sh0"]
