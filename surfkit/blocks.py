@@ -221,7 +221,8 @@ def told(site: Site, ended: executor.Ended) -> str:
     state = read_state(site.place(index))
     if ended.why is not None or status == 0:
         why = ended.why or f"nothing of its work has come to {site.place(index)}"
-        write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
+        if not heard_elsewhere(site.place(index)):  # it may only be cut off, and the next one must wait for its end
+            write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
         return f"failed: {why}"
     if status < 0:
         name = signal.Signals(-status).name
