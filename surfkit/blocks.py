@@ -309,7 +309,8 @@ def told(site: Site, ended: Ended, starved: bool = False) -> str:
     state = read_state(site.place(index))
     if ended.why is not None or status == 0:
         why = ended.why or f"nothing of its work has come to {site.place(index)}"
-        write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
+        if not heard_elsewhere(site.place(index)):  # it may only be cut off, and the next one must wait for its end
+            write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
         return f"failed: {why}"
     if status < 0:
         error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved

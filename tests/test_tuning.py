@@ -5,6 +5,7 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
@@ -14,6 +15,7 @@ from surfkit.blocks import Hands
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.errand import DRIVER
+from surfkit.partition.executor import Ended, Job
 from surfkit.partition.state import STALE_S, read_state, write_state
 from surfkit.pipeline import run
 from surfkit.tuning import signs
@@ -63,6 +65,16 @@ def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
     elsewhere(STALE_S - 3)
     assert main(["tune", str(folder), "0", "--patience", "60"]) == 0
     assert read_state(folder / "blocks" / "000").host != "far"
+
+
+def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
+    """Its signs of life would otherwise be those of a block that nobody works on."""
+    site = SimpleNamespace(place=lambda index: folder / "blocks" / f"{index:03}")
+    lost = Ended(Job(0, Path(), lambda: 0, ()), 70, "its machine is gone")
+    for seconds, status in ((10, "running"), (STALE_S, "failed")):
+        folder = elsewhere(seconds)
+        assert blocks.told(site, lost) == "failed: its machine is gone"
+        assert read_state(folder / "blocks" / "000").status == status
 
 
 def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):  # noqa: F811

@@ -122,9 +122,9 @@ class Pool(Executor):
 
     def __post_init__(self) -> None:
         if self.workers < 1 or self.threads < 0:
-            raise BadInput(f"executor: pool.workers {self.workers}, threads {self.threads}: give 1 or more, 0 or more")
+            raise BadInput(f"pool.workers {self.workers}, threads {self.threads}: give 1 or more, 0 or more")
         if not 0 < self.memory_share <= 1:
-            raise BadInput(f"executor: pool.memory_share is {self.memory_share}; it must lie in 0 to 1")
+            raise BadInput(f"pool.memory_share is {self.memory_share}; it must lie in 0 to 1")
 
     @property
     def at_once(self) -> int:

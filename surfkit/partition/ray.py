@@ -48,12 +48,12 @@ class Ray(Executor):
     def __post_init__(self) -> None:
         if self.cpus < 0 or self.memory_gb < 0 or self.retries < 0:
             given = f"cpus {self.cpus}, memory_gb {self.memory_gb:g}, retries {self.retries}"
-            raise BadInput(f"executor: ray: {given}: each must be 0 or more")
+            raise BadInput(f"ray: {given}: each must be 0 or more")
         if not 0 <= self.gpus <= 1:
-            raise BadInput(f"executor: ray.gpus is {self.gpus:g}; a block uses one at most, so give 0 to 1")
+            raise BadInput(f"ray.gpus is {self.gpus:g}; a block uses one at most, so give 0 to 1")
         if self.address.startswith("ray://"):
             raise BadInput(
-                f"executor: ray.address {self.address}: give HOST:PORT of the head (port 6379 by default), and start "
+                f"ray.address {self.address}: give HOST:PORT of the head (port 6379 by default), and start "
                 "surfkit on a machine of the cluster, which sees the run folder"
             )
 

@@ -81,15 +81,15 @@ class Slurm(Executor):
 
     def __post_init__(self) -> None:
         if self.hours <= 0 or self.cpus < 1:
-            raise BadInput(f"executor: slurm.hours {self.hours:g}, cpus {self.cpus}: give more than 0, 1 or more")
+            raise BadInput(f"slurm.hours {self.hours:g}, cpus {self.cpus}: give more than 0, 1 or more")
         if min(self.requeues, self.memory_gb, self.parallel) < 0:
             given = f"requeues {self.requeues}, memory_gb {self.memory_gb:g}, parallel {self.parallel}"
-            raise BadInput(f"executor: slurm: {given}: each must be 0 or more")
+            raise BadInput(f"slurm: {given}: each must be 0 or more")
         if self.gpus not in (0, 1):
-            raise BadInput(f"executor: slurm.gpus is {self.gpus}; a block uses one at most, so give 0 or 1")
+            raise BadInput(f"slurm.gpus is {self.gpus}; a block uses one at most, so give 0 or 1")
         for option in self.extra:
             if not re.fullmatch(r"[a-z][a-z-]*(=[^\n]+)?", option):
-                raise BadInput(f"executor: slurm.extra {option!r}: give NAME=VALUE or NAME, without dashes before it")
+                raise BadInput(f"slurm.extra {option!r}: give NAME=VALUE or NAME, without dashes before it")
 
     @property
     def at_once(self) -> int | None:
