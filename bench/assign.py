@@ -1,6 +1,6 @@
 """How far the two ways to assign views agree, and what each costs.
 
-    python bench/assign.py DATA [DATA ...] [--steps 1500] [--scale 2]
+    python bench/assign.py DATA [DATA ...] [--steps 300] [--scale 2]
 
 `ssim-difference` is the paper's and draws each view once whole and once without every block that it shows; with
 `picture-share` one pass over the view is enough. Both look at the same coarse model, half-way through a short training,
@@ -105,7 +105,7 @@ def described(case: Case) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, nargs="+")
-    parser.add_argument("--steps", type=int, default=1_500)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--scale", type=float, default=2.0)
     chosen = parser.parse_args()
     figures: dict[str, float] = {}
