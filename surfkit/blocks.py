@@ -47,6 +47,8 @@ ATTEMPTS = 3
 PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
 """What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
 moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
+STARVED = ("OUT_OF_MEMORY", "OutOfMemoryError")
+"""How Slurm and Ray say that memory gave out."""
 LEAVE_S = 20.0
 """How long workers of a driver that is gone may take to notice."""
 PATIENCE_S = STALE_S + LEAVE_S
@@ -214,8 +216,8 @@ def await_workers(site: Site) -> None:
 
 def foresee(site: Site, blocks: Plan, coarse: Stored, hands: Hands) -> None:
     """Say what the blocks that are left will take; BadInput if there is certainly no room for them."""
-    indices = left(site, blocks)
-    memory = [job_of(site, blocks, index, hands).memory_bytes for index in indices]
+    indices, here = left(site, blocks), hands.workers.at_once is not None
+    memory = [job_of(site, blocks, index, hands).memory_bytes for index in indices] if here else []
     if indices:
         tell(site, need(site, [blocks.blocks[index] for index in indices], coarse.state, memory))
 
@@ -309,8 +311,9 @@ def told(site: Site, ended: Ended, starved: bool = False) -> str:
     state = read_state(site.place(index))
     if ended.why is not None or status == 0:
         why = ended.why or f"nothing of its work has come to {site.place(index)}"
+        kind = "oom" if any(word in why for word in STARVED) else "data" if status == 2 else "crash"
         if not heard_elsewhere(site.place(index)):  # it may only be cut off, and the next one must wait for its end
-            write_state(site.place(index), status="failed", kind="data" if status == 2 else "crash", error=why)
+            write_state(site.place(index), status="failed", kind=kind, error=why)
         return f"failed: {why}"
     if status < 0:
         error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved

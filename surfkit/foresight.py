@@ -31,7 +31,7 @@ class Need:
         seconds: At the mean pace of the coarse model, on this machine.
         least_bytes: Of disk, for the last checkpoint of each if no point were added.
         disk_bytes: Of disk, for all checkpoints if points multiply.
-        memory_bytes: Of the block that needs most.
+        memory_bytes: Of the block that needs most; 0 where blocks are tuned on other machines.
     """
 
     steps: int
@@ -48,7 +48,7 @@ def need(site: Site, left: Sequence[Block], coarse: StageState, memory: Sequence
         site: Run and data.
         left: Blocks with steps to make.
         coarse: The coarse model.
-        memory: Bytes that each of them is expected to need.
+        memory: Bytes that each of them is expected to need, where they are tuned on this machine.
     """
     tune = site.this.recipe.tune
     steps = sum(max(0, tune.steps - read_state(site.place(block.index)).step) for block in left)
@@ -79,11 +79,13 @@ def tell(site: Site, found: Need) -> None:
         BadInput: The disk is certainly too small.
     """
     disk, memory = shutil.disk_usage(site.this.out).free, free_bytes()
-    say(
+    text = (
         f"{found.steps:,} steps to tune, about {clock(found.seconds)} at the pace of the coarse model; "
-        f"checkpoints take about {size(found.disk_bytes)} of disk, {size(disk)} are free; "
-        f"a block needs up to {size(found.memory_bytes)} of memory, {size(memory)} are free"
+        f"checkpoints take about {size(found.disk_bytes)} of disk, {size(disk)} are free"
     )
+    if found.memory_bytes:
+        text += f"; a block needs up to {size(found.memory_bytes)} of memory, {size(memory)} are free"
+    say(text)
     if found.least_bytes > disk:
         raise BadInput(
             f"{site.this.out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "

@@ -20,10 +20,12 @@ from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
+from surfkit.folder import Run
 from surfkit.ladder import ANEW, BARE, HELD, capped, following
 from surfkit.losses.depth import DepthRegression
 from surfkit.optimise import Every
 from surfkit.partition import PictureShare, Pool, QuantileGrid
+from surfkit.partition.executor import Ended, Job
 from surfkit.partition.state import BlockState, read_state, write_state
 from surfkit.pipeline import run
 from surfkit.recipe import Recipe
@@ -196,6 +198,21 @@ def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, rec
     assert read_state(out / "blocks" / "000").rung == BARE and same(out, undisturbed)
     assert any("ended by SIGKILL while memory ran out on this machine" in text for text in notes(out))
     assert not any("less than the recipe" in text for text in notes(out))
+
+
+@pytest.mark.parametrize(
+    ("why", "kind"),
+    [
+        ("job 7 is OUT_OF_MEMORY in Slurm and has left no result; see x.err", "oom"),
+        ("Ray could not do it: OutOfMemoryError: Task was killed due to the node running low on memory.", "oom"),
+        ("job 7 is NODE_FAIL in Slurm and has left no result; see x.err", "crash"),
+    ],
+)
+def test_clusters_tell_that_memory_gave_out(data, recipe, tmp_path, why, kind):
+    site = tuning.Site(Run(tmp_path, recipe, data), None, None, EVERY, None)
+    job = Job(0, site.place(0), lambda: 0, ())
+    assert blocks.told(site, Ended(job, 70, why)) == f"failed: {why}"
+    assert read_state(site.place(0)).kind == kind
 
 
 def test_the_system_counts_whom_it_ends(tmp_path, monkeypatch):
