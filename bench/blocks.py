@@ -1,8 +1,8 @@
 """How much faster blocks are tuned by two workers than by one, and how plans of 40 blocks fill 1 to 64 devices.
 
-Two workers have one thread each, as has the one: what is compared is the wall time of the same work, start of the
-processes included. The plans are of a synthetic city, denser in its middle, by the pixels and points of each block;
-a device takes the largest block that is left, as `executor:pool` does.
+Two workers have one thread each, as has the one: what is compared is the wall time of tuning the same blocks, start of
+the processes included, planning and merging left out. The plans are of a synthetic city, denser in its middle, by the
+pixels and points of each block; a device takes the largest block that is left, as `executor:pool` does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks import Hands, tuned
+from surfkit.blocks import Hands, extract_views, planned, work
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
@@ -34,7 +34,7 @@ from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.scene.scene import View
 from surfkit.train.material import Store
-from surfkit.tuning import Site
+from surfkit.tuning import Site, coarse_model
 
 
 def tuning(steps: int) -> dict[str, float]:
@@ -53,8 +53,10 @@ def tuning(steps: int) -> dict[str, float]:
             for old in ("blocks", "tune"):
                 shutil.rmtree(out / old, ignore_errors=True)
             site = Site(Run(out, recipe, data), read(data), select("cpu")[0], Every(pictures=0), Store("1GB"))
+            blocks = planned(site, coarse_model(site.this)).plan
+            extract_views(site, blocks)
             began = time.perf_counter()
-            tuned(site, Hands("cpu", Pool(workers=workers, threads=1)))
+            work(site, blocks, Hands("cpu", Pool(workers=workers, threads=1)))
             seconds[f"{workers} workers s"] = time.perf_counter() - began
     return seconds | {"faster with 2": seconds["1 workers s"] / seconds["2 workers s"]}
 
