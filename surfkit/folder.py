@@ -74,6 +74,11 @@ class Run:
         return self.refined[-1].stage if self.refined else getattr(self.recipe, self.part)
 
     @property
+    def setting(self) -> str:
+        """Where that stage stands in the recipe, as the command line has it."""
+        return f"refine.{len(self.refined) - 1}.stage" if self.refined else self.part
+
+    @property
     def primitive(self) -> Primitive:
         """What the points are in the stage that is spoken of."""
         found = self.recipe.primitive
@@ -145,9 +150,9 @@ def refuse_file(out: Path) -> None:
     for name in FILES:
         if (out / name).is_dir():
             raise BadInput(f"{out / name}: a folder, where the run keeps a file; delete it")
-    for name in FOLDERS:
-        if (out / name).is_file():
-            raise BadInput(f"{out / name}: a file, where the run keeps a folder; delete it")
+    for path in [*(out / name for name in FOLDERS), *out.glob("refine[0-9]")]:
+        if path.is_file():
+            raise BadInput(f"{path}: a file, where the run keeps a folder; delete it")
 
 
 def refuse_no_run(out: Path) -> None:
@@ -186,7 +191,7 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
-    there = read_json(this.out / "recipe.json", Any) if (this.out / "recipe.json").exists() else None
+    there = recipe_before(this.out / "recipe.json")
     mesh = dump(this.recipe.mesh)
     remesh = isinstance(there, dict) and there.get("mesh") != mesh
     if remesh:  # training is the same
@@ -211,6 +216,15 @@ def refuse_other(this: Run) -> None:
         )
     if remesh:
         this.mesh_record.unlink(missing_ok=True)
+
+
+def recipe_before(path: Path) -> Any:
+    """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none."""
+    there = read_json(path, Any) if path.exists() else None
+    try:
+        return dump(load(Recipe, there)) if there is not None else None
+    except BadInput:
+        return there  # the difference will tell
 
 
 def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:

@@ -130,6 +130,18 @@ def test_another_recipe_is_refused(finished, data, recipe, path, value, message)
     assert message in str(error.value) and "name another folder" in str(error.value)
 
 
+def test_a_run_from_before_there_was_a_setting_goes_on(finished, data, recipe, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    written = json.loads((out / "recipe.json").read_text())
+    del written["refine"], written["pretrain"]["near"]
+    (out / "recipe.json").write_text(json.dumps(written))
+    assert run(recipe, data, out) == json.loads((out / "metrics.json").read_text())
+    (out / "recipe.json").write_text(json.dumps(written | {"seed": 3}))
+    with pytest.raises(BadInput, match="seed 3, and this one has 0"):
+        run(recipe, data, out)
+
+
 def test_other_data_is_refused(finished, data, recipe):
     with pytest.raises(BadInput, match="data.test_every 8, and this one has 4"):
         run(recipe, replace(data, test_every=4), finished[0])
