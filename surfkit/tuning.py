@@ -158,6 +158,8 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
         every = replace(site.every, pictures=0)
         start = Start(site, blocks, index, scene.train)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
+    else:
+        say(f"block {index} has all its {steps} steps already")
     write_state(folder, status="done", step=state.index, steps=steps)
 
 

@@ -328,7 +328,8 @@ def test_blocks_of_a_plan_that_is_gone_are_put_aside(undisturbed, data, recipe, 
 
 
 def test_tune_by_hand(undisturbed, tmp_path, capsys):
-    assert main(["tune", str(undisturbed), "0"]) == 0  # it is done
+    assert main(["tune", str(undisturbed), "0"]) == 0
+    assert "block 0 has all its " in capsys.readouterr().err
     assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
     assert main(["tune", str(tmp_path), "0"]) == 2
 
