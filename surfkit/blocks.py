@@ -1,6 +1,6 @@
 """The blocks of a large scene: planned, tuned apart by whoever has hands free, and merged (CityGaussianV2, sec. 3.3).
 
-The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NN/` holds what one block has
+The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NNN/` holds what one block has
 come to, and whoever comes back to it goes on from there.
 """
 
