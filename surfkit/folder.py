@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import platform
 from dataclasses import dataclass, replace
@@ -253,9 +254,10 @@ def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
             if path != "about" and (found := difference(old.get(key), new.get(key), path)):
                 return found
         return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        pairs = enumerate(zip(old, new, strict=True))
-        return next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
+    if isinstance(old, list) and isinstance(new, list):  # where one is longer, its first item too many tells
+        pairs = enumerate(itertools.zip_longest(old, new))
+        first = next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
+        return first or (None if len(old) == len(new) else (at, old, new))
     return None if old == new else (at, old, new)
 
 

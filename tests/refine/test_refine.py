@@ -176,6 +176,13 @@ def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):
         run(recipe, data, tmp_path, Hands("cpu"), EVERY)
 
 
+def test_a_refinement_too_many_is_named(finished, data, recipe):
+    for refine, told in ((recipe.refine[:1], "has null"), ((*recipe.refine, Recover()), 'has {"use": "recover"')):
+        with pytest.raises(BadInput, match=rf"refine\.{min(2, len(refine))} .*, and this one {told}") as error:
+            run(replace(recipe, refine=refine), data, finished, Hands("cpu"), EVERY)
+    assert "refine.2 null" in str(error.value)
+
+
 def test_depth_priors_teach_nothing_where_the_model_does():
     losses = Stage().losses | {"depth": DepthRegression()}
     with pytest.raises(BadInput, match="refine.1: learns from what the model draws, where depth finds no depth priors"):
