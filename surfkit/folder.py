@@ -75,6 +75,12 @@ class Run:
         return self.refined[-1].stage if self.refined else getattr(self.recipe, self.part)
 
     @property
+    def shown(self) -> Stage:
+        """The last one so far that was shown photographs: colours are as it has learnt them."""
+        so_far = [replace(self, part=part) for part in self.parts[: self.parts.index(self.part) + 1]]
+        return [run.stage for run in so_far if not (run.refined and run.refined[-1].taught)][-1]
+
+    @property
     def setting(self) -> str:
         """Where that stage stands in the recipe, as the command line has it."""
         return f"refine.{len(self.refined) - 1}.stage" if self.refined else self.part

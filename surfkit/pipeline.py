@@ -183,7 +183,7 @@ def evaluate(
             draw,
             timed=colors,
             show=show,
-            correct_color=this.stage.appearance is not None,
+            correct_color=this.shown.appearance is not None,
             masks=mask_cache(scene.held_out, ahead),
             networks=perceptual,
         )

@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from surfkit import optimise, pipeline
+from surfkit.appearance import Exposure
 from surfkit.blocks import Hands
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.core.registry import components
+from surfkit.core.tree import evolve
 from surfkit.densify.prune import Importance
 from surfkit.folder import Run
 from surfkit.losses.depth import DepthRegression
@@ -181,6 +183,26 @@ def test_a_refinement_too_many_is_named(finished, data, recipe):
         with pytest.raises(BadInput, match=rf"refine\.{min(2, len(refine))} .*, and this one {told}") as error:
             run(replace(recipe, refine=refine), data, finished, Hands("cpu"), EVERY)
     assert "refine.2 null" in str(error.value)
+
+
+def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
+    depth = replace(recipe.refine[0].stage, losses=Stage().losses | {"depth": DepthRegression()})
+    short = replace(recipe, partition=None, refine=(Recover(stage=depth),))
+    run(evolve(short, "pretrain.losses", depth.losses), data, tmp_path, Hands("cpu"), EVERY)
+    assert capsys.readouterr().err.count("has no depth priors") == 1
+
+
+@pytest.mark.parametrize(("taught", "corrected"), [(True, True), (False, False)])
+def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkeypatch, taught, corrected):
+    """By the last stage that was shown any: one that is taught keeps what was learnt of them."""
+    found, original = [], pipeline.evaluate_views
+    monkeypatch.setattr(
+        pipeline, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
+    )
+    stage = Stage(steps=2, sh_every=1)
+    refine = (Distil if taught else Recover)(stage=stage)
+    run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Hands("cpu"), EVERY)
+    assert found == [corrected]
 
 
 def test_depth_priors_teach_nothing_where_the_model_does():
