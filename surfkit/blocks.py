@@ -342,6 +342,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     mine = [view for view in site.scene.train if view.name in block.views]
     photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
     growth = 1 if site.this.recipe.tune.densify is None else 3
+    points = max(block.points, read_state(site.place(index)).begun_points)  # also those around it, once they are known
     return executor.Job(
         index=index,
         folder=site.place(index),
@@ -349,7 +350,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         command=tuple(command),
         cost=block.work,
         memory_bytes=PROGRAM_BYTES
-        + growth * POINT_BYTES * block.points
+        + growth * POINT_BYTES * points
         + PIXEL_BYTES * pixels
         + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
         needs=(site.this.data.path, mine[0].path),
