@@ -1,6 +1,6 @@
 """The blocks of a large scene: planned, tuned apart by whoever has hands free, and merged (CityGaussianV2, sec. 3.3).
 
-The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NN/` holds what one block has
+The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NNN/` holds what one block has
 come to, and whoever comes back to it goes on from there.
 """
 
@@ -342,6 +342,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     mine = [view for view in site.scene.train if view.name in block.views]
     photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
     growth = 1 if site.this.recipe.tune.densify is None else 3
+    points = max(block.points, read_state(site.place(index)).begun_points)  # also those around it, once they are known
     return executor.Job(
         index=index,
         folder=site.place(index),
@@ -349,7 +350,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         command=tuple(command),
         cost=block.work,
         memory_bytes=PROGRAM_BYTES
-        + growth * POINT_BYTES * block.points
+        + growth * POINT_BYTES * points
         + PIXEL_BYTES * pixels
         + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
         needs=(site.this.data.path, mine[0].path),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import platform
 from dataclasses import dataclass, replace
@@ -72,6 +73,17 @@ class Run:
     def stage(self) -> Stage:
         """The one that is spoken of."""
         return self.refined[-1].stage if self.refined else getattr(self.recipe, self.part)
+
+    @property
+    def shown(self) -> Stage:
+        """The last one so far that was shown photographs: colours are as it has learnt them."""
+        so_far = [replace(self, part=part) for part in self.parts[: self.parts.index(self.part) + 1]]
+        return [run.stage for run in so_far if not (run.refined and run.refined[-1].taught)][-1]
+
+    @property
+    def setting(self) -> str:
+        """Where that stage stands in the recipe, as the command line has it."""
+        return f"refine.{len(self.refined) - 1}.stage" if self.refined else self.part
 
     @property
     def primitive(self) -> Primitive:
@@ -145,9 +157,9 @@ def refuse_file(out: Path) -> None:
     for name in FILES:
         if (out / name).is_dir():
             raise BadInput(f"{out / name}: a folder, where the run keeps a file; delete it")
-    for name in FOLDERS:
-        if (out / name).is_file():
-            raise BadInput(f"{out / name}: a file, where the run keeps a folder; delete it")
+    for path in [*(out / name for name in FOLDERS), *out.glob("refine[0-9]")]:
+        if path.is_file():
+            raise BadInput(f"{path}: a file, where the run keeps a folder; delete it")
 
 
 def refuse_no_run(out: Path) -> None:
@@ -186,7 +198,7 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
-    there = read_json(this.out / "recipe.json", Any) if (this.out / "recipe.json").exists() else None
+    there = recipe_before(this.out / "recipe.json")
     mesh = dump(this.recipe.mesh)
     remesh = isinstance(there, dict) and there.get("mesh") != mesh
     if remesh:  # training is the same
@@ -211,6 +223,15 @@ def refuse_other(this: Run) -> None:
         )
     if remesh:
         this.mesh_record.unlink(missing_ok=True)
+
+
+def recipe_before(path: Path) -> Any:
+    """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none."""
+    there = read_json(path, Any) if path.exists() else None
+    try:
+        return dump(load(Recipe, there)) if there is not None else None
+    except BadInput:
+        return there  # the difference will tell
 
 
 def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
@@ -239,9 +260,10 @@ def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
             if path != "about" and (found := difference(old.get(key), new.get(key), path)):
                 return found
         return None
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        pairs = enumerate(zip(old, new, strict=True))
-        return next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
+    if isinstance(old, list) and isinstance(new, list):  # where one is longer, its first item too many tells
+        pairs = enumerate(itertools.zip_longest(old, new))
+        first = next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
+        return first or (None if len(old) == len(new) else (at, old, new))
     return None if old == new else (at, old, new)
 
 

@@ -191,7 +191,7 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
     if halvings >= MOST_HALVINGS:
         raise NotFinite(
             f"{this.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
-            f"and its camera, or lower {this.part}.rates in another folder; the last checkpoint is whole"
+            f"and its camera, or lower {this.setting}.rates in another folder; the last checkpoint is whole"
         ) from error
     found = checkpoint.load_last(this.checkpoint)
     state = found[0] if found else begin()

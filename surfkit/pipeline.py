@@ -36,6 +36,7 @@ from surfkit.folder import (
 from surfkit.mesh.base import Subject
 from surfkit.notes import noted
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
+from surfkit.partition.executor import Inline
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.recipe import Recipe
@@ -108,6 +109,8 @@ def run(
         state = saved(this, scene, repair=True)
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
+        if recipe.partition is None and hands.workers != Inline():
+            emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
         unfinished = state is None or state.index < recipe.pretrain.steps
         given = read_ahead(this.data, scene, recipe.pretrain.losses, store) if unfinished else None
         claim(this, backend, prints, notes, scene.frame)
@@ -180,7 +183,7 @@ def evaluate(
             draw,
             timed=colors,
             show=show,
-            correct_color=this.stage.appearance is not None,
+            correct_color=this.shown.appearance is not None,
             masks=mask_cache(scene.held_out, ahead),
             networks=perceptual,
         )

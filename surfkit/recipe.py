@@ -44,8 +44,8 @@ class Recipe:
     """Optimisation of each block, where the scene is cut."""
 
     refine: tuple[Annotated[Refine, choice(Refine)], ...] = ()
-    """What the whole model goes through when its blocks are merged; refine.0:NAME adds the first, refine.1:NAME the
-    next, refine.0:none drops one."""
+    """What the whole model goes through when it is trained, and its blocks merged if there are any; refine.0:NAME adds
+    the first, refine.1:NAME the next, refine.0:none drops one."""
 
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""
@@ -58,3 +58,7 @@ class Recipe:
             raise BadInput(f"seed is {self.seed}; it must be 0 or more and below 2^63")
         if self.min_views < 1:
             raise BadInput(f"min_views is {self.min_views}; a block needs 1 or more")
+        for at, refine in enumerate(self.refine):
+            blind = [name for name, loss in refine.stage.losses.items() if refine.taught and loss.needs_prior]
+            if blind:
+                raise BadInput(f"refine.{at}: learns from what the model draws, where {blind[0]} finds no depth priors")

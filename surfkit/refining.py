@@ -9,6 +9,7 @@ from torch import Tensor
 
 from surfkit.core.journal import kept
 from surfkit.folder import Run, discard_results
+from surfkit.notes import naming
 from surfkit.optimise import Job, drawing, optimise, saved
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Rasterizer
@@ -49,12 +50,11 @@ def _gone_through(site: Site, before: Run, given: StageState) -> StageState:
     def start() -> Columns:
         return {name: value.clone() for name, value in refine.params(before.stage.finished(given)).items()}
 
-    losses = this.stage.losses
-    shown = _drawn(before, given, scene, site.rasterizer) if refine.taught else None
-    shown = shown or read_ahead(this.data, scene, losses, site.store)
     every, folder = replace(site.every, pictures=0), this.checkpoint.parent
     folder.mkdir(exist_ok=True)
-    with kept(folder):  # its steps are counted anew
+    with kept(folder), naming(f"{this.title}: "):  # its steps are counted anew, and what is known is not told again
+        shown = _drawn(before, given, scene, site.rasterizer) if refine.taught else None
+        shown = shown or read_ahead(this.data, scene, this.stage.losses, site.store)
         return optimise(Job(this, scene, site.rasterizer, every, shown, Meter(), start, given), state)
 
 

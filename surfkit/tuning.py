@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.errand import DRIVER, INTERRUPTED, POLL_S
+from surfkit.core.errand import CRASHED, DRIVER, INTERRUPTED, POLL_S
 from surfkit.core.events import StageBegan, StepDone, say
 from surfkit.core.files import sweep
 from surfkit.core.journal import kept
@@ -42,9 +42,8 @@ from surfkit.train.stage import StageState
 
 ALIVE_S = 5.0
 """Seconds between signs of life of a block."""
-CRASHED, FULL, BUSY = 70, 74, 75
-"""Exit statuses beside those of `surfkit train`: an error that nobody foresaw, a full disk, and a block that another
-works on."""
+FULL, BUSY = 74, 75
+"""Exit statuses beside those of `surfkit train` and of errands: a full disk, and a block that another works on."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +157,8 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
         every = replace(site.every, pictures=0)
         start = Start(site, blocks, index, scene.train)
         state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
+    else:
+        say(f"block {index} has all its {steps} steps already")
     write_state(folder, status="done", step=state.index, steps=steps)
 
 

@@ -21,7 +21,7 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
 from surfkit.optimise import Every
 from surfkit.partition import Inline, PictureShare, Pool, QuantileGrid
-from surfkit.partition.state import read_state
+from surfkit.partition.state import read_state, write_state
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
 from surfkit.recipe import Recipe
@@ -328,7 +328,8 @@ def test_blocks_of_a_plan_that_is_gone_are_put_aside(undisturbed, data, recipe, 
 
 
 def test_tune_by_hand(undisturbed, tmp_path, capsys):
-    assert main(["tune", str(undisturbed), "0"]) == 0  # it is done
+    assert main(["tune", str(undisturbed), "0"]) == 0
+    assert "block 0 has all its " in capsys.readouterr().err
     assert main(["tune", str(undisturbed), "2"]) == 2 and "has blocks 0 to 1" in capsys.readouterr().err
     assert main(["tune", str(tmp_path), "0"]) == 2
 
@@ -370,6 +371,19 @@ def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_pa
     assert main(["tune", str(tmp_path / "run"), "1"]) == 2 and "views.npz cannot be used" in capsys.readouterr().err
     run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
     assert read_state(folder).status == "done"
+
+
+def test_a_block_that_was_begun_is_known_to_be_larger(undisturbed, data, recipe, tmp_path):
+    """Than what it owns: what its views show is drawn, too."""
+    this, _, scene = load_run(undisturbed)
+    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    fresh = tuning.Site(replace(this, out=tmp_path), scene, select("cpu")[0], EVERY, Store())
+    begun = read_state(undisturbed / "blocks" / "000").begun_points
+    more = begun - plan.blocks[0].points
+    memory = [blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes]
+    write_state(fresh.place(0), begun_points=begun)
+    memory.append(blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes)
+    assert more > 0 and memory[1] - memory[0] in (more * blocks.POINT_BYTES, 3 * more * blocks.POINT_BYTES)
 
 
 def test_an_inline_executor_is_the_default(recipe):

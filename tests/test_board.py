@@ -8,8 +8,10 @@ import pytest
 from rich.console import Console
 
 from surfkit.board import Board, Standing, state_since, table
+from surfkit.cli.status import rows
 from surfkit.outlook import all_left, in_words, pace, seconds_left, so_far
 from surfkit.partition.state import BlockState, write_state
+from surfkit.report.status import KNOWN, Block, Status
 from surfkit.train import progress
 
 RUNNING = BlockState("running", step=130, steps=300, first=30, began=1000.0, heard=1020.0)
@@ -24,6 +26,14 @@ def test_time_left_of_a_block():
     early = replace(RUNNING, heard=1001.0)
     assert pace(early) is None and in_words(early) == "step 130/300, 0:01"
     assert so_far(FAILED) is None and seconds_left(DONE) is None
+
+
+def test_a_block_that_is_worked_on_no_more():
+    state = {name: getattr(RUNNING, name) for name in KNOWN}
+    there = [Block(0, 9, **state | {"heard": time.time() - ago, "began": time.time() - 200}) for ago in (100, 0)]
+    (_, silent), (_, heard) = [row for row in rows(Status("stopped", blocks=tuple(there))) if row[0] == "block 0"]
+    assert "running, but silent for 1:40, step 130 of 300" in silent and "left" not in silent
+    assert "silent" not in heard and "5:40 left" in heard
 
 
 def test_time_left_of_all_blocks():

@@ -10,10 +10,12 @@ import torch
 from PIL import Image
 
 from surfkit import optimise, pipeline
+from surfkit.blocks import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
+from surfkit.partition import Pool
 from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
@@ -130,6 +132,18 @@ def test_another_recipe_is_refused(finished, data, recipe, path, value, message)
     assert message in str(error.value) and "name another folder" in str(error.value)
 
 
+def test_a_run_from_before_there_was_a_setting_goes_on(finished, data, recipe, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(finished[0], out)
+    written = json.loads((out / "recipe.json").read_text())
+    del written["refine"], written["pretrain"]["near"]
+    (out / "recipe.json").write_text(json.dumps(written))
+    assert run(recipe, data, out) == json.loads((out / "metrics.json").read_text())
+    (out / "recipe.json").write_text(json.dumps(written | {"seed": 3}))
+    with pytest.raises(BadInput, match="seed 3, and this one has 0"):
+        run(recipe, data, out)
+
+
 def test_other_data_is_refused(finished, data, recipe):
     with pytest.raises(BadInput, match="data.test_every 8, and this one has 4"):
         run(recipe, replace(data, test_every=4), finished[0])
@@ -176,6 +190,11 @@ def test_without_held_out_photographs_the_metrics_say_so(data, recipe, tmp_path,
     assert metrics["images"] == {"psnr": None, "ssim": None, "per_image": {}} and metrics["fps"] > 0
     notes = json.loads((tmp_path / "run.json").read_text())["notes"]
     assert len(notes) == 1 and "cannot be measured" in notes[0] and notes[0] in capsys.readouterr().err
+
+
+def test_an_executor_without_blocks_is_told(data, recipe, tmp_path, capsys):
+    run(with_steps(recipe, 2), data, tmp_path, Hands(workers=Pool()))
+    assert "no blocks, so the executor has nothing to do" in capsys.readouterr().err
 
 
 def test_warnings_of_a_run_become_notes_once(data, recipe, tmp_path, monkeypatch):

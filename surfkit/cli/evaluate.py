@@ -76,6 +76,11 @@ class Evaluate:
         this = opened(self.target) if self.target.is_dir() else None
         if this is not None and not this.mesh.exists():
             raise BadInput(f"{self.target}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")
+        if this is not None and not this.mesh_record.exists():
+            raise BadInput(
+                f"{this.mesh}: without {this.mesh_record.name} it is of an earlier model, or half made; make it with "
+                "surfkit mesh, or name the file"
+            )
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if this is None else this.out)
         scene = self._scene(this)
         found = measure_geometry(

@@ -40,8 +40,10 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
     print_table(("metric", "value"), rows)
     print()
     written = [("metrics", this.metrics), ("points", this.cloud)]
-    written += [("mesh", path) for path in sorted(this.out.glob("mesh.*")) if path.suffix in (".ply", ".obj", ".glb")]
-    written += [("picture of the mesh", path) for path in sorted(this.mesh_pictures.glob("*.png"))]
+    if this.mesh_record.exists():  # without it, what is there is of an earlier model
+        meshes = sorted(path for path in this.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
+        written += [("mesh", path) for path in meshes]
+        written += [("picture of the mesh", path) for path in sorted(this.mesh_pictures.glob("*.png"))]
     pictures = sorted(this.pictures.rglob("*.png")) if this.pictures.exists() else []
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])

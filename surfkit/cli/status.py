@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,8 @@ from surfkit.outlook import seconds_left, so_far
 from surfkit.report.status import Block, Status, as_json, status
 
 UNFINISHED = 3
+SILENT_S = 60.0
+"""A block that is worked on gives signs of life more often."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,12 @@ def _where(block: Block) -> str:
         return "no views; stays as it is in the coarse model"
     kind = f" ({block.kind})" if block.kind else ""
     parts = [f"{block.status}{kind}{f': {block.error}' if block.error else ''}"]
+    silent = time.time() - block.heard if block.status == "running" else 0.0
+    left = seconds_left(block) if silent <= SILENT_S else None
+    parts += [f"but silent for {clock(silent)}"] * (silent > SILENT_S)
     parts.append(f"step {block.step:,} of {block.steps:,}")
     parts += [clock(seconds) for seconds in [so_far(block)] if seconds is not None]
-    parts += [f"{clock(seconds)} left" for seconds in [seconds_left(block)] if seconds is not None]
+    parts += [f"{clock(seconds)} left" for seconds in [left] if seconds is not None]
     parts.append(f"{block.views} views")
     parts += [f"attempt {block.attempts}"] * (block.attempts > 1)
     parts += [f"for want of memory {'; then '.join(block.eased)}"] * bool(block.eased)

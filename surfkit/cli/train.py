@@ -113,7 +113,7 @@ class Train:
 
     tensorboard: bool = False
     """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder;
-    every block has a folder of its own there."""
+    every block and every refinement has a folder of its own there."""
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result

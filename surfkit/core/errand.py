@@ -21,7 +21,8 @@ from surfkit.core.version import own_version
 
 DRIVER = "SURFKIT_DRIVER"
 """Names the process that a worker works for; without it, the worker stops."""
-INTERRUPTED = 130
+INTERRUPTED, CRASHED = 130, 70
+"""Exit statuses: someone asked to stop; something went wrong that nobody foresaw."""
 POLL_S = 0.2
 CARRIED = ("PYTHONPATH", "SURFKIT_PLUGINS")
 """Variables of whoever asks, without which another machine might run other code."""

@@ -88,7 +88,15 @@ def forecast(
         return None, [_failed(probed, held_back)]
     found = estimate(load, parts, rising, probed, room)
     found = replace(found, probe_seconds=time.perf_counter() - begun)
-    return found, advice(found)
+    return found, [*beyond(recipe), *advice(found)]
+
+
+def beyond(recipe: Recipe) -> list[Finding]:
+    """What of the run the forecast leaves out."""
+    later = ["the blocks, which are foretold when they are planned,"] if recipe.partition is not None else []
+    later += ["what the recipe refines"] if recipe.refine else []
+    text = f"memory, disk and time are those of pretraining; {' and '.join(later)} come on top"
+    return [Finding("note", "forecast", text)] if later else []
 
 
 def schedule(steps: int, rising: Growth) -> tuple[Part, ...]:

@@ -11,11 +11,10 @@ from types import ModuleType
 from typing import Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.errand import POLL_S, attend
+from surfkit.core.errand import CRASHED, POLL_S, attend
 from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 
-CRASHED = 70
 REACH_S = 10.0
 STORE_BYTES = 100 << 20
 """For Ray's object store on this machine, through which next to nothing goes."""

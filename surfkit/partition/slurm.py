@@ -15,13 +15,12 @@ from types import ModuleType
 from typing import Any, Literal
 
 from surfkit.core.check import BadInput
-from surfkit.core.errand import POLL_S, Errand
+from surfkit.core.errand import CRASHED, POLL_S, Errand
 from surfkit.core.events import say
 from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 from surfkit.partition.state import worked_on
 
-CRASHED = 70
 SLURM_POLL_S = 1.0
 SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T %r")
 """States and reasons of jobs, also of those that are over."""

@@ -70,7 +70,7 @@ class Status:
         steps: Of the stage.
         saved_step: Of the last checkpoint.
         steps_per_second: Over the last steps.
-        seconds_left: To the end of the stage, or of all blocks, at this speed; None when nothing runs.
+        seconds_left: To the end of the stage, or of the blocks that are left, at this speed; None when nothing runs.
         points: After the last step.
         loss: Of the last step.
         peak_memory_bytes: Most memory held.
@@ -157,9 +157,10 @@ def _blocks(folder: Path) -> tuple[Block, ...]:
 
 
 def _left(stage: float | None, blocks: tuple[Block, ...]) -> float | None:
-    """Seconds to the end of the blocks, once they are planned, else of the stage."""
+    """Seconds to the end of the blocks, while some are left to tune, else of the stage."""
     tuned = [block for block in blocks if block.views]
-    found = all_left(tuned, max(block.steps for block in tuned)) if tuned else stage
+    waiting = any(block.status != "done" for block in tuned)
+    found = all_left(tuned, max(block.steps for block in tuned)) if waiting else stage
     return None if found is None else round(found, 1)
 
 

@@ -15,7 +15,7 @@ from surfkit.core.registry import hookimpl, plugins
 class Scalars:
     """Writes losses, points, memory and held-out PSNR; steps that a run takes again replace those it lost.
 
-    Every block has a folder of its own, which TensorBoard shows as a run of its own.
+    Every block and every refinement has a folder of its own, which TensorBoard shows as a run of its own.
     """
 
     def __init__(self, folder: Path, writer: type) -> None:
@@ -27,8 +27,7 @@ class Scalars:
         """See one event."""
         if isinstance(event, StageBegan):
             self.close()
-            folder = self.folder if event.block is None else self.folder / f"block-{event.block:03}"
-            self.writer = self.kind(str(folder), purge_step=event.first, flush_secs=10)
+            self.writer = self.kind(str(self.folder / _folder(event)), purge_step=event.first, flush_secs=10)
         elif self.writer is None:
             return
         elif isinstance(event, StepDone):
@@ -46,6 +45,13 @@ class Scalars:
         if self.writer is not None:
             self.writer.close()
             self.writer = None
+
+
+def _folder(began: StageBegan) -> str:
+    """Where the scalars of a stage go: those that count their steps anew must not replace others."""
+    if began.block is not None:
+        return f"block-{began.block:03}"
+    return began.stage if began.stage.startswith("refine") else ""
 
 
 @contextmanager

@@ -121,8 +121,7 @@ def read_priors(
 def alignment(data: Data, scene: Scene) -> Alignment:
     """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
-    Photographs without a map, or with one that cannot be used, are listed in one warning. Without `anchors`, the sparse
-    points are read from the data set.
+    Photographs without a map, or with one that cannot be used, are listed in one warning.
     """
     maps = prior_files(data, scene)
     if not maps:

@@ -1,6 +1,7 @@
 """`surfkit evaluate`: what it prints, writes and refuses."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -94,6 +95,15 @@ def test_a_run_without_a_mesh(folder, capsys, tmp_path):
         (tmp_path / name).write_bytes((folder / "run" / name).read_bytes())
     status, _, error = spoken(capsys, tmp_path, "--gt", folder / "truth.ply")
     assert status == 2 and "no mesh.ply in it; make it with surfkit mesh" in error
+
+
+def test_a_mesh_of_an_earlier_model_is_not_measured(folder, capsys, tmp_path):
+    shutil.copytree(folder / "run", tmp_path / "run")
+    (tmp_path / "run" / "mesh.json").unlink()
+    status, said, error = spoken(capsys, tmp_path / "run", "--gt", folder / "truth.ply")
+    assert status == 2 and not said and "mesh.ply: without mesh.json it is of an earlier model" in error
+    assert spoken(capsys, folder / "run", "--lpips-weights", "none")[1].count("mesh.ply") == 1
+    assert "mesh.ply" not in spoken(capsys, tmp_path / "run", "--lpips-weights", "none")[1]
 
 
 def test_another_unit_is_told(folder, capsys, tmp_path):

@@ -16,7 +16,7 @@ from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
 from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, one_digit, size
 from surfkit.doctor.examine import examine
-from surfkit.doctor.forecast import Plan, forecast, schedule, within
+from surfkit.doctor.forecast import Plan, beyond, forecast, schedule, within
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, Started, Taken, Written, measure, probe, some, with_count
 from surfkit.pipeline import Every, run, with_steps
@@ -143,6 +143,14 @@ def test_parts_of_a_run_avoid_its_edits_and_the_limits_of_a_probe():
     assert all(part.points <= 1_500_000 for part in within(middles, 1_500_000))
     few = [part.points for part in within(middles, 9_000)]
     assert few == sorted(set(few)) and few[-1] == 9_000
+
+
+def test_what_comes_after_pretraining_is_named():
+    found = [
+        [finding.text for finding in beyond(recipe)] for recipe in map(recipes().get, ("2dgs", "citygs2", "citygs"))
+    ]
+    assert found[0] == [] and "the blocks" in found[1][0] and "refines" not in found[1][0]
+    assert "the blocks" in found[2][0] and "refines" in found[2][0]
 
 
 def test_points_become_as_many_as_wanted(farm):

@@ -1,16 +1,22 @@
 """The whole model made smaller after its blocks are merged."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
 import torch
 
 from surfkit import optimise, pipeline
+from surfkit.appearance import Exposure
 from surfkit.blocks import Hands
 from surfkit.core.check import BadInput
+from surfkit.core.lock import held
 from surfkit.core.registry import components
+from surfkit.core.tree import evolve
 from surfkit.densify.prune import Importance
+from surfkit.folder import Run
+from surfkit.losses.depth import DepthRegression
 from surfkit.optimise import Every
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run, with_steps
@@ -27,6 +33,7 @@ from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.testing import check_refine
 from surfkit.train import checkpoint
+from surfkit.train.faults import Diverged, NotFinite
 from surfkit.train.stage import Stage
 
 EVERY = Every(checkpoint=2, pictures=0)
@@ -135,8 +142,6 @@ def interrupt(*_):
 
 
 def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path, monkeypatch):
-    import shutil
-
     out = tmp_path / "run"
     shutil.copytree(finished, out)
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=8))
@@ -148,6 +153,62 @@ def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path, monkeypatch
     assert not torch.equal(
         state_of(out, "refine0").points.params["sh0"], state_of(finished, "refine0").points.params["sh0"]
     )
+
+
+def test_the_time_left_is_that_of_the_refinement(finished, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    journal = out / "refine1" / "events.jsonl"
+    lines = [json.loads(text) for text in journal.read_text().splitlines()]
+    lines = [line | {"time": 10.0 * line["index"]} for line in lines if line["event"] == "StepDone"][:4]
+    began = {"event": "StageBegan", "time": 0.0, "stage": "refine1", "steps": 6, "points": 100, "first": 1}
+    journal.write_text("".join(json.dumps(line) + "\n" for line in [began, *lines]))
+    with held(out):
+        assert status(out).seconds_left == pytest.approx(20.0)
+
+
+def test_numbers_that_stay_infinite_name_the_rates_of_the_refinement(data, recipe, tmp_path):
+    with pytest.raises(NotFinite, match=r"lower refine\.1\.stage\.rates in another folder"):
+        optimise.rolled_back(Run(tmp_path, recipe, data, "refine1"), 2, Diverged(3, "a.png", "infinite"), interrupt)
+
+
+def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):
+    (tmp_path / "refine0").touch()
+    with pytest.raises(BadInput, match="refine0: a file, where the run keeps a folder"):
+        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+
+
+def test_a_refinement_too_many_is_named(finished, data, recipe):
+    for refine, told in ((recipe.refine[:1], "has null"), ((*recipe.refine, Recover()), 'has {"use": "recover"')):
+        with pytest.raises(BadInput, match=rf"refine\.{min(2, len(refine))} .*, and this one {told}") as error:
+            run(replace(recipe, refine=refine), data, finished, Hands("cpu"), EVERY)
+    assert "refine.2 null" in str(error.value)
+
+
+def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
+    depth = replace(recipe.refine[0].stage, losses=Stage().losses | {"depth": DepthRegression()})
+    short = replace(recipe, partition=None, refine=(Recover(stage=depth),))
+    run(evolve(short, "pretrain.losses", depth.losses), data, tmp_path, Hands("cpu"), EVERY)
+    assert capsys.readouterr().err.count("has no depth priors") == 1
+
+
+@pytest.mark.parametrize(("taught", "corrected"), [(True, True), (False, False)])
+def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkeypatch, taught, corrected):
+    """By the last stage that was shown any: one that is taught keeps what was learnt of them."""
+    found, original = [], pipeline.evaluate_views
+    monkeypatch.setattr(
+        pipeline, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
+    )
+    stage = Stage(steps=2, sh_every=1)
+    refine = (Distil if taught else Recover)(stage=stage)
+    run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Hands("cpu"), EVERY)
+    assert found == [corrected]
+
+
+def test_depth_priors_teach_nothing_where_the_model_does():
+    losses = Stage().losses | {"depth": DepthRegression()}
+    with pytest.raises(BadInput, match="refine.1: learns from what the model draws, where depth finds no depth priors"):
+        Recipe(refine=(Recover(stage=Stage(losses=losses)), Distil(stage=Stage(losses=losses))))
 
 
 def test_cameras_beside_those_of_the_photographs(data):

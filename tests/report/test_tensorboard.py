@@ -50,7 +50,7 @@ class Written:
         pass
 
 
-def test_every_block_has_scalars_of_its_own(tmp_path, monkeypatch):
+def test_every_block_and_refinement_has_scalars_of_its_own(tmp_path, monkeypatch):
     module = types.ModuleType("torch.utils.tensorboard")
     module.SummaryWriter = Written
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
@@ -59,4 +59,6 @@ def test_every_block_has_scalars_of_its_own(tmp_path, monkeypatch):
             emit(StageBegan("pretrain" if block is None else "tune", 2, 10, block=block))
             for index in (1, 2):
                 emit(StepDone(index, 2, {"l1": 0.5}, 10 * index + (9 if block is None else block), 1000))
-    assert Written.points == {"tensorboard": [19, 29], "block-000": [10, 20], "block-001": [11, 21]}
+        emit(StageBegan("refine0", 1, 10))
+        emit(StepDone(1, 1, {"l1": 0.5}, 5, 1000))
+    assert Written.points == {"tensorboard": [19, 29], "block-000": [10, 20], "block-001": [11, 21], "refine0": [5]}
