@@ -60,7 +60,7 @@ def _gone_through(site: Site, before: Run, given: StageState) -> StageState:
 
 def seen_by(this: Run, scene: Scene) -> Scene:
     """The scene with the views that the stage which is spoken of looks from."""
-    return replace(scene, train=this.refined[-1].views(scene.train)) if this.refined else scene
+    return replace(scene, train=this.refined[-1].views(scene.train, this.recipe.seed)) if this.refined else scene
 
 
 def _drawn(before: Run, given: StageState, scene: Scene, rasterizer: Rasterizer) -> Material:

@@ -250,7 +250,7 @@ def check_refine(refine: Refine, primitive: Primitive, params: Columns, views: S
     assert len({len(value) for value in begun.values()}) == 1, f"{name}: the columns differ in length"
     assert set(refine.stage.rates) == set(begun), f"{name}: stage.rates and the columns of the points differ"
     assert after.shape(begun, after.sh_degree).sh.shape[1] == (after.sh_degree + 1) ** 2
-    seen, again = ([view.camera.centre.tolist() for view in refine.views(views)] for _ in range(2))
+    seen, again = ([view.camera.centre.tolist() for view in refine.views(views, 0)] for _ in range(2))
     assert seen and seen == again, f"{name}: its views are not the same again"
     there = [view.camera.centre.tolist() for view in views]
     assert refine.taught or seen == there, f"{name} has photographs of the training views only"

@@ -31,6 +31,9 @@ class Refine(Component):
         """Raw parameters to begin with, given those of the model before."""
         return params
 
-    def views(self, views: Sequence[View]) -> tuple[View, ...]:
-        """The cameras to look from, given those of the training photographs. All of them, unless it is taught."""
+    def views(self, views: Sequence[View], seed: int) -> tuple[View, ...]:
+        """The cameras to look from, given those of the training photographs: all of them, unless it is taught.
+
+        Those that are drawn by chance are drawn from `seed`, and are the same again.
+        """
         return tuple(views)

@@ -74,9 +74,9 @@ class Distil(Refine):
         kept = (self.sh_degree + 1) ** 2 - 1
         return params | {"sh_rest": params["sh_rest"][:, :kept].clone()}
 
-    def views(self, views: Sequence[View]) -> tuple[View, ...]:
+    def views(self, views: Sequence[View], seed: int) -> tuple[View, ...]:
         """Each camera `copies` times, moved without being turned."""
-        generator = torch.Generator().manual_seed(len(views))
+        generator = torch.Generator().manual_seed(seed)
         shifts = self.jitter * torch.randn(self.copies, len(views), 3, generator=generator, dtype=torch.float64)
         return tuple(beside(view, shift) for row in shifts for view, shift in zip(views, row, strict=True))
 
