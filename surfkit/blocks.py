@@ -342,7 +342,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     mine = [view for view in site.scene.train if view.name in block.views]
     photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
     growth = 1 if site.this.recipe.tune.densify is None else 3
-    points = max(block.points, read_state(site.place(index)).begun_points)  # also those around it, once they are known
+    points = read_state(site.place(index)).begun_points or max(block.points, block.begins)
     return executor.Job(
         index=index,
         folder=site.place(index),

@@ -53,7 +53,7 @@ def need(site: Site, left: Sequence[Block], coarse: StageState, memory: Sequence
     tune = site.this.recipe.tune
     steps = sum(max(0, tune.steps - read_state(site.place(block.index)).step) for block in left)
     whole = replace(site.this, part="pretrain").checkpoint.stat().st_size
-    own = [whole * block.points // max(1, len(coarse.points)) for block in left]
+    own = [whole * max(block.points, block.begins) // max(1, len(coarse.points)) for block in left]
     there = [size_of(site.block(block.index)) for block in left]
     kept = KEPT * (GROWN if tune.densify is not None else 1.0)
     return Need(

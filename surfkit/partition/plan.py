@@ -13,6 +13,9 @@ from surfkit.core.events import Warned, emit
 from surfkit.partition.assign import Assign
 from surfkit.partition.base import Cells, Partition, Sight
 
+LOOKS = 16
+"""Views by which the points around a block are counted."""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -24,6 +27,7 @@ class Block:
         cameras: How many of them stand inside.
         points: Of the coarse model that it owns.
         work: Pixels of the views times the points, as a share of all blocks'.
+        begins: Points that it begins with, about: those, and what its views show of others'; 0 where nobody looked.
     """
 
     index: int
@@ -31,6 +35,7 @@ class Block:
     cameras: int
     points: int
     work: float
+    begins: int = 0
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,7 @@ def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tupl
     points = torch.bincount(cells.owner(sight.splats.means), minlength=cells.count)
     work = (joins * sight.pixels[:, None]).sum(0) * points
     share = (work / work.sum().clamp_min(1)).tolist()
-    names = [view.name for view in sight.views]
+    names, owner = [view.name for view in sight.views], cells.owner(sight.splats.means)
     return tuple(
         Block(
             index,
@@ -101,9 +106,18 @@ def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tupl
             int(inside[:, index].sum()),
             int(points[index]),
             share[index],
+            begins(sight, owner == index, joins[:, index]),
         )
         for index in range(cells.count)
     )
+
+
+def begins(sight: Sight, own: Tensor, joins: Tensor) -> int:
+    """Points that a block begins with, by (N,) those that it owns and what some of its (V,) views show."""
+    views, seen = joins.nonzero()[:, 0].tolist(), own.clone()
+    for at in views[:: -(-len(views) // LOOKS) or 1]:
+        seen |= sight.rasterizer.render(sight.splats, sight.views[at].camera, sight.near, geometry=False).seen
+    return int(seen.sum())
 
 
 def with_enough(cells: Cells, joins: Tensor, inside: Tensor, fewest: int, poor: Tensor) -> tuple[Cells, Tensor, Tensor]:
