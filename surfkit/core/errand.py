@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -147,7 +148,13 @@ class Errand:
 
 
 def attend(errand: Errand) -> Outcome:
-    """Run an errand; a function of its own, as Ray wants it."""
+    """Run an errand; a function of its own, as Ray wants it.
+
+    Ray cancels by a simulated Ctrl-C, which means nothing where that is ignored, as by all that a shell begins in the
+    background; the driver would then wait for ever.
+    """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     return errand()
 
 

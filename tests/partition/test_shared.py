@@ -1,6 +1,8 @@
 """Jobs for other machines: what they look for before they begin, and what they leave to whoever sent them."""
 
+import _thread
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -10,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.core.errand import Outcome
+from surfkit.core.errand import Outcome, attend
 from surfkit.partition.executor import LOG, Job
 from surfkit.partition.shared import MARK, errand, marked
 
@@ -63,3 +65,19 @@ def test_agents_are_light(module):
     """What an agent of a cluster imports for an errand."""
     code = f"import sys, surfkit.core.errand; raise SystemExit({module!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_an_agent_hears_ctrl_c_also_where_the_shell_ignores_it():
+    """As in all that a shell begins in the background: Ray's way to cancel would mean nothing to it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def interrupted():
+        with pytest.raises(KeyboardInterrupt):
+            _thread.interrupt_main()
+            time.sleep(1)
+        return "saved"
+
+    try:
+        assert attend(interrupted) == "saved"
+    finally:
+        signal.signal(signal.SIGINT, before)
