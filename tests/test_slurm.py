@@ -64,7 +64,17 @@ def processes(folder: Path) -> list[psutil.Process]:
     return [psutil.Process(minder).parent(), psutil.Process(minder), psutil.Process(command)]
 
 
-def test_leaving_stops_the_jobs(tmp_path, monkeypatch):
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_leaving_stops_the_jobs(tmp_path, monkeypatch, ctrl_c):
+    """Also in the background, where a shell lets Ctrl-C be ignored, by which submitit cancels."""
+    before = signal.signal(signal.SIGINT, ctrl_c)
+    try:
+        leave(tmp_path, monkeypatch)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def leave(tmp_path, monkeypatch):
     class Stop(Exception):
         pass
 

@@ -6,9 +6,12 @@ import math
 import os
 import re
 import shutil
+import signal
 import subprocess
+import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -151,6 +154,23 @@ class Slurm(Executor):
         return given
 
 
+@contextmanager
+def _heard() -> Iterator[None]:
+    """Within, processes are begun that hear Ctrl-C, by which submitit cancels them on this machine.
+
+    What a shell has begun in the background ignores it, and so would all that it begins.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    ignored = before is signal.SIG_IGN and threading.current_thread() is threading.main_thread()
+    if ignored:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if ignored:
+            signal.signal(signal.SIGINT, before)
+
+
 @dataclass
 class Queue:
     """Jobs that were submitted, and what each works on.
@@ -171,7 +191,7 @@ class Queue:
         """Submit some jobs; to Slurm, as one array."""
         submitit = _imported()
         try:
-            with executor.batch():
+            with _heard(), executor.batch():
                 handles = [executor.submit(what) for what in errands]
         except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError) as error:
             reason = " ".join(str(error).split())
