@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.core.events import Warned, emit, say
+from surfkit.core.memory import size
 from surfkit.folder import Run
 from surfkit.partition.plan import Block
 from surfkit.partition.state import read_state
@@ -105,8 +106,3 @@ def tell(site: Site, found: Need) -> None:
                 "gives out, the block is tried again with less, which will be told; more blocks need less each"
             )
         )
-
-
-def size(count: float) -> str:
-    """Bytes in words: 1.5 GB."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.{0 if count >= 1e7 else 1}f} MB"

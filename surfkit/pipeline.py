@@ -196,7 +196,7 @@ def evaluate(
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
         "points": len(state.points),
-        "steps": state.index,
+        "steps": sum(replace(this, part=part).stage.steps for part in this.parts[: this.parts.index(this.part) + 1]),
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
         "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,

@@ -78,6 +78,7 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
     assert gave["points"] == sum(block["kept"] for block in gave["blocks"]) == len(params(undisturbed)["means"])
     metrics = json.loads((undisturbed / "metrics.json").read_text())
     assert metrics["points"] == gave["points"] and metrics["images"]["psnr"] > 8
+    assert metrics["steps"] == 2 * STEPS, "of both stages"
     stages = map(json.loads, (undisturbed / "events.jsonl").read_text().splitlines())
     assert sum(line["event"] == "StepDone" for line in stages) == STEPS, "blocks have journals of their own"
     this, state, _ = load_run(undisturbed)
@@ -388,3 +389,12 @@ def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_pat
 
 def test_an_inline_executor_is_the_default(recipe):
     assert Hands().workers == Inline() and Hands().device == "auto"
+
+
+@pytest.mark.parametrize(
+    "word", [["--tune.steps", "7"], ["tune.densify:none"], ["assign:airspace"], ["--min-views", "3"]]
+)
+def test_settings_of_blocks_where_there_are_none(data, tmp_path, capsys, word):
+    words = ["train", "recipe:2dgs", *word, "--data", str(data.path), "--out", str(tmp_path / "run")]
+    assert main(words) == 2 and not (tmp_path / "run").exists()
+    assert f"surfkit: {word[0]}: the recipe cuts the scene into no blocks" in capsys.readouterr().err

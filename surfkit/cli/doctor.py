@@ -19,7 +19,8 @@ from surfkit.cli.recipes import chosen_recipe
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
-from surfkit.doctor.estimate import Estimate, duration, likely_range, size
+from surfkit.core.memory import size
+from surfkit.doctor.estimate import Estimate, duration, likely_range
 from surfkit.doctor.examine import Diagnosis, Told, examine
 from surfkit.doctor.finding import LEVELS
 from surfkit.doctor.forecast import Plan, forecast

@@ -85,7 +85,7 @@ def _condensed(text: str, command: type, argv: Sequence[str], prog: str) -> str:
     if title == "Required options":
         return f"{' and '.join(_outermost(sections[0]))} missing; see {prog} --help"
     if title in ("Value error", "Invalid choice", "Missing argument"):
-        return message
+        return message.removeprefix(f"{command.__name__}: ")  # of the whole command, not of one setting
     return f"{': '.join(filter(None, [title, message])) or 'these words do not fit'}; see {prog} --help"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ from surfkit.report.tensorboard import tensorboard
 from surfkit.train.material import Store
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
+
+BLOCKS_ONLY = re.compile(r"--(tune\.|assign\.|min-views)|(tune\.|assign:)")
+"""Words that say something of blocks alone."""
 
 
 def named_recipe() -> str:
@@ -130,6 +134,11 @@ class Train:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         if self.pictures_every is not None and self.pictures_every < 0:
             raise BadInput(f"--pictures-every {self.pictures_every}: give 0 (none) or more steps")
+        if self.recipe.partition is None and (idle := [word for word in ARGV.get() if BLOCKS_ONLY.match(word)]):
+            raise BadInput(
+                f"{idle[0]}: the recipe cuts the scene into no blocks, so this has nothing to do; add "
+                "partition:contracted-grid, or leave it out"
+            )
         if not self.folder:  # the words of the command line are only known while it is parsed
             object.__setattr__(self, "folder", named_recipe())
 

@@ -28,3 +28,11 @@ def give_back() -> None:
     """Hand memory that was freed back to the system, where the C library keeps it for itself (glibc)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def size(count: float, digits: int = 1) -> str:
+    """Bytes in words: 1.5 GB, with so many digits after the point, or whole MB."""
+    for unit, per in (("TB", 1e12), ("GB", 1e9)):
+        if count >= per:
+            return f"{count / per:.{digits}f} {unit}"
+    return f"{count / 1e6:.0f} MB"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surfkit.core.memory import size
 from surfkit.doctor.finding import Finding
 from surfkit.doctor.growth import SPREAD, Growth
 from surfkit.doctor.probe import Part, Probed
@@ -202,14 +203,6 @@ def _time(found: Estimate) -> list[Finding]:
         "--scale 2 makes each step about four times faster"
     )
     return [Finding("warning", "time", text)]
-
-
-def size(count: float, digits: int = 1) -> str:
-    """Bytes in words: 1.5 GB."""
-    for unit, per in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if count >= per or unit == "MB":
-            return f"{count / per:.{0 if unit == 'MB' else digits}f} {unit}"
-    raise AssertionError
 
 
 def duration(seconds: float) -> str:

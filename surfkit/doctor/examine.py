@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput, few
-from surfkit.core.memory import peak_memory_bytes
-from surfkit.doctor.estimate import Estimate, size
+from surfkit.core.memory import peak_memory_bytes, size
+from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
 from surfkit.doctor.gather import Gathered, gather

@@ -26,7 +26,7 @@ def curve(out: Path, what: What, block: int | None = None) -> tuple[np.ndarray, 
         raise BadInput(f"{out}: no run folder (no recipe.json in it); name one that surfkit train made")
     folder = out if block is None else out / "blocks" / f"{block:03}"
     if block is not None and not folder.is_dir():
-        there = sorted(path.name for path in (out / "blocks").glob("[0-9]*"))
+        there = sorted(int(path.name) for path in (out / "blocks").glob("[0-9]*"))
         raise BadInput(
             f"{out}: no block {block} is begun; {f'there are {there[0]} to {there[-1]}' if there else 'none is'}"
         )
