@@ -102,7 +102,10 @@ def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
         Unfinished: Blocks failed, also when they were tried again.
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
-    final, coarse = replace(site.this, part="tune"), coarse_model(site.this)
+    final = replace(site.this, part="tune")
+    if not site.folder.exists() and (state := whole(final)):  # who deletes the blocks of a finished run wants their room
+        return final, state
+    coarse = coarse_model(site.this)
     sweep(site.folder, deep=False)  # a block's own folder is its worker's
     record = planned(site, coarse)
     state = merged(site, record)
@@ -179,10 +182,13 @@ def put_aside(site: Site) -> Path:
 
 def merged(site: Site, record: Record) -> StageState | None:
     """The state of all blocks together, if it was made and none has been tuned for longer since."""
-    found = checkpoint.load_last(replace(site.this, part="tune").checkpoint)
-    if found is None or found[0].index < site.this.recipe.tune.steps or not done(site, record.plan):
-        return None
-    return found[0]
+    return whole(replace(site.this, part="tune")) if done(site, record.plan) else None
+
+
+def whole(final: Run) -> StageState | None:
+    """The state of all blocks together that is in the folder, if any; further steps of the coarse model delete it."""
+    found = checkpoint.load_last(final.checkpoint)
+    return None if found is None or found[0].index < final.stage.steps else found[0]
 
 
 def done(site: Site, blocks: Plan) -> bool:

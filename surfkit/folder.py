@@ -199,11 +199,14 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
     there = recipe_before(this.out / "recipe.json")
-    mesh = dump(this.recipe.mesh)
-    remesh = isinstance(there, dict) and there.get("mesh") != mesh
-    if remesh:  # training is the same
-        there |= {"mesh": mesh}
-    found = None if there is None else difference(there, dump(this.recipe))
+    now = dump(this.recipe)
+    remesh = isinstance(there, dict) and there.get("mesh") != now["mesh"]
+    if isinstance(there, dict):
+        there |= {"mesh": now["mesh"]}  # training is the same
+        before = there.get("refine")
+        if isinstance(before, list) and difference(before, now["refine"][: len(before)]) is None:
+            there |= {"refine": now["refine"]}  # the model that is there can be refined further
+    found = None if there is None else difference(there, now)
     if found and not (found := longer(this, there)):
         emit(
             Warned(
@@ -245,8 +248,7 @@ def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
     before = stage.get("steps") if isinstance(stage, dict) else None
     if not isinstance(before, int) or not 0 < before < now:
         return plain
-    old = read_json(this.out / "recipe.json", Recipe)
-    old = replace(old, about=this.recipe.about, mesh=this.recipe.mesh)
+    old = replace(load(Recipe, there, f"{this.out / 'recipe.json'}"), about=this.recipe.about)
     if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(this.recipe):
         return None
     return difference(dump(rescale_like(old, now / before, this.recipe)), dump(this.recipe))

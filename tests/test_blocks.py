@@ -256,6 +256,16 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
     assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".*.part"))
 
 
+def test_blocks_of_a_finished_run_can_be_deleted(undisturbed, data, recipe, tmp_path, capsys):
+    shutil.copytree(undisturbed, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "blocks")
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert "is finished" in capsys.readouterr().err and not (tmp_path / "run" / "blocks").exists()
+    shutil.rmtree(tmp_path / "run" / "tune")
+    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    assert same(tmp_path / "run", undisturbed), "without the merged model they are tuned again"
+
+
 def test_a_damaged_result_is_not_merged(undisturbed, data, recipe, tmp_path):
     """The merged model is gone, a checkpoint damaged: the block goes on from the one before, to the same bits."""
     shutil.copytree(undisturbed, tmp_path / "run")

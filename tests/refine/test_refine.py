@@ -178,11 +178,26 @@ def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):
         run(recipe, data, tmp_path, Hands("cpu"), EVERY)
 
 
-def test_a_refinement_too_many_is_named(finished, data, recipe):
-    for refine, told in ((recipe.refine[:1], "has null"), ((*recipe.refine, Recover()), 'has {"use": "recover"')):
-        with pytest.raises(BadInput, match=rf"refine\.{min(2, len(refine))} .*, and this one {told}") as error:
+def test_a_refinement_less_or_another_is_named(finished, data, recipe):
+    other = replace(recipe.refine[1], copies=3)
+    for refine, told in (
+        (recipe.refine[:1], r"refine.1 \{.*, and this one has null"),
+        ((recipe.refine[0], other, Recover()), r"refine.1.copies 2, and this one has 3"),
+    ):
+        with pytest.raises(BadInput, match=told):
             run(replace(recipe, refine=refine), data, finished, Hands("cpu"), EVERY)
-    assert "refine.2 null" in str(error.value)
+
+
+def test_a_finished_run_is_refined_further(finished, data, recipe, tmp_path):
+    """To the same bits as in one go, without a step of what is there made again."""
+    out = tmp_path / "run"
+    run(replace(recipe, refine=recipe.refine[:1]), data, out, Hands("cpu"), EVERY)
+    journals = [out / "events.jsonl", out / "blocks" / "000" / "events.jsonl", out / "refine0" / "events.jsonl"]
+    before = [path.read_text().count("StepDone") for path in journals]
+    metrics = run(recipe, data, out, Hands("cpu"), EVERY)
+    assert [path.read_text().count("StepDone") for path in journals] == before
+    assert (out / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
+    assert metrics["steps"] == 6 + 6 + 4 + 6
 
 
 def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
