@@ -103,7 +103,7 @@ def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
     final = replace(site.this, part="tune")
-    if not site.folder.exists() and (state := whole(final)):  # who deletes the blocks of a finished run wants their room
+    if not site.folder.exists() and (state := whole(final)):  # deleted to make room
         return final, state
     coarse = coarse_model(site.this)
     sweep(site.folder, deep=False)  # a block's own folder is its worker's
