@@ -8,13 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from surfkit.cli.data import data_of
 from surfkit.cli.recipes import chosen_recipe
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
@@ -27,6 +26,7 @@ from surfkit.doctor.forecast import Plan, forecast
 from surfkit.pipeline import with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
+from surfkit.scene.data import Reading
 
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
@@ -61,36 +61,8 @@ class Doctor:
     steps: int | None = None
     """Length of the run; every schedule of the recipe is scaled along."""
 
-    scale: float | None = None
-    """Divide the size of every photograph by this."""
-
-    longest: int | None = None
-    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
-
-    test_every: int = 8
-    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none."""
-
-    test_list: Path | None = None
-    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
-
-    model: Path | None = None
-    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
-
-    split: Literal["gauu-scene"] | None = None
-    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
-    numbers, k = n // ceil(n / 10)."""
-
-    test_data: Path | None = None
-    """Another data set, of the same layout and in the same coordinates, all of which is kept from training."""
-
-    images: Path | None = None
-    """Folder of the photographs, when it is not images/; relative to the data set."""
-
-    masks: Path | None = None
-    """Folder of the masks, when none of the folders called masks; relative to the data set."""
-
-    layout: str | None = None
-    """How the data set is laid out; recognised if left out."""
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    """How the data set is read."""
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors in the run, such as 4GB; auto takes half of what is free."""
@@ -109,7 +81,7 @@ class Doctor:
 
     def run(self) -> int:
         """Examine, and tell."""
-        data = data_of(self.data, self)
+        data = self.reading.of(self.data)
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with watched() as told:
             examined = examine(data, recipe, self.quick, told)

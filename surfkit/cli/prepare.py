@@ -6,14 +6,13 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from surfkit.cli.data import data_of
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
@@ -22,6 +21,7 @@ from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.prepare import Preparation, Prepared
 from surfkit.evaluate.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
+from surfkit.scene.data import Reading
 from surfkit.scene.depth_files import FOLDER, DepthFile, map_path
 from surfkit.scene.photos import read_photo
 from surfkit.scene.read import read
@@ -48,47 +48,15 @@ class Depth:
     again: bool = False
     """Estimate what is there already again, also with other settings."""
 
-    scale: float | None = None
-    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
-
-    longest: int | None = None
-    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
-
-    test_every: int = 8
-    """Keep every Nth photograph from training, as in `surfkit train`: priors must not have seen them."""
-
-    test_list: Path | None = None
-    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
-
-    model: Path | None = None
-    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
-
-    split: Literal["gauu-scene"] | None = None
-    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
-    numbers, k = n // ceil(n / 10)."""
-
-    test_data: Path | None = None
-    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
-    the test folder of MatrixCity as CityGaussian prepares it."""
-
-    images: Path | None = None
-    """Folder of the photographs, when it is not images/; relative to the data set."""
-
-    masks: Path | None = None
-    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
-
-    layout: str | None = None
-    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
-
-    white: bool = False
-    """Lay transparent pixels of photographs over white instead of black."""
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    """How the data set is read."""
 
     device: Device = "auto"
     """Where to compute."""
 
     def run(self) -> None:
         """Estimate, and show what came out."""
-        data = data_of(self.data, self)
+        data = self.reading.of(self.data)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
         if notice := self.estimator.notice():

@@ -7,13 +7,12 @@ import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 import surfkit
 from surfkit.blocks import Hands
-from surfkit.cli.data import data_of
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -25,6 +24,7 @@ from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
+from surfkit.scene.data import Reading
 from surfkit.train.material import Store
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
@@ -63,43 +63,8 @@ class Train:
     """Length of the run. Every schedule of the recipe is scaled along, so that a short run is a small whole run. Raised
     later, the run goes on under the schedules of the new length."""
 
-    scale: float | None = None
-    """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
-
-    longest: int | None = None
-    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
-
-    test_every: int = 8
-    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none."""
-
-    test_list: Path | None = None
-    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
-
-    model: Path | None = None
-    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
-
-    split: Literal["gauu-scene"] | None = None
-    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
-    numbers, k = n // ceil(n / 10)."""
-
-    test_data: Path | None = None
-    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
-    the test folder of MatrixCity as CityGaussian prepares it."""
-
-    images: Path | None = None
-    """Folder of the photographs, when it is not images/; relative to the data set."""
-
-    masks: Path | None = None
-    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
-
-    layout: str | None = None
-    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
-
-    white: bool = False
-    """Lay transparent pixels of photographs over white instead of black."""
-
-    metres_per_unit: float | None = None
-    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    """How the data set is read."""
 
     device: Device = "auto"
     """Where to compute."""
@@ -144,7 +109,7 @@ class Train:
 
     def run(self) -> None:
         """Train, and show what came out."""
-        data = data_of(self._data(), self)
+        data = self.reading.of(self._data())
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():

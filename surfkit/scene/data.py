@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,13 +17,9 @@ LONGEST = 1600
 """Default for the longest side of a photograph, pixels."""
 
 
-@dataclass(frozen=True)
-class Data:
-    """A data set and how to use it."""
-
-    path: Annotated[Path, tyro.conf.arg(name="data")]
-    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
-    another layout that `surfkit components reader` lists."""
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How a data set is read: at which size, from which of its files, and what is kept from training."""
 
     scale: float | None = None
     """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
@@ -102,6 +98,19 @@ class Data:
             what = f"--test-list {self.test_list}" if self.test_list else what
             raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
         return chosen
+
+    def of(self, path: Path) -> Data:
+        """The data set at `path`, read so."""
+        return Data(path, **{field.name: getattr(self, field.name) for field in fields(Reading)})
+
+
+@dataclass(frozen=True)
+class Data(Reading):
+    """A data set and how it is read."""
+
+    path: Annotated[Path, tyro.conf.arg(name="data")]
+    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
+    another layout that `surfkit components reader` lists."""
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
