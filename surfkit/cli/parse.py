@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from dataclasses import is_dataclass
+from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
 from surfkit.cli.recipes import ARGV
 from surfkit.cli.slots import WHOLE, choices_first, explain_choice, slots
 from surfkit.core.check import BadInput
+from surfkit.core.registry import Component
+from surfkit.recipe import Recipe
 
 T = TypeVar("T")
 
@@ -105,12 +109,26 @@ def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequ
     if not word.startswith("-"):
         return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
     flag = word.partition("=")[0]
+    if plain := difflib.get_close_matches(flag, list(_plain_flags(command)), n=2, cutoff=0.75):
+        return f"no option {flag}; perhaps you meant {' or '.join(plain)}"
     similar = [line.strip() for section in more if _about(flag, section[0].strip()) for line in section[1:]]
     near = list(dict.fromkeys(found[0] for line in similar if (found := _FLAG.match(line))))
     owners = dict.fromkeys(re.findall(r"(\S+:\S+) --help", " ".join(_entry(flag, similar))))
     if owners:
         return f"{flag} does not apply here; it belongs to {' or '.join(list(owners)[:3])}, which is not chosen"
     return f"no option {flag}; " + (f"perhaps you meant {' or '.join(near[:3])}" if near else f"see {prog} --help")
+
+
+def _plain_flags(command: type) -> Iterator[str]:
+    """The flags of a command itself; tyro puts those of its parts first, as they stand in every recipe."""
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        kind, marks = (get_args(hint)[0], get_args(hint)[1:]) if get_origin(hint) is Annotated else (hint, ())
+        if tyro.conf.Positional in marks or tyro.conf.Suppress in marks:
+            continue
+        if not is_dataclass(kind):
+            yield f"--{name.replace('_', '-')}"
+        elif not issubclass(kind, (Component, Recipe)):
+            yield from _plain_flags(kind)
 
 
 def _outermost(lines: list[str]) -> list[str]:

@@ -79,6 +79,7 @@ def test_words_that_do_not_fit(farm, capsys):
         (["--points", "0"], "--points 0: give 1 or more"),
         (["recipe:none"], "no recipe named 'none'"),
         (["--scale", "0.5"], "--scale 0.5"),
+        (["--scal", "4"], "no option --scal; perhaps you meant --scale"),
         (["--pretrain.stepz", "3"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
         (["pretrain.densify:nothing"], "'nothing'"),
     ):
