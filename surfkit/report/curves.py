@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -16,20 +17,41 @@ DOTS = 300
 """A line has no more of them; each is the mean over the steps since the one before."""
 
 
-def curve(out: Path, what: What, block: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(T,) steps and (T,) numbers of a run: of its first stage, or of a block. Memory in GB.
+@dataclass(frozen=True)
+class Place:
+    """A part of a run whose steps are counted on their own.
+
+    Attributes:
+        kind: "block" or "refinement".
+        index: Which one, counted from 0.
+    """
+
+    kind: Literal["block", "refinement"]
+    index: int
+
+    def folder(self, out: Path) -> Path:
+        """Where its journal lies.
+
+        Raises:
+            BadInput: It is not begun.
+        """
+        before = {"block": "blocks/", "refinement": "refine"}[self.kind]
+        found = {int(path.name.removeprefix("refine")): path for path in out.glob(f"{before}[0-9]*")}
+        if self.index not in found:
+            there = f"there are {min(found)} to {max(found)}" if found else "none is"
+            raise BadInput(f"{out}: no {self.kind} {self.index} is begun; {there}")
+        return found[self.index]
+
+
+def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) steps and (T,) numbers of a run: of its first stage, or of one of its parts. Memory in GB.
 
     Raises:
-        BadInput: There is no such run or block, or it has made no step.
+        BadInput: There is no such run or part, or it has made no step.
     """
     if not (out / "recipe.json").exists():
         raise BadInput(f"{out}: no run folder (no recipe.json in it); name one that surfkit train made")
-    folder = out if block is None else out / "blocks" / f"{block:03}"
-    if block is not None and not folder.is_dir():
-        there = sorted(int(path.name) for path in (out / "blocks").glob("[0-9]*"))
-        raise BadInput(
-            f"{out}: no block {block} is begun; {f'there are {there[0]} to {there[-1]}' if there else 'none is'}"
-        )
+    folder = out if place is None else place.folder(out)
     done = [line for line in journal.read(folder / journal.NAME) if line["event"] == "StepDone"]
     try:
         rows = np.array([(line["index"], _number(line, what)) for line in done], dtype=np.float64)
@@ -42,13 +64,13 @@ def curve(out: Path, what: What, block: int | None = None) -> tuple[np.ndarray, 
     return steps, values
 
 
-def lines(outs: tuple[Path, ...], what: What, block: int | None = None) -> list[Line]:
+def lines(outs: tuple[Path, ...], what: What, place: Place | None = None) -> list[Line]:
     """A line for each run, named after its folder."""
     if not outs:
         raise BadInput("curves: name one or more run folders")
     found = []
     for at, out in enumerate(outs):
-        steps, values = curve(out, what, block)
+        steps, values = curve(out, what, place)
         found.append(Line(out.resolve().name, steps, values, COLORS[at % len(COLORS)]))
     return found
 

@@ -12,10 +12,12 @@ from surfkit.evaluate.chart import BLUE, LEFT, ORANGE, RIGHT, SIZE, round_above
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run of 1,000 steps with as many points as steps made, and a block of 10 steps with 50 points."""
+    """A run of 1,000 steps with as many points as steps made, a block of 10 steps with 50 points, a refinement of 5."""
     (tmp_path / "blocks" / "000").mkdir(parents=True)
+    (tmp_path / "refine0").mkdir()
     (tmp_path / "recipe.json").write_text("{}")
-    for where, steps, points in ((tmp_path, 1_000, None), (tmp_path / "blocks" / "000", 10, 50)):
+    parts = ((tmp_path, 1_000, None), (tmp_path / "blocks" / "000", 10, 50), (tmp_path / "refine0", 5, 40))
+    for where, steps, points in parts:
         lines = [
             {
                 "event": "StepDone",
@@ -51,7 +53,22 @@ def test_blocks_and_several_runs(folder, tmp_path, capsys):
     assert rows.max() - rows.min() <= 3 and round_above(1.5) == 2.0
 
 
-@pytest.mark.parametrize("words", [["/nowhere"], [], ["RUN", "--block", "7"], ["RUN", "--of", "memory"]])
+def test_a_refinement(folder, tmp_path, capsys):
+    assert main(["curves", str(folder), "--refinement", "0", "--out", str(tmp_path / "c.png")]) == 0
+    assert capsys.readouterr().out.count("40") == 3
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["/nowhere"],
+        [],
+        ["RUN", "--block", "7"],
+        ["RUN", "--refinement", "1"],
+        ["RUN", "--refinement", "0", "--block", "0"],
+        ["RUN", "--of", "memory"],
+    ],
+)
 def test_what_cannot_be_drawn(folder, tmp_path, capsys, words):
     words = [str(folder) if word == "RUN" else word for word in words]
     assert main(["curves", *words, "--out", str(tmp_path / "c.png")]) == 2
