@@ -123,12 +123,14 @@ def _plain_flags(command: type) -> Iterator[str]:
     """The flags of a command itself; tyro puts those of its parts first, as they stand in every recipe."""
     for name, hint in get_type_hints(command, include_extras=True).items():
         kind, marks = (get_args(hint)[0], get_args(hint)[1:]) if get_origin(hint) is Annotated else (hint, ())
-        if tyro.conf.Positional in marks or tyro.conf.Suppress in marks:
+        if {tyro.conf.Positional, tyro.conf.Suppress} & set(marks):
+            continue  # no flag
+        if isinstance(kind, type) and issubclass(kind, (Component, Recipe)):
             continue
-        if not is_dataclass(kind):
-            yield f"--{name.replace('_', '-')}"
-        elif not issubclass(kind, (Component, Recipe)):
+        if is_dataclass(kind):
             yield from _plain_flags(kind)
+        else:
+            yield f"--{name.replace('_', '-')}"
 
 
 def _outermost(lines: list[str]) -> list[str]:
