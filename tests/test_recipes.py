@@ -88,6 +88,12 @@ def test_citygs2_t_begins_its_blocks_from_the_first_7000_steps_of_the_same_pretr
     assert tiny.pretrain.densify == whole.pretrain.densify
 
 
+def test_citygs2_short_goes_on_at_the_pace_of_pretraining():
+    whole, short = recipes()["citygs2"], recipes()["citygs2-short"]
+    assert short.pretrain == whole.pretrain and short.tune.rates == short.pretrain.rates != whole.tune.rates
+    assert replace(short.tune, rates=whole.tune.rates, prune=whole.tune.prune) == whole.tune and not short.tune.prune
+
+
 def test_citygs2_for_streets():
     street, at = recipes()["citygs2-street"], {}
     for part in ("pretrain", "tune"):

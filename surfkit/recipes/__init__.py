@@ -88,6 +88,7 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "citygs": city.FIRST,
         "citygs2-coarse": city.COARSE,
         "citygs2": city.CITY,
+        "citygs2-short": city.SHORT,
         "citygs2-s": city.SMALL,
         "citygs2-t": city.TINY,
         "citygs2-aerial": city.AERIAL,

@@ -67,6 +67,13 @@ CITY = replace(
     ),
 )
 
+# After 4,000 steps, blocks at reduced rates lag behind; after 12,000, the two had come to the same.
+SHORT = replace(
+    CITY,
+    about="CityGaussianV2 for runs of a few thousand steps: blocks keep the rates of pretraining and are not trimmed",
+    tune=replace(CITY.tune, prune=(), rates=RATES),
+)
+
 SMALL = replace(
     CITY,
     about="CityGaussianV2, small: colours of degree 2, a third fewer numbers a point",
