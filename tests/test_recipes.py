@@ -1,5 +1,7 @@
 """The recipes say what was published."""
 
+from dataclasses import replace
+
 import pytest
 
 from surfkit.cli.recipes import recipes
@@ -52,8 +54,6 @@ def test_no_steps_are_refused():
 
 
 def test_citygs2_coarse_is_the_last_row_of_the_upper_half_of_the_ablation_table():
-    from dataclasses import replace
-
     from surfkit.recipes.ablations import MODEL
     from surfkit.report.ablation import build
 
