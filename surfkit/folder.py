@@ -204,7 +204,8 @@ def refuse_other(this: Run) -> None:
     if isinstance(there, dict):
         there |= {"mesh": now["mesh"]}  # training is the same
         before = there.get("refine")
-        if isinstance(before, list) and difference(before, now["refine"][: len(before)]) is None:
+        prefix = isinstance(before, list) and difference(before, now["refine"][: len(before)]) is None
+        if prefix and there.get("pretrain") == now["pretrain"]:
             there |= {"refine": now["refine"]}  # the model that is there can be refined further
     found = None if there is None else difference(there, now)
     if found and not (found := longer(this, there)):

@@ -95,10 +95,11 @@ def plan(sight: Sight, partition: Partition, assign: Assign, fewest: Fewest | No
 
 def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:
     """What there is to say of every block, from (V, B) views that join and that stand inside."""
-    points = torch.bincount(cells.owner(sight.splats.means), minlength=cells.count)
+    owner = cells.owner(sight.splats.means)
+    points = torch.bincount(owner, minlength=cells.count)
     work = (joins * sight.pixels[:, None]).sum(0) * points
     share = (work / work.sum().clamp_min(1)).tolist()
-    names, owner = [view.name for view in sight.views], cells.owner(sight.splats.means)
+    names = [view.name for view in sight.views]
     return tuple(
         Block(
             index,

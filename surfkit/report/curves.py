@@ -36,7 +36,8 @@ class Place:
             BadInput: It is not begun.
         """
         before = {"block": "blocks/", "refinement": "refine"}[self.kind]
-        found = {int(path.name.removeprefix("refine")): path for path in out.glob(f"{before}[0-9]*")}
+        names = {path: path.name.removeprefix("refine") for path in out.glob(f"{before}[0-9]*")}
+        found = {int(name): path for path, name in names.items() if name.isdecimal()}
         if self.index not in found:
             there = f"there are {min(found)} to {max(found)}" if found else "none is"
             raise BadInput(f"{out}: no {self.kind} {self.index} is begun; {there}")

@@ -41,7 +41,7 @@ class Reading:
     """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
 
     layout: str | None = None
-    """How the data set is laid out; recognised by its files if left out."""
+    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
 
     white: bool = False
     """Lay transparent pixels of photographs over white instead of black."""

@@ -11,10 +11,11 @@ import pytest
 import torch
 
 from surfkit.cli.recipes import recipes
+from surfkit.core.memory import size
 from surfkit.core.tree import evolve
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
-from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, one_digit, size
+from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, one_digit
 from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, beyond, forecast, schedule, within
 from surfkit.doctor.growth import Growth, growth

@@ -15,6 +15,7 @@ def folder(tmp_path):
     """A run of 1,000 steps with as many points as steps made, a block of 10 steps with 50 points, a refinement of 5."""
     (tmp_path / "blocks" / "000").mkdir(parents=True)
     (tmp_path / "refine0").mkdir()
+    (tmp_path / "refine0-copy").mkdir()  # somebody's own
     (tmp_path / "recipe.json").write_text("{}")
     parts = ((tmp_path, 1_000, None), (tmp_path / "blocks" / "000", 10, 50), (tmp_path / "refine0", 5, 40))
     for where, steps, points in parts:
