@@ -200,11 +200,12 @@ def test_a_finished_run_is_refined_further(finished, data, recipe, tmp_path):
     assert metrics["steps"] == 6 + 6 + 4 + 6
 
 
-def test_longer_and_refined_at_once_is_refused(finished, data, recipe):
+def test_longer_and_refined_at_once_is_refused(data, tmp_path):
     """Of the two, the message names the refinement: it is what the folder lacks."""
-    longer = with_steps(replace(recipe, refine=(*recipe.refine, Recover())), 12)
-    with pytest.raises(BadInput, match=r"refine\.2 null"):
-        run(longer, data, finished, Hands("cpu"), EVERY)
+    plain = Recipe(pretrain=Stage(steps=2, sh_every=1))
+    run(plain, data, tmp_path, Hands("cpu"), EVERY)
+    with pytest.raises(BadInput, match=r"refine\.0 null"):
+        run(with_steps(replace(plain, refine=(Recover(),)), 4), data, tmp_path, Hands("cpu"), EVERY)
 
 
 def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
