@@ -102,10 +102,11 @@ def _reworded(message: str) -> str:
 def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequence[str], prog: str) -> str | None:
     """What to do about words that have no place. Only the first is named; the next may be its value."""
     message = re.sub(r"\(applied to [^)]*\)", "", message.partition("Arguments are applied")[0])
-    unplaced = [word for word in argv if re.search(rf"(?<!\S){re.escape(word)}(?=[\s,]|$)", message)]
+    found = {word: re.search(rf"(?<!\S){re.escape(word)}(?=[\s,]|$)", message) for word in argv}
+    unplaced = {word: at.start() for word, at in found.items() if at}
     if not unplaced:
         return None
-    word = unplaced[0]
+    word = min(unplaced, key=unplaced.__getitem__)  # not by their order in argv: a value may stand there twice
     if not word.startswith("-"):
         return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
     flag = word.partition("=")[0]

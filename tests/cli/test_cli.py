@@ -98,6 +98,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ),
         ([*OK, "tune:stag"], "no tune named 'stag'; did you mean 'stage'? known: stage, none"),
         ([*OK, "stray"], "unexpected 'stray'; settings are given as --NAME VALUE"),
+        ([*OK, "--pretrain.steps", "3", "--zzzzzz", "3"], "no option --zzzzzz; see surfkit train --help"),
         ([*OK, "--devic", "cpu"], "no option --devic; perhaps you meant --device"),
         ([*OK, "--pretrain.stepz", "3"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
         ([*OK, "--pretrain.stepz=3", "--dat", "x"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
