@@ -42,11 +42,14 @@ class Estimate:
         inverse: (h, w) float32 inverse camera z, 1/local units if the estimator is `aligned`; 0 where there is none.
             None where the photograph gives nothing to work from.
         confidence: (h, w) float32 in [0, 1].
+        normal: (3, h, w) float32 unit normals of the surface in the camera's axes, towards the camera; 0 where there is
+            none. None from estimators that give no normals.
     """
 
     at: int
     inverse: Tensor | None
     confidence: Tensor | None
+    normal: Tensor | None = None
 
 
 class DepthEstimator(Component):

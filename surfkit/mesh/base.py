@@ -13,6 +13,7 @@ import torch
 
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
 
 
@@ -48,6 +49,7 @@ class Subject:
         generator: Of every random draw.
         scratch: Folder for large temporary files, which the mesher deletes; None for the system's own.
         keep: (H, W) bool mask of a view by its position, or None for all of it; false where nothing is to be fused.
+        priors: Estimated depths by position, where the data set has any.
     """
 
     splats: Splats
@@ -60,6 +62,7 @@ class Subject:
     generator: torch.Generator = field(default_factory=torch.Generator)
     scratch: Path | None = None
     keep: Callable[[int], torch.Tensor | None] = lambda at: None
+    priors: Sequence[DepthPrior | None] | None = None
 
 
 class Mesher(Component):

@@ -35,11 +35,14 @@ class DepthPrior:
         inverse: (H, W) float32 inverse camera z, 1/local units; 0 where there is none.
         confidence: (H, W) float32 in [0, 1]; 0 where there is none.
         typical: Inverse depth that is typical of the data set, 1/local units.
+        normal: (3, H, W) float32 unit normals of the surface in the camera's axes, towards the camera; 0 where there is
+            none. None where the data set has no normals.
     """
 
     inverse: Tensor
     confidence: Tensor
     typical: float
+    normal: Tensor | None = None
 
 
 Priors = Cache["DepthPrior | None"]
