@@ -2,9 +2,10 @@
 
 from surfkit.core.registry import hookimpl
 from surfkit.depth.depth_anything import DepthAnythingV2
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 
 
 @hookimpl
 def surfkit_components():
-    return {"plane-sweep": PlaneSweep, "depth-anything-v2": DepthAnythingV2}
+    return {"patch-match": PatchMatch, "plane-sweep": PlaneSweep, "depth-anything-v2": DepthAnythingV2}

@@ -9,6 +9,7 @@
 #include <optional>
 #include <string>
 
+#include "../../depth/cpu/bind.h"
 #include "../../mesh/cpu/bind.h"
 #include "pass.h"
 #include "pool.h"
@@ -180,4 +181,5 @@ NB_MODULE(_native, m) {
     });
 
     add_mesh(m);
+    add_stereo(m);
 }

@@ -1,0 +1,96 @@
+// What Python sees of the stereo: arrays are checked in depth/native.py, which alone calls this.
+#include "bind.h"
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "../../raster/cpu/pool.h"
+#include "stereo.h"
+
+namespace nb = nanobind;
+
+namespace surfkit {
+namespace {
+
+using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Words = nb::ndarray<const uint32_t, nb::c_contig, nb::device::cpu>;
+
+const StereoKernels& named(const std::string& name) {
+#if defined(SURFKIT_X86)
+    if (name == "avx512") return stereo_kernels_avx512();
+    if (name == "avx2") return stereo_kernels_avx2();
+#endif
+    return stereo_kernels_baseline();
+}
+
+}  // namespace
+
+void add_stereo(nb::module_& m) {
+    m.def(
+        "patch_match",
+        [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Words> pixels, std::vector<std::vector<double>> ways,
+           std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
+           nb::ndarray<float, nb::c_contig, nb::device::cpu> cost,
+           nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int best, bool survey,
+           uint32_t seed, const std::string& kernels, int threads) {
+            std::vector<StereoSource> sources(pixels.size());
+            for (size_t i = 0; i < pixels.size(); i++) {
+                StereoSource& s = sources[i];
+                s.pixels = pixels[i].data();
+                s.height = (int)pixels[i].shape(0);
+                s.width = (int)pixels[i].shape(1);
+                const std::vector<double>& way = ways.at(i);
+                for (int j = 0; j < 9; j++) s.a[j] = (float)way.at(j), s.back_a[j] = (float)way.at(12 + j);
+                for (int j = 0; j < 3; j++) s.b[j] = (float)way.at(9 + j), s.back_b[j] = (float)way.at(21 + j);
+                const std::optional<Floats>& map = inverse.at(i);
+                s.inverse = map ? map->data() : nullptr;
+                s.inverse_height = map ? (int)map->shape(0) : 0;
+                s.inverse_width = map ? (int)map->shape(1) : 0;
+                s.to_inverse[0] = (float)s.inverse_width / (float)s.width;
+                s.to_inverse[1] = (float)s.inverse_height / (float)s.height;
+            }
+            StereoJob job{};
+            job.image = image.data();
+            job.height = (int)cost.shape(0);
+            job.width = (int)cost.shape(1);
+            job.fx = (float)lens.at(0), job.fy = (float)lens.at(1), job.cx = (float)lens.at(2), job.cy = (float)lens.at(3);
+            job.offset_x = pattern.data(), job.offset_y = pattern.data() + kSamples, job.nearness = pattern.data() + 2 * kSamples;
+            job.sources = sources.data();
+            job.views = (int)sources.size();
+            job.plane = plane.data();
+            job.cost = cost.data();
+            job.each = each.data();
+            job.low = (float)settings.at(0), job.high = (float)settings.at(1);
+            job.parallax = (float)settings.at(2);
+            job.jitter_px = (float)settings.at(3);
+            job.smoothness = (float)settings.at(4);
+            job.consistency = (float)settings.at(5);
+            job.spread = (float)settings.at(6);
+            job.best = best;
+            job.survey = survey;
+            job.seed = seed;
+            const StereoKernels& k = named(kernels);
+            const int rows = 4;
+            nb::gil_scoped_release free;
+            for (int colour = 0; colour < 2; colour++)
+                parallel((job.height + rows - 1) / rows, threads, [&](int64_t piece) {
+                    for (int row = (int)piece * rows; row < std::min(job.height, (int)(piece + 1) * rows); row++)
+                        k.improve(job, row, colour);
+                });
+        },
+        nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("inverse"), nb::arg("plane"),
+        nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
+        nb::arg("threads"));
+    m.attr("STEREO_SAMPLES") = kSamples;
+    m.attr("STEREO_RADIUS") = kRadius;
+    m.attr("STEREO_MOST_VIEWS") = kMostViews;
+}
+
+}  // namespace surfkit

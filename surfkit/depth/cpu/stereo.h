@@ -1,0 +1,57 @@
+// PatchMatch stereo: planes of a picture that are tried against other pictures.
+#pragma once
+
+#include <cstdint>
+
+namespace surfkit {
+
+constexpr int kSamples = 32;   // pixels of a window that are compared
+constexpr int kRadius = 8;     // most pixels from the middle of a window to its border
+constexpr int kMostViews = 16; // that one picture is compared with
+
+// A picture to compare with. A pixel (x, y) of inverse depth w falls on the pixel a (x, y, 1) + b w of it, over the third
+// component; pixels are numbered from the middle of the first one.
+struct StereoSource {
+    const uint32_t* pixels;  // four bytes: a grey value, and those to the right, below, and below to the right
+    int width, height;
+    float a[9], b[3];
+    // Inverse depths of that picture, for geometric consistency, or null; and the way back.
+    const float* inverse;
+    int inverse_width, inverse_height;
+    float to_inverse[2];  // from pixels of the picture to pixels of the map
+    float back_a[9], back_b[3];
+};
+
+// State and settings of one picture. A plane is an inverse depth and its slopes: in the picture, inverse depth is linear on
+// a plane.
+struct StereoJob {
+    const float* image;  // height + 2 kRadius rows of width + 2 kRadius grey values in [0, 255]
+    int width, height;
+    float fx, fy, cx, cy;
+    const float *offset_x, *offset_y, *nearness;  // kSamples pixels of a window and their weights; whole numbers
+    const StereoSource* sources;
+    int views;
+    float* plane;    // (height, width, 3) inverse depth, change per pixel to the right, per pixel down
+    float* cost;     // (height, width)
+    uint8_t* each;   // (height, width, views) costs of the present plane by view, 255 for 1 and worse
+    float low, high;     // inverse depths
+    float parallax;      // pixels by which a picture moves, a unit of inverse depth
+    float jitter_px;     // by which planes are changed at random
+    float smoothness;    // cost of a difference of one pixel of parallax from the neighbours
+    float consistency;   // cost of a reprojection error of one pixel
+    float spread;        // difference of grey values at which a pixel of the window counts 1 / e
+    int best;            // views that count
+    bool survey;         // look at all views anew, to choose those that count
+    uint32_t seed;
+};
+
+struct StereoKernels {
+    // Improve the planes of the pixels of a row whose x + y has the parity of `colour`.
+    void (*improve)(const StereoJob&, int row, int colour);
+};
+
+const StereoKernels& stereo_kernels_baseline();
+const StereoKernels& stereo_kernels_avx2();
+const StereoKernels& stereo_kernels_avx512();
+
+}  // namespace surfkit

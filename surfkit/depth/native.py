@@ -1,0 +1,176 @@
+"""The compiled PatchMatch: planes of a picture that are tried against other pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.raster.native import module
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Grey:
+    """A camera and the grey values that it saw.
+
+    Attributes:
+        camera: At the size of the picture.
+        value: (H, W) uint8.
+    """
+
+    camera: Camera
+    value: np.ndarray
+
+    def packed(self) -> np.ndarray:
+        """(H, W) uint32: a pixel, and those to the right, below, and below to the right, which interpolate it."""
+        wide = np.pad(self.value, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
+        return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
+
+    def padded(self) -> np.ndarray:
+        """(H + 2 r, W + 2 r) float32, continued by the radius of the windows."""
+        return np.pad(self.value, module().STEREO_RADIUS, mode="edge").astype(np.float32)
+
+
+@dataclass
+class Planes:
+    """A plane for each pixel of a picture, to be improved.
+
+    Attributes:
+        value: (H, W, 3) float32 inverse depth, and its change from a pixel to the next to the right and below.
+        cost: (H, W) float32 of matching, smoothness and consistency.
+        each: (H, W, V) uint8 costs by view, 255 is 1 and more.
+    """
+
+    value: np.ndarray
+    cost: np.ndarray
+    each: np.ndarray
+
+    @classmethod
+    def at(cls, inverse: np.ndarray, views: int) -> Planes:
+        """Planes that face the camera, of these (H, W) inverse depths."""
+        value = np.zeros((*inverse.shape, 3), np.float32)
+        value[..., 0] = inverse
+        return cls(value, np.full(inverse.shape, 2, np.float32), np.full((*inverse.shape, views), 255, np.uint8))
+
+    def resized(self, height: int, width: int) -> Planes:
+        """The same planes at another size."""
+        old_height, old_width = self.cost.shape
+        x, y = (np.arange(width) + 0.5) * old_width / width - 0.5, (np.arange(height) + 0.5) * old_height / height - 0.5
+        at_x, at_y = np.rint(x).astype(int).clip(0, old_width - 1), np.rint(y).astype(int).clip(0, old_height - 1)
+        value = self.value[at_y[:, None], at_x].copy()
+        value[..., 0] += value[..., 1] * (x - at_x) + value[..., 2] * (y - at_y)[:, None]
+        value[..., 1] *= old_width / width
+        value[..., 2] *= old_height / height
+        rows = at_y[:, None], at_x
+        return Planes(value, self.cost[rows].copy(), self.each[rows].copy())
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What makes a plane good, and how far one is changed.
+
+    Attributes:
+        low: Least inverse depth.
+        high: Greatest inverse depth.
+        parallax: Pixels by which a picture moves, a unit of inverse depth.
+        jitter_px: Parallax by which planes are changed at random.
+        smoothness: Cost of a difference of one pixel of parallax from the neighbours.
+        consistency: Cost of a reprojection error of one pixel.
+        spread: Difference of grey values, of 255, at which a pixel of the window counts 1 / e.
+        best: Views that count for a pixel.
+        window: Side of the windows compared, pixels; odd.
+    """
+
+    low: float
+    high: float
+    parallax: float
+    jitter_px: float
+    smoothness: float
+    consistency: float
+    spread: float
+    best: int
+    window: int
+    survey: bool = True
+
+
+def improve(
+    here: Grey,
+    others: Sequence[Grey],
+    planes: Planes,
+    terms: Terms,
+    seed: int,
+    known: Sequence[np.ndarray | None] | None = None,
+) -> None:
+    """One pass over both colours of the checkerboard, in place; no number of threads changes a bit.
+
+    Args:
+        here: The picture whose planes are sought.
+        others: To compare it with.
+        planes: At the size of the picture.
+        terms: See there.
+        seed: Of the random changes.
+        known: (h, w) float32 inverse depth of the others, for geometric consistency.
+    """
+    camera = here.camera
+    ways = [[*way(camera, other.camera), *way(other.camera, camera)] for other in others]
+    module().patch_match(
+        here.padded(),
+        [camera.fx, camera.fy, camera.cx, camera.cy],
+        pattern(terms.window),
+        [other.packed() for other in others],
+        ways,
+        list(known or [None] * len(others)),
+        planes.value,
+        planes.cost,
+        planes.each,
+        [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread],
+        terms.best,
+        terms.survey,
+        seed % 2**32,
+        module().kernels_in_use(),
+        torch.get_num_threads(),
+    )
+
+
+def require_native() -> None:
+    """BadInput where surfkit was installed without its compiled part."""
+    if module() is None:
+        raise BadInput(
+            "patch-match needs the compiled part of surfkit, and no C++ compiler was found when it was installed: install "
+            "GCC or Clang, then surfkit again, or take estimator:plane-sweep"
+        )
+
+
+def pattern(window: int) -> np.ndarray:
+    """(3, S) float32: x and y of the S pixels of a window that are compared, and their weights; 0 for unused ones.
+
+    As many as there is room for, those of an even coarser grid first, then those next to the middle.
+    """
+    room, half = module().STEREO_SAMPLES, window // 2
+    step = next(step for step in range(1, window) if len(range(-half, half + 1, step)) ** 2 <= room)
+    grid = [(x, y) for y in range(-half, half + 1, step) for x in range(-half, half + 1, step)]
+    more = [(x, y) for y in range(-half, half + 1) for x in range(-half, half + 1) if (x, y) not in grid]
+    chosen = np.array((grid + sorted(more, key=lambda at: at[0] ** 2 + at[1] ** 2))[:room], np.float32).T
+    found = np.zeros((3, room), np.float32)
+    found[:2, : chosen.shape[1]] = chosen
+    found[2, : chosen.shape[1]] = np.exp(-np.square(chosen).sum(0) / (2 * half**2))
+    return found
+
+
+def way(here: Camera, there: Camera) -> list[float]:
+    """A (3, 3) and b (3,) in a row: a pixel (x, y) of inverse depth w falls on A (x, y, 1) + b w, over its third.
+
+    Pixels are numbered from the middle of the first one.
+    """
+    turn = (there.world_to_camera @ torch.linalg.inv(here.world_to_camera)).numpy()
+    into, out = lens(there), np.linalg.inv(lens(here))
+    return [*(into @ turn[:3, :3] @ out).flatten().tolist(), *(into @ turn[:3, 3]).tolist()]
+
+
+def lens(camera: Camera) -> np.ndarray:
+    """(3, 3) from rays to pixels that are numbered from the middle of the first one."""
+    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])

@@ -1,0 +1,258 @@
+"""Stereo with a slanted plane for every pixel, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.consistency import agreement, at_edge
+from surfkit.depth.matching import ray_map
+from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
+from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.scene.camera import Camera
+from surfkit.scene.depth_files import save_array
+from surfkit.scene.photos import read_photo
+
+KEPT = 64
+"""Pictures and maps kept in memory."""
+JITTER_PX = (2.0, 1.0, 0.5, 0.25, 0.12)
+"""Parallax by which planes are changed at random, in one pass after the other."""
+
+
+@dataclass(frozen=True)
+class PatchMatch(DepthEstimator):
+    """PatchMatch stereo: slanted planes that neighbours hand on (Bleyer et al. 2011; checkerboard of Galliani et al. 2015).
+
+    The planes begin with a plane sweep of small pictures, and are improved from coarse to fine by photometric consistency,
+    in the views that match best at each pixel; then by the reprojection error in the depth maps of other views too (Xu and
+    Tao 2019). The time grows with the number of pixels.
+    """
+
+    aligned: ClassVar[bool] = True
+    matched: ClassVar[bool] = True
+
+    longest: int = 1600
+    """Longest side of a depth map in pixels; never more than that of the photograph."""
+
+    neighbours: int = 8
+    """Photographs that each one is compared with."""
+
+    angle: float = 8.0
+    """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
+
+    best: int = 3
+    """Photographs, of those compared, that count for a pixel: the ones that match best at it and around it."""
+
+    window: int = 7
+    """Side of the windows compared, pixels; odd. Smaller ones keep edges sharp, larger ones stand noise."""
+
+    spread: float = 0.12
+    """Difference of grey values, of 1, at which a pixel of a window counts 1 / e: windows end at edges."""
+
+    smoothness: float = 0.01
+    """Cost of a difference of one pixel of parallax between a plane and its neighbours; 1 is that of a wrong match."""
+
+    passes: int = 3
+    """Passes over the pixels at each size."""
+
+    consistency: float = 0.1
+    """Cost of one pixel of reprojection error in the depth maps of the photographs compared; 0 leaves that pass out."""
+
+    coarsest: int = 160
+    """Longest side of the pictures in which the planes begin, pixels."""
+
+    tolerance_px: float = 1.0
+    """Reprojection error, pixels, up to which the depth maps of two photographs agree."""
+
+    agree: int = 3
+    """Photographs whose depth maps must agree with a depth to trust it fully."""
+
+    edge: float = 0.01
+    """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
+
+    def __post_init__(self) -> None:
+        if self.window not in range(3, 18, 2):
+            raise BadInput(f"window is {self.window}; it must be an odd number of 3 to 17 pixels")
+        if not (1 <= self.neighbours <= 16 and 1 <= self.best <= self.neighbours and self.agree >= 1):
+            raise BadInput("neighbours must be 1 to 16, best 1 to neighbours, and agree 1 or more")
+        if not 1 <= self.passes <= len(JITTER_PX) or min(self.longest, self.coarsest) < 32:
+            raise BadInput(f"passes must be 1 to {len(JITTER_PX)}, longest and coarsest 32 pixels or more")
+        if not (min(self.angle, self.spread, self.tolerance_px) > 0 and min(self.smoothness, self.consistency) >= 0):
+            raise BadInput("angle, spread and tolerance_px must be above 0, smoothness and consistency 0 or more")
+        if not 0 < self.edge < 1:
+            raise BadInput(f"edge is {self.edge:g}; it must lie between 0 and 1")
+
+    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+        require_native()
+        work = Work(self, given, neighbours(given.views, given.observations, self.neighbours, self.angle))
+        for at in wanted:
+            found = work.consistent(at)
+            yield Estimate(at, None, None) if found is None else self.trusted(work, at, found)
+
+    def trusted(self, work: Work, at: int, found: Map) -> Estimate:
+        """What the maps of other photographs agree with, and the mean of what they say."""
+        camera = work.camera(at, 0)
+        others = [(work.camera(near, 0), other.inverse) for near in work.pairs[at] if (other := work.consistent(near))]
+        share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
+        count, fused = agreement(camera, found.inverse, others, share)
+        trust = (count / min(self.agree, max(1, len(others)))).clamp_max(1) * found.matched
+        trust[at_edge(found.inverse, self.window // 2, self.edge)] = 0
+        return Estimate(at, fused, trust, found.normals(camera))
+
+
+@dataclass(frozen=True)
+class Map:
+    """The planes of one photograph.
+
+    Attributes:
+        value: (H, W, 3) float32, see `Planes`.
+        matched: (H, W) float32 in [0, 1], how well they match.
+        parallax: Pixels by which the photographs move that it is compared with, a unit of inverse depth.
+    """
+
+    value: np.ndarray
+    matched: Tensor
+    parallax: float
+
+    @property
+    def inverse(self) -> Tensor:
+        """(H, W) inverse depth."""
+        return torch.from_numpy(np.ascontiguousarray(self.value[..., 0]))
+
+    def normals(self, camera: Camera) -> Tensor:
+        """(3, H, W) unit normals in the camera's axes, towards it: a plane is n . X = 1, and n . ray its inverse depth."""
+        w, gx, gy = torch.from_numpy(self.value).unbind(-1)
+        rays = camera.rays()
+        nx, ny = gx * camera.fx, gy * camera.fy
+        away = torch.stack([nx, ny, w - nx * rays[0] - ny * rays[1]])
+        return -away / away.norm(dim=0).clamp_min(1e-20)
+
+
+class Work:
+    """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work."""
+
+    def __init__(self, settings: PatchMatch, given: Material, pairs: list[list[int]]) -> None:
+        self.settings, self.given, self.pairs = settings, given, pairs
+        self.grey = lru_cache(KEPT * 3)(self._grey)
+        self.matched = lru_cache(KEPT)(self._matched)
+        self.consistent = lru_cache(KEPT)(self._consistent)
+        self.sweep = PlaneSweep(longest=settings.coarsest)
+        self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
+
+    def camera(self, at: int, level: int) -> Camera:
+        """Of a photograph at half the size, `level` times."""
+        whole = self.given.views[at].camera.fitted(self.settings.longest)
+        return whole.resized(max(1, round(whole.width / 2**level)), max(1, round(whole.height / 2**level)))
+
+    def levels(self, at: int) -> int:
+        """How often a photograph is halved before it is about as small as those the planes begin with."""
+        camera = self.camera(at, 0)
+        return max(0, round(np.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
+
+    def _grey(self, at: int, level: int) -> Grey:
+        camera = self.camera(at, level)
+        rgb = read_photo(self.given.views[at].path, (camera.width, camera.height)).to(torch.float32)
+        return Grey(camera, rgb.mean(0).round().to(torch.uint8).numpy())
+
+    def _matched(self, at: int) -> Map | None:
+        """By photometric consistency alone."""
+        return self.kept(f"{at:06d}.npy", lambda: self.match(at))
+
+    def _consistent(self, at: int) -> Map | None:
+        """By geometric consistency too."""
+        if not self.settings.consistency:
+            return self.matched(at)
+        return self.kept(f"{at:06d}-consistent.npy", lambda: self.reconcile(at))
+
+    def kept(self, name: str, make: Callable[[], Map | None]) -> Map | None:
+        """A map from the folder for work, where it is put if it is not there."""
+        path = self.given.work / name
+        if not path.exists():
+            made = make()
+            numbers = np.zeros(0, np.float32)
+            if made is not None:
+                flat = np.full((*made.matched.shape, 1), made.parallax, np.float32)
+                numbers = np.concatenate([made.value, made.matched.numpy()[..., None], flat], 2)
+            save_array(path, numbers)
+        numbers = np.load(path)
+        if not len(numbers):
+            return None
+        return Map(
+            np.ascontiguousarray(numbers[..., :3]), torch.from_numpy(numbers[..., 3].copy()), float(numbers[0, 0, 4])
+        )
+
+    def match(self, at: int) -> Map | None:
+        """Planes from coarse to fine."""
+        settings, others = self.settings, self.pairs[at]
+        span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
+        begun = self.sweep.sweep(self.given, at, self.small(at), [self.small(other) for other in others])
+        if span is None or begun is None:
+            return None
+        planes = Planes.at(begun[0].cpu().numpy(), len(others))
+        for level in range(self.levels(at), -1, -1):
+            camera = self.camera(at, level)
+            planes = planes.resized(camera.height, camera.width)
+            parallax = self.parallax(at, level, planes)
+            for index in range(settings.passes):
+                terms = self.terms(span, parallax, index)
+                here, there = self.grey(at, level), [self.grey(other, self.level(other, level)) for other in others]
+                improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
+        return self.map(planes, parallax)
+
+    def level(self, at: int, level: int) -> int:
+        return min(level, self.levels(at))
+
+    def reconcile(self, at: int) -> Map | None:
+        """One more pass, that also looks at the depth maps of the others."""
+        found = self.matched(at)
+        span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
+        if found is None or span is None:
+            return None
+        others = [(near, other) for near in self.pairs[at] if (other := self.matched(near)) is not None]
+        if not others:
+            return found
+        planes = Planes.at(np.zeros(found.matched.shape, np.float32), len(others))
+        planes.value[:] = found.value
+        known = [other.inverse.numpy() for _, other in others]
+        terms = self.terms(span, found.parallax, 2, self.settings.consistency)
+        improve(self.grey(at, 0), [self.grey(near, 0) for near, _ in others], planes, terms, at * 31 + 30, known)
+        return self.map(planes, found.parallax)
+
+    def terms(self, span: tuple[float, float], parallax: float, index: int, consistency: float = 0.0) -> Terms:
+        s = self.settings
+        return Terms(
+            low=span[0],
+            high=span[1],
+            parallax=parallax,
+            jitter_px=JITTER_PX[index],
+            smoothness=s.smoothness,
+            consistency=consistency,
+            spread=255 * s.spread,
+            best=s.best,
+            window=s.window,
+            survey=index in (0, 2),
+        )
+
+    def map(self, planes: Planes, parallax: float) -> Map:
+        best = np.sort(planes.each, 2)[..., : self.settings.best].mean(2)
+        return Map(planes.value, torch.from_numpy(1 - best.astype(np.float32) / 255), parallax)
+
+    def parallax(self, at: int, level: int, planes: Planes) -> float:
+        """Pixels by which the other photographs move, a unit of inverse depth, about the median of the planes."""
+        here, middle = self.camera(at, level), float(np.median(planes.value[..., 0]))
+        moves = []
+        for other in self.pairs[at]:
+            a, b = ray_map(here, self.camera(other, level), torch.device("cpu"))
+            ends = [a[:, ::16, ::16] + c * middle * b[:, None, None] for c in (0.98, 1.02)]
+            x, y = (ends[1][i] / ends[1][2] - ends[0][i] / ends[0][2] for i in range(2))
+            moves.append(float(torch.hypot(x, y).median()) / (0.04 * middle))
+        return float(np.mean(moves))
