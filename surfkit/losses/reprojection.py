@@ -1,0 +1,60 @@
+"""Rendered depths of two views that agree (PGSR, section 4.3, multi-view geometric consistency)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import Steps
+from surfkit.losses.base import Loss, Sample
+from surfkit.losses.two_views import agreement, round_trip, surface_depth
+from surfkit.raster.api import Maps
+
+
+@dataclass(frozen=True)
+class Reprojection(Loss):
+    """Pixels by which a point misses its own when it goes to a neighbouring view and back (PGSR, arXiv 2406.06521).
+
+    A pixel is taken to the neighbour over its rendered depth, and back over the neighbour's, which is held constant.
+    The loss is the mean of exp(-error) x error, the weight exp(-error) held constant, over the pixels that come back
+    nearer than `limit`; the others are taken for occluded. One more view is rendered in the steps that count.
+    """
+
+    reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median")
+    needs_neighbour: ClassVar[bool] = True
+
+    weight: float = 0.03
+    """Share in the objective of the steps that count, for errors in pixels."""
+
+    start: Steps = 7_000
+    """Steps without this term, as a surface must form first; 0 has it from the first step."""
+
+    every: int = 2
+    """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
+
+    limit: float = 1.0
+    """Errors of more pixels do not count."""
+
+    depth: Literal["median", "expected"] = "median"
+    """Which rendered depth is the surface, in both views."""
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.every < 1 or not self.limit > 0:
+            given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
+            raise BadInput(f"the reprojection loss has {given}; give 0 or more, 1 or more, and a limit above 0")
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return self.weight if index > self.start and index % self.every == 0 else 0.0
+
+    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+        depth, neighbour = surface_depth(maps, self.depth), sample.neighbour
+        if neighbour is None:
+            return 0 * depth.sum()
+        rays = sample.view.camera.rays(depth.dtype).flatten(1)
+        surface = surface_depth(neighbour.maps, self.depth)
+        error, valid = round_trip(depth.flatten(), rays, sample.view.camera, neighbour, surface)
+        weight, counts = agreement(error, valid, self.limit)
+        return (weight * error).sum() / counts.sum().clamp_min(1)
