@@ -80,8 +80,8 @@ def check_policy(policy: Policy, points: Points, step: Step) -> None:
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
     """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered, where no
-    depth and no normals are known beforehand and where no second view is; it uses no map but those it says it reads, and
-    its weight is 0 or more at any step.
+    depth and no normals are known beforehand, and where there is no second view; it uses no map but those it says it
+    reads, and its weight is 0 or more at any step.
 
     Args:
         loss: To check.

@@ -69,8 +69,8 @@ def round_trip(
         surface: (h, w) camera z in the second view, 0 where there is none.
 
     Returns:
-        (P,) distances in pixels, and (P,) bool where there is one: the neighbour sees the place, before it, with a depth
-        there, and not under its mask.
+        (P,) distances in pixels, and (P,) bool where there is one: the place lies before the neighbour and in its
+        picture, where it has a depth and no mask.
     """
     rotation, shift = motion(camera, neighbour.view.camera, depth.dtype)
     points = rotation @ (rays * depth) + shift
@@ -89,6 +89,6 @@ def round_trip(
 
 
 def agreement(error: Tensor, valid: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Weights exp(-error), constant, of the pixels that come back nearer than a limit in pixels, and which these are."""
+    """Constant weights exp(-error) of the pixels that come back nearer than a limit in pixels, and which these are."""
     counts = valid & (error.detach() < limit)
     return torch.where(counts, (-error.detach()).exp(), 0.0), counts
