@@ -10,7 +10,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps
 from surfkit.losses.base import Loss, Sample
-from surfkit.losses.two_views import agreement, round_trip, surface_depth
+from surfkit.losses.two_views import Opposite, agreement, round_trip, spread, surface_depth
 from surfkit.raster.api import Maps
 
 
@@ -32,8 +32,11 @@ class Reprojection(Loss):
     start: Steps = 7_000
     """Steps without this term, as a surface must form first; 0 has it from the first step."""
 
-    every: int = 2
+    every: int = 3
     """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
+
+    stride: int = 2
+    """One pixel at random is looked at in each square of so many pixels a side; 1 takes all."""
 
     limit: float = 1.0
     """Errors of more pixels do not count."""
@@ -42,9 +45,9 @@ class Reprojection(Loss):
     """Which rendered depth is the surface, in both views."""
 
     def __post_init__(self) -> None:
-        if self.weight < 0 or self.every < 1 or not self.limit > 0:
-            given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
-            raise BadInput(f"the reprojection loss has {given}; give 0 or more, 1 or more, and a limit above 0")
+        if self.weight < 0 or min(self.every, self.stride) < 1 or not self.limit > 0:
+            given = f"weight {self.weight:g}, every {self.every}, stride {self.stride}, limit {self.limit:g}"
+            raise BadInput(f"the reprojection loss has {given}; give 0 or more, twice 1 or more, and a limit above 0")
 
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight if index > self.start and index % self.every == 0 else 0.0
@@ -53,8 +56,11 @@ class Reprojection(Loss):
         depth, neighbour = surface_depth(maps, self.depth), sample.neighbour
         if neighbour is None:
             return 0 * depth.sum()
-        rays = sample.view.camera.rays(depth.dtype).flatten(1)
-        surface = surface_depth(neighbour.maps, self.depth)
-        error, valid = round_trip(depth.flatten(), rays, sample.view.camera, neighbour, surface)
+        height, width = depth.shape
+        camera = sample.view.camera
+        y, x = spread((height, width), self.stride, sample.seed)
+        at = y * width + x
+        rays = camera.rays(depth.dtype).flatten(1)[:, at]
+        error, valid = round_trip(depth.flatten()[at], rays, camera, Opposite.of(neighbour, self.depth))
         weight, counts = agreement(error, valid, self.limit)
         return (weight * error).sum() / counts.sum().clamp_min(1)

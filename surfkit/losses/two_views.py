@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -16,7 +17,7 @@ OPAQUE = 0.5
 """The expected depth counts as a surface where alpha is above this, as the median depth does."""
 WHOLE = 0.999
 """A bilinear sample counts if at least this share of it comes from pixels that count."""
-TINY = 1e-6
+TINY = 1e-4
 """Depths and inverse depths below this, in local units, are as good as none."""
 
 
@@ -25,6 +26,24 @@ def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:
     if which == "median":
         return maps.median
     return torch.where(maps.alpha > OPAQUE, maps.expected_depth(), 0.0)
+
+
+def spread(size: tuple[int, int], side: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Rows and columns, (K,) each, of one pixel at random in every square of a picture of (H, W) pixels.
+
+    None comes twice, so that no gradient is added up in an order that threads decide. Of the squares that reach over
+    the right and lower rim some have none, so that every pixel is as likely as any other.
+
+    Args:
+        size: (H, W).
+        side: Of the squares, pixels.
+        seed: Of the draw.
+    """
+    y, x = (torch.arange(0, length, side) for length in size)
+    draws = torch.randint(side, (2, len(y), len(x)), generator=torch.Generator().manual_seed(seed))
+    y, x = y[:, None] + draws[0], x[None] + draws[1]
+    inside = (y < size[0]) & (x < size[1])
+    return y[inside], x[inside]
 
 
 def motion(camera: Camera, other: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -53,39 +72,58 @@ def is_whole(counts: Tensor, at: Tensor) -> Tensor:
         return sampled(counts.to(at), at.detach()) > WHOLE
 
 
-def round_trip(
-    depth: Tensor, rays: Tensor, camera: Camera, neighbour: Neighbour, surface: Tensor
-) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class Opposite:
+    """The surface that a neighbour shows, as it is looked into from another view.
+
+    Attributes:
+        camera: Of the neighbour.
+        inverse: (h, w) inverse camera z, which is linear in the picture on a plane; 0 where there is none.
+        counts: (h, w) bool, where there is one that no mask hides.
+    """
+
+    camera: Camera
+    inverse: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, neighbour: Neighbour, which: Literal["median", "expected"]) -> Opposite:
+        """Of the median or the expected depth."""
+        surface = surface_depth(neighbour.maps, which)
+        there = surface > TINY
+        inverse = torch.where(there, 1 / torch.where(there, surface, 1.0), 0.0)
+        return cls(neighbour.view.camera, inverse, there if neighbour.mask is None else there & neighbour.mask)
+
+
+def round_trip(depth: Tensor, rays: Tensor, camera: Camera, opposite: Opposite) -> tuple[Tensor, Tensor]:
     """How far from itself a pixel comes back that goes to the neighbour's surface and from there to the first view.
 
-    The point of the pixel is projected into the neighbour; its depth there is read from the inverse depth of the
-    neighbour's surface, bilinearly, which is exact on planes; and that point is projected into the first view.
+    The point of the pixel is projected into the neighbour; its depth there is that of the neighbour's surface, sampled
+    bilinearly in the inverse, which is exact on planes; and that point is projected into the first view.
 
     Args:
         depth: (P,) camera z of the pixels in the first view, 0 where there is none. The way back depends on it too.
         rays: (3, P) directions of the pixels in the frame of the first view, with z = 1.
         camera: Of the first view.
-        neighbour: The second view.
-        surface: (h, w) camera z in the second view, 0 where there is none.
+        opposite: The second view.
 
     Returns:
         (P,) distances in pixels, and (P,) bool where there is one: the place lies before the neighbour and in its
         picture, where it has a depth and no mask.
     """
-    rotation, shift = motion(camera, neighbour.view.camera, depth.dtype)
+    lens = opposite.camera
+    rotation, shift = motion(camera, lens, depth.dtype)
     points = rotation @ (rays * depth) + shift
-    at = projected(neighbour.view.camera, points)
-    there = surface > TINY
-    inverse = sampled(torch.where(there, 1 / torch.where(there, surface, 1.0), 0.0), at)
-    counts = there if neighbour.mask is None else there & neighbour.mask
-    valid = (depth > TINY) & (points[2] > TINY) & is_whole(counts, at) & (inverse > TINY)
-    lens = neighbour.view.camera
+    at = projected(lens, points)
+    inverse = sampled(opposite.inverse, at)
+    valid = (depth > TINY) & (points[2] > TINY) & is_whole(opposite.counts, at) & (inverse > TINY)
     way = torch.stack([(at[0] - lens.cx) / lens.fx, (at[1] - lens.cy) / lens.fy, torch.ones_like(inverse)])
     back = rotation.T @ (way / torch.where(valid, inverse, 1.0) - shift)
     valid = valid & (back[2] > TINY)
     start = projected(camera, rays)
-    error = torch.where(valid, projected(camera, back) - start, 0.0)
-    return torch.linalg.vector_norm(error, dim=0), valid
+    square = (projected(camera, back) - start).square().sum(0)
+    apart = valid & (square > 0)  # no root of 0, whose slope is infinite
+    return torch.where(apart, torch.where(apart, square, 1.0).sqrt(), 0.0), valid
 
 
 def agreement(error: Tensor, valid: Tensor, limit: float) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,18 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps
 from surfkit.losses.base import Loss, Neighbour, Sample
-from surfkit.losses.two_views import TINY, agreement, is_whole, motion, projected, round_trip, sampled, surface_depth
+from surfkit.losses.two_views import (
+    TINY,
+    Opposite,
+    agreement,
+    is_whole,
+    motion,
+    projected,
+    round_trip,
+    sampled,
+    spread,
+    surface_depth,
+)
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 
@@ -44,7 +55,7 @@ class WarpedPatches(Loss):
     start: Steps = 7_000
     """Steps without this term, as a surface must form first; 0 has it from the first step."""
 
-    every: int = 2
+    every: int = 3
     """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
 
     pixels: int = 4_096
@@ -80,8 +91,8 @@ class WarpedPatches(Loss):
         rays = camera.rays(depth.dtype).flatten(1)[:, at]
         facing = -(normal * rays).sum(0) > GRAZING * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
         with torch.no_grad():
-            surface = surface_depth(neighbour.maps, self.depth)
-            weight, counts = agreement(*round_trip(z, rays, camera, neighbour, surface), self.limit)
+            opposite = Opposite.of(neighbour, self.depth)
+            weight, counts = agreement(*round_trip(z, rays, camera, opposite), self.limit)
         kept = (counts & facing & (normal != 0).any(0)).nonzero()[:, 0]
         plane = normal[:, kept] / ((normal[:, kept] * rays[:, kept]).sum(0) * z[kept])  # plane . point = 1
         found, inside = self.warped(plane, rays[:, kept], camera, neighbour)
@@ -91,10 +102,7 @@ class WarpedPatches(Loss):
         return nothing + terms.sum() / right.sum().clamp_min(1)
 
     def centres(self, sample: Sample) -> Tensor:
-        """(K,) flat positions of the central pixels: one at random in each cell of a grid, if all of its patch counts.
-
-        No position comes twice, so that no gradient is added up in an order that threads decide.
-        """
+        """(K,) flat positions of the central pixels, spread over the picture; all of their patches counts."""
         height, width = sample.photo.shape[1:]
         r = self.radius
         inner = (height - 2 * r, width - 2 * r)
@@ -103,13 +111,8 @@ class WarpedPatches(Loss):
         side = max(1, math.ceil(math.sqrt(inner[0] * inner[1] / self.pixels)))
         while math.ceil(inner[0] / side) * math.ceil(inner[1] / side) > self.pixels:
             side += 1
-        generator = torch.Generator().manual_seed(sample.seed)
-        y, x = (torch.arange(0, size, side) for size in inner)
-        draws = torch.randint(side, (2, len(y), len(x)), generator=generator)
-        y, x = y[:, None] + draws[0], x[None] + draws[1]
-        inside = (y < inner[0]) & (x < inner[1])
-        y, x = y[inside] + r, x[inside] + r
-        at = y * width + x
+        y, x = spread(inner, side, sample.seed)
+        at = (y + r) * width + x + r
         if sample.mask is None:
             return at
         return at[sample.mask.flatten()[at[:, None] + self.offsets(width)].all(1)]
