@@ -274,7 +274,8 @@ class Trainer:
         a run which goes on has the same ones.
         """
         found = self.rig.neighbours(shown, maps.median)
-        first = state.seed % max(1, len(found))
+        generator = torch.Generator().manual_seed(state.seed)
+        first = int(torch.randint(max(1, len(found)), (), generator=generator))
         for at in (*found[first:], *found[:first]):
             photo = None if at in state.skipped else self.photo(state, at, aside=True)
             if photo is None:

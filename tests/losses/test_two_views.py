@@ -181,7 +181,9 @@ def test_what_the_neighbour_does_not_see_does_not_count(loss):
     for way in ("occluded", "masked", "hole", "out of sight"):
         given, hidden = occluded(sample)
         if way == "masked":
-            given = replace(given, neighbour=replace(given.neighbour, mask=~hidden))
+            near = sample.neighbour.maps.median
+            wrong = replace(given.neighbour.maps, median=torch.where(hidden, 1.01 * near, near))
+            given = replace(given, neighbour=replace(given.neighbour, maps=wrong, mask=~hidden))
         elif way == "hole":
             holes = replace(given.neighbour.maps, median=torch.where(hidden, 0.0, sample.neighbour.maps.median))
             given = replace(given, neighbour=replace(given.neighbour, maps=holes))

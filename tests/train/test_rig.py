@@ -146,8 +146,18 @@ def test_a_second_view_is_another_one_and_constant(world):
         assert torch.equal((second.photo * 255).round().to(torch.uint8), trainer.photos[at])
         assert second.mask is masks[at]
     assert len({sample.seed for sample in Watched.given}) == 12
-    sides = {names.index(s.view.name) - names.index(n.view.name) for s, n in zip(Watched.given, seconds, strict=True)}
-    assert len(sides) > 1, "neighbours take turns"
+
+
+@pytest.mark.parametrize("every", [1, 2, 4])
+def test_all_good_neighbours_take_turns(world, every):
+    trainer, state = started(world, PAIRED)
+    splats = trainer.primitive.shape(state.points.params, 0)
+    maps = trainer.rasterizer.render(splats, trainer.views[7].camera, 0.005).maps
+    good = {trainer.views[at].name for at in trainer.rig.neighbours(7, maps.median)}
+    turns = [
+        trainer.neighbour(replace(state, index=at), splats, 7, maps).view.name for at in range(0, 24 * every, every)
+    ]
+    assert len(good) > 1 and set(turns) == good
 
 
 class Damaged(list):
