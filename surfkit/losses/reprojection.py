@@ -1,4 +1,4 @@
-"""Rendered depths of two views that agree (PGSR, section 4.3, multi-view geometric consistency)."""
+"""Rendered depths of two views that agree (PGSR, multi-view geometric consistency)."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Reprojection(Loss):
     limit: float = 1.0
     """Errors of more pixels do not count."""
 
-    depth: Literal["median", "expected"] = "median"
-    """Which rendered depth is the surface, in both views."""
+    depth: Literal["median", "expected"] = "expected"
+    """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
 
     def __post_init__(self) -> None:
         if self.weight < 0 or min(self.every, self.stride) < 1 or not self.limit > 0:

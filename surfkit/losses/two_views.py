@@ -1,4 +1,4 @@
-"""From a pixel of one view to another view and back, over the depth that both have rendered (PGSR, section 4.3)."""
+"""From a pixel of one view to another view and back, over the depth rendered in both (PGSR, arXiv 2406.06521)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs that agree over the rendered surface (PGSR, section 4.3, multi-view photometric consistency)."""
+"""Photographs that agree over the rendered surface (PGSR, multi-view photometric consistency)."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class WarpedPatches(Loss):
     limit: float = 1.0
     """Patches whose central pixel comes back from the neighbour with an error of more pixels do not count."""
 
-    depth: Literal["median", "expected"] = "median"
-    """Which rendered depth is the surface, in both views."""
+    depth: Literal["median", "expected"] = "expected"
+    """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
 
     def __post_init__(self) -> None:
         if self.weight < 0 or self.every < 1 or not self.limit > 0:

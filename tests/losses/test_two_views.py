@@ -15,7 +15,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
 HEIGHT, WIDTH, FOCAL = 36, 44, 60.0
-LOSSES = [Reprojection(stride=1), WarpedPatches()]
+LOSSES = [Reprojection(depth="median", stride=1), WarpedPatches(depth="median")]
 
 
 def pose(angle: float = 0.0, x: float = 0.0, y: float = 0.0) -> torch.Tensor:
@@ -86,9 +86,9 @@ def test_exact_depth_is_no_error(which):
 def test_the_error_of_a_frontal_plane_is_the_difference_of_the_disparities(factor):
     maps, sample = scene(BESIDE, FRONTAL)
     error = FOCAL * 0.1 / -OFFSET * abs(1 / factor - 1)
-    value = Reprojection(stride=1)(moved(maps, factor), sample).item()
+    value = Reprojection(depth="median", stride=1)(moved(maps, factor), sample).item()
     assert value == pytest.approx(math.exp(-error) * error, rel=1e-9)
-    limited = Reprojection(stride=1, limit=0.9 * error)(moved(maps, factor), sample)
+    limited = Reprojection(depth="median", stride=1, limit=0.9 * error)(moved(maps, factor), sample)
     assert limited.item() == 0, "all are taken for occluded"
 
 
@@ -107,7 +107,7 @@ def test_the_gradient_leads_to_the_true_normal():
     maps, sample = scene()
     for by in (-0.5, 0.5):
         leaf = tilted(maps, by).normal.requires_grad_()
-        WarpedPatches()(replace(maps, normal=leaf), sample).backward()
+        WarpedPatches(depth="median")(replace(maps, normal=leaf), sample).backward()
         assert leaf.grad[0].sum() * by > 0
 
 
@@ -134,7 +134,7 @@ def test_the_loss_is_that_of_constant_weights():
     rays, opposite = FIRST.rays(torch.float64).flatten(1), Opposite.of(sample.neighbour, "median")
     weight, counts = agreement(*round_trip(maps.median.flatten(), rays, FIRST, opposite), 1.0)
     leaf = maps.median.clone().requires_grad_()
-    Reprojection(stride=1)(replace(maps, median=leaf), sample).backward()
+    Reprojection(depth="median", stride=1)(replace(maps, median=leaf), sample).backward()
     way = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def frozen(step):
@@ -150,7 +150,7 @@ def test_the_gradient_of_patches_is_that_of_finite_differences(monkeypatch):
     maps = tilted(moved(maps, 1.01), 0.1)
     draw = torch.Generator().manual_seed(0)
     leaves = [value.clone().requires_grad_() for value in (maps.median, maps.normal)]
-    loss = WarpedPatches(pixels=60, radius=2)
+    loss = WarpedPatches(depth="median", pixels=60, radius=2)
     loss(replace(maps, median=leaves[0], normal=leaves[1]), sample).backward()
     for name, leaf in zip(("median", "normal"), leaves, strict=True):
         way = torch.rand(leaf.shape, generator=draw, dtype=torch.float64) - 0.3
@@ -162,7 +162,9 @@ def test_exposure_makes_no_difference_to_patches():
     maps, sample = scene()
     maps = moved(maps, 1.05)
     darker = replace(sample.neighbour, photo=0.55 * sample.neighbour.photo + 0.1)
-    values = [WarpedPatches()(maps, given).item() for given in (sample, replace(sample, neighbour=darker))]
+    values = [
+        WarpedPatches(depth="median")(maps, given).item() for given in (sample, replace(sample, neighbour=darker))
+    ]
     assert values[0] > 0.01 and values[1] == pytest.approx(values[0], rel=1e-6)
 
 
@@ -212,7 +214,7 @@ def test_patches_that_reach_under_the_mask_of_the_view_do_not_count():
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[8:20, 10:24] = False
     right, wrong = (torch.where(mask, sample.photo, value) for value in (sample.photo, torch.zeros(())))
-    loss = WarpedPatches()
+    loss = WarpedPatches(depth="median")
     values = [loss(maps, replace(sample, photo=photo, mask=mask)).item() for photo in (right, wrong)]
     assert values[0] == values[1] and loss(maps, replace(sample, photo=wrong)).item() > values[0] + 0.01
 
@@ -231,8 +233,8 @@ def test_a_neighbour_that_looks_away_teaches_nothing(loss):
 def test_patches_without_texture_or_room_do_not_count():
     maps, sample = scene()
     plain = replace(sample, photo=torch.full_like(sample.photo, 0.4))
-    assert WarpedPatches()(moved(maps, 1.01), plain).item() == 0
-    assert WarpedPatches(radius=20)(moved(maps, 1.01), sample).item() == 0, "larger than the picture"
+    assert WarpedPatches(depth="median")(moved(maps, 1.01), plain).item() == 0
+    assert WarpedPatches(depth="median", radius=20)(moved(maps, 1.01), sample).item() == 0, "larger than the picture"
 
 
 def test_pixels_are_spread_evenly_and_never_twice():
