@@ -79,8 +79,9 @@ def check_policy(policy: Policy, points: Points, step: Step) -> None:
 
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
-    """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered and where
-    no depth is known beforehand; it uses no map but those it says it reads, and its weight is 0 or more at any step.
+    """A loss is one finite number that repeats itself, with finite gradients, also where nothing was rendered, where no
+    depth and no normals are known beforehand, and where there is no second view; it uses no map but those it says it
+    reads, and its weight is 0 or more at any step.
 
     Args:
         loss: To check.
@@ -95,7 +96,12 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
     draw = torch.Generator().manual_seed(0)
     sample = _sample(size, draw)
     cases = [("", torch.rand(size, generator=draw), sample), (" of an empty render", torch.zeros(size), sample)]
-    cases.append((" without a depth prior", torch.rand(size, generator=draw), replace(sample, prior=None)))
+    without = {
+        " without a depth prior": replace(sample, prior=None),
+        " without prior normals": replace(sample, prior=replace(sample.prior, normal=None)),
+        " without a neighbour": replace(sample, neighbour=None),
+    }
+    cases += [(what, torch.rand(size, generator=draw), less) for what, less in without.items()]
     for what, alpha, sample in cases:
         maps = _maps(alpha, loss.reads, draw)
         leaves = {key: value.requires_grad_() for key, value in maps.present().items()}
@@ -145,7 +151,7 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
 def _sample(size: tuple[int, int], draw: Generator) -> Sample:
     import torch
 
-    from surfkit.losses.base import Sample
+    from surfkit.losses.base import Neighbour, Sample
     from surfkit.scene.camera import Camera
     from surfkit.scene.depth_prior import DepthPrior
     from surfkit.scene.scene import View
@@ -155,7 +161,13 @@ def _sample(size: tuple[int, int], draw: Generator) -> Sample:
     view, photo = View("random.png", camera, Path("random.png")), torch.rand(3, *size, generator=draw)
     there = torch.rand(size, generator=draw) > 0.2
     inverse = torch.where(there, 0.5 + torch.rand(size, generator=draw), 0.0)
-    return Sample(view, photo, DepthPrior(inverse, torch.rand(size, generator=draw) * there, 0.8))
+    normal = there * torch.nn.functional.normalize(torch.randn(3, *size, generator=draw), dim=0)
+    prior = DepthPrior(inverse, torch.rand(size, generator=draw) * there, 0.8, normal)
+    beside = camera.world_to_camera.clone()
+    beside[0, 3] = 0.02  # less than a pixel of parallax, at any depth
+    view_beside = View("beside.png", replace(camera, world_to_camera=beside), Path("beside.png"))
+    maps = _maps(torch.ones(size), ("alpha", "depth", "median", "normal"), draw)
+    return Sample(view, photo, prior, neighbour=Neighbour(view_beside, torch.rand(3, *size, generator=draw), maps))
 
 
 def _maps(alpha: Tensor, reads: Iterable[str], draw: Generator) -> Maps:

@@ -2,9 +2,12 @@
 
 from surfkit.core.registry import hookimpl
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
+from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import Distortion, NormalConsistency
+from surfkit.losses.warped_patches import WarpedPatches
 
 
 @hookimpl
@@ -15,6 +18,9 @@ def surfkit_components():
         "normal": NormalConsistency,
         "distortion": Distortion,
         "depth": DepthRegression,
+        "normal-prior": NormalPrior,
+        "reprojection": Reprojection,
+        "warped-patches": WarpedPatches,
         "mean-opacity": MeanOpacity,
         "mean-scale": MeanScale,
     }

@@ -16,6 +16,24 @@ from surfkit.scene.scene import View
 
 
 @dataclass(frozen=True)
+class Neighbour:
+    """A second view of what a sample shows, from another side. All of it is constant.
+
+    Attributes:
+        view: The photograph's name and camera.
+        photo: (3, H, W) float32 in [0, 1].
+        maps: Rendered from the same splats as those of the sample: alpha, depth, median and normal.
+        mask: (H, W) bool, False where the photograph is to be ignored, None where all of it counts. The trainer hides
+            nothing here: losses leave such pixels out.
+    """
+
+    view: View
+    photo: Tensor
+    maps: Maps
+    mask: Tensor | None = None
+
+
+@dataclass(frozen=True)
 class Sample:
     """What a rendered view is compared with.
 
@@ -25,12 +43,16 @@ class Sample:
         prior: What is known of the depth, of a photograph with a usable estimate and for losses that need one.
         mask: (H, W) bool, False where the photograph is to be ignored; None where all of it counts. The trainer sees
             to it (`ignoring`) that no loss learns from such pixels.
+        neighbour: A second view, for losses that need one; None where no other photograph shows enough of the same.
+        seed: Of random draws in this step, in [0, 2^63).
     """
 
     view: View
     photo: Tensor
     prior: DepthPrior | None = None
     mask: Tensor | None = None
+    neighbour: Neighbour | None = None
+    seed: int = 0
 
 
 def ignoring(maps: Maps, sample: Sample) -> tuple[Maps, Sample]:
@@ -45,7 +67,8 @@ def ignoring(maps: Maps, sample: Sample) -> tuple[Maps, Sample]:
     held = Maps(**{name: torch.where(keep, value, value.detach()) for name, value in maps.present().items()})
     prior = sample.prior
     if prior is not None:
-        known = {name: torch.where(keep, getattr(prior, name), 0) for name in ("inverse", "confidence")}
+        names = ("inverse", "confidence", "normal")
+        known = {n: torch.where(keep, value, 0) for n in names if (value := getattr(prior, n)) is not None}
         prior = replace(prior, **known)
     return held, replace(sample, photo=torch.where(keep, sample.photo, held.color.detach()), prior=prior)
 
@@ -54,11 +77,13 @@ class Loss(Component):
     """A term of the objective.
 
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
-    priors are only read when a term has `needs_prior`; a photograph may still be without one.
+    priors are only read when a term has `needs_prior`; a photograph may still be without one. A second view is only
+    chosen and rendered in steps in which a term with a weight has `needs_neighbour`, once for all of them.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)
     needs_prior: ClassVar[bool] = False
+    needs_neighbour: ClassVar[bool] = False
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:

@@ -56,22 +56,24 @@ class Cache(Sequence, Generic[T]):
         """
         at = range(len(self))[at]
         self._turn = self._needed.get(at, self._turn)
-        self._needed[at] = -1  # before all else, until it is there
-        if at in self._kept:
-            future = self._kept[at] = self._kept.pop(at)
-        else:
-            self._make_room(self._sizes[at], -1)
-            future = self._submit(at)
-        self._fetch()
         try:
-            return future.result()
-        except BaseException:
-            if self._kept.get(at) is future:  # what went wrong may not go wrong again
-                del self._kept[at]
-                self._bytes -= self._sizes[at]
-            raise
+            return self._value(at)
         finally:
             del self._needed[at]
+
+    def aside(self, at: int) -> T:
+        """The value of a position out of turn: when it is to be asked for next, and what is read ahead, stay.
+
+        Raises:
+            BadInput: The file is damaged.
+        """
+        due = self._needed.get(at)
+        try:
+            return self._value(at)
+        finally:
+            del self._needed[at]
+            if due is not None:
+                self._needed[at] = due
 
     def expect(self, coming: Sequence[int]) -> None:
         """Read in this order from now on: positions in the order in which they will be asked for."""
@@ -106,6 +108,23 @@ class Cache(Sequence, Generic[T]):
     def bytes(self) -> int:
         """What is kept or being read now."""
         return self._bytes
+
+    def _value(self, at: int) -> T:
+        """Wait for a value, and read on; until it is taken back, its position is the one that is needed first."""
+        self._needed[at] = -1
+        if at in self._kept:
+            future = self._kept[at] = self._kept.pop(at)
+        else:
+            self._make_room(self._sizes[at], -1)
+            future = self._submit(at)
+        self._fetch()
+        try:
+            return future.result()
+        except BaseException:
+            if self._kept.get(at) is future:  # what went wrong may not go wrong again
+                del self._kept[at]
+                self._bytes -= self._sizes[at]
+            raise
 
     def _fetch(self) -> None:
         """Read what is needed next, as far as it is worth its room."""

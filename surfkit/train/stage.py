@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Protocol
+from functools import cached_property
+from typing import Annotated, Any, Protocol
 
 import torch
 from torch import Tensor
@@ -19,16 +20,19 @@ from surfkit.core.schedule import Interval
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Regularizer, Sample, ignoring
+from surfkit.losses.base import Loss, Neighbour, Regularizer, Sample, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.scene.cache import Cache
 from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.train.adam import Rate, adam_step
+from surfkit.train.cotangents import added, gradient, pulled
 from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
+from surfkit.train.rig import Rig
 from surfkit.train.views import Order, Survey
 
 RATES = {
@@ -124,6 +128,11 @@ class StageState:
     skipped: list[int] = field(default_factory=list)
     """Positions of photographs that turned out damaged, and are not shown any more."""
 
+    @property
+    def seed(self) -> int:
+        """Of what is drawn in the coming step beside the generator, in [0, 2^63)."""
+        return (self.generator.initial_seed() * 1_000_003 + self.index + 1) % 2**63
+
 
 @dataclass(frozen=True)
 class Done:
@@ -205,9 +214,12 @@ class Trainer:
         shape = self.primitive.shape(leaves, state.sh_degree)
         splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
 
-        geometry, distortion = bool(reads & GEOMETRY), "distortion" in reads
+        paired = any(stage.losses[loss].needs_neighbour for loss in active)
+        geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
         render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry, distortion)
-        losses, total, chosen = self.cotangents(active, render.maps, sample, self.look(state, shown))
+        second = self.neighbour(state, splats, shown, render.maps) if paired else None
+        compared = replace(sample, neighbour=second)
+        losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
         terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
         losses |= {name: float(term.detach()) for name, term in terms.items()}
         require_finite_losses(index, sample.view.name, losses)
@@ -230,15 +242,48 @@ class Trainer:
             shown = state.order.next(state.generator)
             if shown in state.skipped:
                 continue
-            try:
-                photo = self.photos[shown]
-            except BadInput as error:
-                state.skipped.append(shown)
-                emit(PhotoSkipped(self.views[shown].name, str(error)))
+            photo = self.photo(state, shown)
+            if photo is None:
                 continue
             prior, mask = (None if known is None else known[shown] for known in (self.priors, self.masks))
-            return shown, Sample(self.views[shown], photo.to(torch.float32).div_(255), prior, mask)
+            return shown, Sample(self.views[shown], photo, prior, mask, seed=state.seed)
         raise BadInput(f"none of the {len(self.views)} photographs can be read, {self.views[0].path} for one")
+
+    def photo(self, state: StageState, at: int, aside: bool = False) -> Tensor | None:
+        """(3, H, W) in [0, 1], the photograph of a view; None for a damaged one, which is named and not shown again.
+
+        `aside`: it is looked at out of turn.
+        """
+        try:
+            photo = out_of_turn(self.photos, at) if aside else self.photos[at]
+        except BadInput as error:
+            state.skipped.append(at)
+            emit(PhotoSkipped(self.views[at].name, str(error)))
+            return None
+        return photo.to(torch.float32).div_(255)
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The cameras of all views."""
+        return Rig.of([view.camera for view in self.views])
+
+    def neighbour(self, state: StageState, splats: Splats, shown: int, maps: Maps) -> Neighbour | None:
+        """One of the views that show best, from another side, what a view shows; None if none does.
+
+        Which one depends on what is rendered now and on the seed and number of the step, and on nothing else, so that
+        a run which goes on has the same ones.
+        """
+        found = self.rig.neighbours(shown, maps.median)
+        generator = torch.Generator().manual_seed(state.seed)
+        first = int(torch.randint(max(1, len(found)), (), generator=generator))
+        for at in (*found[first:], *found[:first]):
+            photo = None if at in state.skipped else self.photo(state, at, aside=True)
+            if photo is None:
+                continue
+            drawn = self.rasterizer.render(splats, self.views[at].camera, self.stage.near, True, False).maps
+            mask = None if self.masks is None else out_of_turn(self.masks, at)
+            return Neighbour(self.views[at], photo, replace(drawn, color=None, distortion=None), mask)
+        return None
 
     def cotangents(
         self, active: Mapping[str, float], maps: Maps, sample: Sample, look: Look | None
@@ -282,7 +327,7 @@ class Trainer:
             views=Survey(self.views, self.rasterizer, splats, self.stage.near),
             since_reset=index - state.reset_at,
             rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.stage.rates.items()},
-            seed=(state.generator.initial_seed() * 1_000_003 + index) % 2**63,
+            seed=state.seed,
         )
 
     def wanted(self, points: Points, step: Step) -> Edit | None:
@@ -304,37 +349,6 @@ class Trainer:
         return points
 
 
-def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
-    """d(sum of losses)/d(maps); None for a map without influence, but colour is always there.
-
-    `shared`: other losses have part of their graph in common with these, and come later.
-    """
-    grads = [None] * len(leaves)
-    if losses:
-        grads = torch.autograd.grad(sum(losses), list(leaves.values()), allow_unused=True, retain_graph=shared)
-    found = Maps(**dict(zip(leaves, grads, strict=True)))
-    return found if found.color is not None else replace(found, color=torch.zeros_like(leaves["color"]))
-
-
-def added(a: Maps, b: Maps) -> Maps:
-    """The sum of two cotangents."""
-    sums = a.present()
-    for name, value in b.present().items():
-        sums[name] = sums[name] + value if name in sums else value
-    return Maps(**sums)
-
-
-def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:
-    """Gradients by the raw parameters, from those by the splats and from terms on the splats.
-
-    A parameter without influence is left out.
-    """
-    splats, grads = shape.tensors(), gradients.tensors()
-    names = [name for name, value in splats.items() if value.requires_grad]
-    raw = torch.autograd.grad(
-        [*(splats[name] for name in names), *terms],
-        list(leaves.values()),
-        [*(grads[name] for name in names), *(torch.ones_like(term) for term in terms)],
-        allow_unused=True,
-    )
-    return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}
+def out_of_turn(known: Pictures | Sequence, at: int) -> Any:
+    """The value of a position, without disturbing what is read ahead."""
+    return known.aside(at) if isinstance(known, Cache) else known[at]

@@ -52,6 +52,25 @@ def test_any_budget_gives_the_same_values_within_it(budget, threads):
             assert cache.bytes <= max(budget, 7)
 
 
+def test_looking_aside_changes_nothing_that_is_foreseen():
+    shelf = Shelf()
+    cache = Cache(shelf, [1] * 40, 12, threads=1)
+    order = [*range(20, 40), *range(20)]
+    cache.expect(order)
+    for turn, at in enumerate(order):
+        assert cache[at] == at * 10
+        needed, now = dict(cache._needed), cache._turn
+        assert cache.aside((at * 7 + 3) % 40) == (at * 7 + 3) % 40 * 10 and cache.bytes <= 12
+        assert cache._needed == needed and cache._turn == now == turn
+        settle(cache)
+    plain = Shelf()
+    cache = Cache(plain, [1] * 40, 12, threads=1)
+    for at in range(40):
+        assert cache[at] == at * 10
+        settle(cache)
+    assert len(shelf.read) <= len(plain.read) + 60, "what is looked at aside is read, and seldom anything twice"
+
+
 def test_reading_follows_the_coming_order():
     shelf = Shelf()
     cache = Cache(shelf, [1] * 40, threads=1)

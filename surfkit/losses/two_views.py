@@ -1,0 +1,132 @@
+"""From a pixel of one view to another view and back, over the depth rendered in both (PGSR, arXiv 2406.06521)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from surfkit.losses.base import Neighbour
+from surfkit.raster.api import Maps
+from surfkit.scene.camera import Camera
+
+OPAQUE = 0.5
+"""The expected depth counts as a surface where alpha is above this, as the median depth does."""
+WHOLE = 0.999
+"""A bilinear sample counts if at least this share of it comes from pixels that count."""
+TINY = 1e-4
+"""Depths and inverse depths below this, in local units, are as good as none."""
+
+
+def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:
+    """(H, W) camera z of the rendered surface; 0 where there is none."""
+    if which == "median":
+        return maps.median
+    return torch.where(maps.alpha > OPAQUE, maps.expected_depth(), 0.0)
+
+
+def spread(size: tuple[int, int], side: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Rows and columns, (K,) each, of one pixel at random in every square of a picture of (H, W) pixels.
+
+    None comes twice, so that no gradient is added up in an order that threads decide. Of the squares that reach over
+    the right and lower rim some have none, so that every pixel is as likely as any other.
+
+    Args:
+        size: (H, W).
+        side: Of the squares, pixels.
+        seed: Of the draw.
+    """
+    y, x = (torch.arange(0, length, side) for length in size)
+    draws = torch.randint(side, (2, len(y), len(x)), generator=torch.Generator().manual_seed(seed))
+    y, x = y[:, None] + draws[0], x[None] + draws[1]
+    inside = (y < size[0]) & (x < size[1])
+    return y[inside], x[inside]
+
+
+def motion(camera: Camera, other: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3) and shift (3, 1) that take points from the frame of one camera to that of another."""
+    both = other.world_to_camera @ torch.linalg.inv(camera.world_to_camera)
+    return both[:3, :3].to(dtype), both[:3, 3:].to(dtype)
+
+
+def projected(camera: Camera, points: Tensor) -> Tensor:
+    """(2, ...) x and y in pixels of (3, ...) points of the camera's frame; those not before it fall on any place."""
+    z = torch.where(points[2] > TINY, points[2], 1.0)
+    return torch.stack([camera.fx * points[0] / z + camera.cx, camera.fy * points[1] / z + camera.cy])
+
+
+def sampled(image: Tensor, at: Tensor) -> Tensor:
+    """(...) bilinear samples of an image (h, w) at (2, ...) x and y in pixels, centres at +0.5; 0 outside."""
+    size = at.new_tensor([image.shape[1], image.shape[0]])
+    places = (2 * at.flatten(1).T / size - 1).clamp(-2, 2)  # far outside is outside
+    values = grid_sample(image[None, None], places[None, None], mode="bilinear", align_corners=False)
+    return values.view(at.shape[1:])
+
+
+def is_whole(counts: Tensor, at: Tensor) -> Tensor:
+    """(...) bool, whether all pixels (h, w) that a bilinear sample at (2, ...) takes its value from count."""
+    with torch.no_grad():
+        return sampled(counts.to(at), at.detach()) > WHOLE
+
+
+@dataclass(frozen=True)
+class Opposite:
+    """The surface that a neighbour shows, as it is looked into from another view.
+
+    Attributes:
+        camera: Of the neighbour.
+        inverse: (h, w) inverse camera z, which is linear in the picture on a plane; 0 where there is none.
+        counts: (h, w) bool, where there is one that no mask hides.
+    """
+
+    camera: Camera
+    inverse: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, neighbour: Neighbour, which: Literal["median", "expected"]) -> Opposite:
+        """Of the median or the expected depth."""
+        surface = surface_depth(neighbour.maps, which)
+        there = surface > TINY
+        inverse = torch.where(there, 1 / torch.where(there, surface, 1.0), 0.0)
+        return cls(neighbour.view.camera, inverse, there if neighbour.mask is None else there & neighbour.mask)
+
+
+def round_trip(depth: Tensor, rays: Tensor, camera: Camera, opposite: Opposite) -> tuple[Tensor, Tensor]:
+    """How far from itself a pixel comes back that goes to the neighbour's surface and from there to the first view.
+
+    The point of the pixel is projected into the neighbour; its depth there is that of the neighbour's surface, sampled
+    bilinearly in the inverse, which is exact on planes; and that point is projected into the first view.
+
+    Args:
+        depth: (P,) camera z of the pixels in the first view, 0 where there is none. The way back depends on it too.
+        rays: (3, P) directions of the pixels in the frame of the first view, with z = 1.
+        camera: Of the first view.
+        opposite: The second view.
+
+    Returns:
+        (P,) distances in pixels, and (P,) bool where there is one: the place lies before the neighbour and in its
+        picture, where it has a depth and no mask.
+    """
+    lens = opposite.camera
+    rotation, shift = motion(camera, lens, depth.dtype)
+    points = rotation @ (rays * depth) + shift
+    at = projected(lens, points)
+    inverse = sampled(opposite.inverse, at)
+    valid = (depth > TINY) & (points[2] > TINY) & is_whole(opposite.counts, at) & (inverse > TINY)
+    way = torch.stack([(at[0] - lens.cx) / lens.fx, (at[1] - lens.cy) / lens.fy, torch.ones_like(inverse)])
+    back = rotation.T @ (way / torch.where(valid, inverse, 1.0) - shift)
+    valid = valid & (back[2] > TINY)
+    start = projected(camera, rays)
+    square = (projected(camera, back) - start).square().sum(0)
+    apart = valid & (square > 0)  # no root of 0, whose slope is infinite
+    return torch.where(apart, torch.where(apart, square, 1.0).sqrt(), 0.0), valid
+
+
+def agreement(error: Tensor, valid: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Constant weights exp(-error) of the pixels that come back nearer than a limit in pixels, and which these are."""
+    counts = valid & (error.detach() < limit)
+    return torch.where(counts, (-error.detach()).exp(), 0.0), counts

@@ -1,0 +1,163 @@
+"""Photographs that agree over the rendered surface (PGSR, multi-view photometric consistency)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import Steps
+from surfkit.losses.base import Loss, Neighbour, Sample
+from surfkit.losses.two_views import (
+    TINY,
+    Opposite,
+    agreement,
+    is_whole,
+    motion,
+    projected,
+    round_trip,
+    sampled,
+    spread,
+    surface_depth,
+)
+from surfkit.raster.api import Maps
+from surfkit.scene.camera import Camera
+
+GREY = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in grey (ITU-R BT.601)."""
+GRAZING = 0.1
+"""Planes that are seen at a smaller cosine are too oblique to warp by."""
+TEXTURE = 0.01
+"""Patches of which grey deviates less, as a standard deviation for white 1, are noise and are not compared."""
+
+
+@dataclass(frozen=True)
+class WarpedPatches(Loss):
+    """One minus the normalised cross-correlation of patches and of what a neighbouring photograph shows in their place
+    (PGSR, arXiv 2406.06521).
+
+    A patch of the photograph is warped into the neighbour over the plane through its central pixel that the rendered
+    depth and normal describe. Exposure does not matter. The loss is the mean of exp(-e) (1 - NCC), where e is the error
+    of `reprojection`, held constant, over the patches with e below `limit`; the others are taken for occluded. Patches
+    without texture, or that reach under a mask or out of either picture, do not count.
+    """
+
+    reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median", "normal")
+    needs_neighbour: ClassVar[bool] = True
+
+    weight: float = 0.15
+    """Share in the objective of the steps that count."""
+
+    start: Steps = 7_000
+    """Steps without this term, as a surface must form first; 0 has it from the first step."""
+
+    every: int = 3
+    """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
+
+    pixels: int = 4_096
+    """Most patches in a step, spread evenly over the picture at random."""
+
+    radius: int = 3
+    """Pixels on each side of the central one: 3 compares patches of 7 x 7 pixels."""
+
+    limit: float = 1.0
+    """Patches whose central pixel comes back from the neighbour with an error of more pixels do not count."""
+
+    depth: Literal["median", "expected"] = "expected"
+    """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.every < 1 or not self.limit > 0:
+            given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
+            raise BadInput(f"the loss of warped patches has {given}; give 0 or more, 1 or more, and a limit above 0")
+        if self.pixels < 1 or self.radius < 1:
+            given = f"pixels {self.pixels}, radius {self.radius}"
+            raise BadInput(f"the loss of warped patches has {given}; both must be 1 or more")
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return self.weight if index > self.start and index % self.every == 0 else 0.0
+
+    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+        depth, camera, neighbour = surface_depth(maps, self.depth), sample.view.camera, sample.neighbour
+        nothing = 0 * (depth.sum() + maps.normal.sum())
+        at = self.centres(sample)
+        if neighbour is None or not len(at):
+            return nothing
+        z, normal = depth.flatten()[at], maps.normal.flatten(1)[:, at]
+        rays = camera.rays(depth.dtype).flatten(1)[:, at]
+        facing = -(normal * rays).sum(0) > GRAZING * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
+        with torch.no_grad():
+            opposite = Opposite.of(neighbour, self.depth)
+            weight, counts = agreement(*round_trip(z, rays, camera, opposite), self.limit)
+        kept = (counts & facing & (normal != 0).any(0)).nonzero()[:, 0]
+        plane = normal[:, kept] / ((normal[:, kept] * rays[:, kept]).sum(0) * z[kept])  # plane . point = 1
+        found, inside = self.warped(plane, rays[:, kept], camera, neighbour)
+        correlation, textured = ncc(self.patches(sample, at[kept]).to(found), found)
+        right = inside & textured
+        terms = torch.where(right, weight[kept] * (1 - correlation), 0.0)
+        return nothing + terms.sum() / right.sum().clamp_min(1)
+
+    def centres(self, sample: Sample) -> Tensor:
+        """(K,) flat positions of the central pixels, spread over the picture; all of their patches counts."""
+        height, width = sample.photo.shape[1:]
+        r = self.radius
+        inner = (height - 2 * r, width - 2 * r)
+        if min(inner) < 1:
+            return torch.zeros(0, dtype=torch.int64)
+        side = max(1, math.ceil(math.sqrt(inner[0] * inner[1] / self.pixels)))
+        while math.ceil(inner[0] / side) * math.ceil(inner[1] / side) > self.pixels:
+            side += 1
+        y, x = spread(inner, side, sample.seed)
+        at = (y + r) * width + x + r
+        if sample.mask is None:
+            return at
+        return at[sample.mask.flatten()[at[:, None] + self.offsets(width)].all(1)]
+
+    def offsets(self, width: int) -> Tensor:
+        """(S,) what to add to the flat position of a pixel to get those of its patch, in rows."""
+        steps = torch.arange(-self.radius, self.radius + 1)
+        return (steps[:, None] * width + steps).flatten()
+
+    def patches(self, sample: Sample, at: Tensor) -> Tensor:
+        """(K, S) grey values of the photograph around the pixels `at`."""
+        return grey(sample.photo).flatten()[at[:, None] + self.offsets(sample.photo.shape[2])]
+
+    def warped(self, plane: Tensor, rays: Tensor, camera: Camera, neighbour: Neighbour) -> tuple[Tensor, Tensor]:
+        """(K, S) grey values of the neighbour where planes take the pixels of patches, and whether all S are there.
+
+        Args:
+            plane: (3, K) with plane . point = 1 on it, in the frame of the first camera.
+            rays: (3, K) directions of the central pixels, with z = 1.
+            camera: The first one.
+            neighbour: To look into.
+        """
+        rotation, shift = motion(camera, neighbour.view.camera, plane.dtype)
+        steps = torch.arange(-self.radius, self.radius + 1, dtype=plane.dtype)
+        y, x = (part.flatten() for part in torch.meshgrid(steps / camera.fy, steps / camera.fx, indexing="ij"))
+        around = rays[:, :, None] + torch.stack([x, y, torch.zeros_like(x)])[:, None]  # (3, K, S)
+        inverse = (plane[:, :, None] * around).sum(0)  # of the depth of the plane along these rays
+        # The point is around / inverse. Projection does not care for its length: all is multiplied by `inverse`.
+        turned = (rotation @ around.flatten(1)).view_as(around)
+        points = turned + shift[:, :, None] * inverse
+        at = projected(neighbour.view.camera, points)
+        counts = torch.ones(neighbour.photo.shape[1:]) if neighbour.mask is None else neighbour.mask
+        inside = (inverse > TINY) & (points[2] > TINY) & is_whole(counts, at)
+        return sampled(grey(neighbour.photo).to(at), at), inside.all(1)
+
+
+def grey(photo: Tensor) -> Tensor:
+    """(H, W) of (3, H, W)."""
+    return torch.tensordot(photo.new_tensor(GREY), photo, 1)
+
+
+def ncc(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """(K,) normalised cross-correlation in [-1, 1] of the rows of (K, S), and whether both rows have texture."""
+    a, b = (rows - rows.mean(1, keepdim=True) for rows in (one, other))
+    first, second = a.square().mean(1), b.square().mean(1)
+    textured = (first > TEXTURE**2) & (second > TEXTURE**2)
+    scale = torch.where(textured, first * second, 1.0).sqrt()
+    return torch.where(textured, (a * b).mean(1) / scale, 0.0), textured

@@ -1,0 +1,47 @@
+"""Gradients between losses, maps, splats and raw parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Gradients, Maps, Splats
+
+
+def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
+    """d(sum of losses)/d(maps); None for a map without influence, but colour is always there.
+
+    `shared`: other losses have part of their graph in common with these, and come later.
+    """
+    grads = [None] * len(leaves)
+    if losses:
+        grads = torch.autograd.grad(sum(losses), list(leaves.values()), allow_unused=True, retain_graph=shared)
+    found = Maps(**dict(zip(leaves, grads, strict=True)))
+    return found if found.color is not None else replace(found, color=torch.zeros_like(leaves["color"]))
+
+
+def added(a: Maps, b: Maps) -> Maps:
+    """The sum of two cotangents."""
+    sums = a.present()
+    for name, value in b.present().items():
+        sums[name] = sums[name] + value if name in sums else value
+    return Maps(**sums)
+
+
+def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:
+    """Gradients by the raw parameters, from those by the splats and from terms on the splats.
+
+    A parameter without influence is left out.
+    """
+    splats, grads = shape.tensors(), gradients.tensors()
+    names = [name for name, value in splats.items() if value.requires_grad]
+    raw = torch.autograd.grad(
+        [*(splats[name] for name in names), *terms],
+        list(leaves.values()),
+        [*(grads[name] for name in names), *(torch.ones_like(term) for term in terms)],
+        allow_unused=True,
+    )
+    return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}
