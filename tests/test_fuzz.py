@@ -4,10 +4,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from needs import needs
 
 from surfkit.core.check import BadInput
 
+hypothesis = needs("hypothesis")
 BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (
@@ -39,15 +40,15 @@ def test_damage_is_one_line(bench, name, tmp_path):
     case = fuzz.Fuzz(name, tmp_path)
     assert case.case([]) is None and case.files, "what is whole is taken"
 
-    @settings(
+    @hypothesis.settings(
         max_examples=CASES,
         deadline=None,
         database=None,
         derandomize=True,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
+        phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
     )
-    @given(damage.damages(case.files))
+    @hypothesis.given(damage.damages(case.files))
     def check(listed):
         assert (found := case.case(listed)) is None, found
 

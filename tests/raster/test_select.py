@@ -1,6 +1,7 @@
 """The device decides which rasterizer draws."""
 
 import pytest
+from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
@@ -16,7 +17,7 @@ def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkey
     assert len(warned) == 1
 
 
-@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+@needs_native
 def test_the_compiled_module_is_preferred():
     rasterizer, name = select("cpu")
     assert isinstance(rasterizer, native.NativeRasterizer)
