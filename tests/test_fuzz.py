@@ -73,7 +73,7 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
         while True:
             pass
 
-    monkeypatch.setattr(fuzz, "SECONDS", 1)
     assert found(lambda path: 1 // 0) == "ZeroDivisionError in transforms.py points"
     assert found(writing).startswith("wrote outside the run folder: ['open ")
+    monkeypatch.setattr(fuzz, "SECONDS", 1)
     assert found(looping).startswith("TimeoutError")

@@ -106,7 +106,6 @@ def test_it_is_saved_before_it_is_queued_again(tmp_path):
 
 def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     """Its command notices, and saves."""
-
     monkeypatch.setattr(submitit.Job, "_results_timeout_s", 1)
     folder = tmp_path / "000"
 
