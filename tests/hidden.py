@@ -7,6 +7,7 @@ loaded once, and a process is forked from there for every case, which begins wit
 `== EXIT STATUS`.
 """
 
+import gc
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -64,6 +65,8 @@ def main(folder: str, cases: Sequence[str]) -> None:
         print(f"== {case}", flush=True)
         if (child := os.fork()) == 0:
             fault, _, packages = case.partition(":")
+            gc.disable()  # it would walk through all that the parent has loaded
+            gc.disable()  # it would walk through all that the parent has loaded
             hide(fault, packages.split(","))
             words = ["--collect-only", "-qq", "--tb=short", "--assert=plain", "-p", "no:cacheprovider", folder]
             status = pytest.main(words)

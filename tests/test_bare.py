@@ -2,10 +2,12 @@
 
 import ast
 import importlib.metadata
+import json
 import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import hidden
@@ -13,6 +15,7 @@ import pytest
 from hidden import NATIVE
 
 from surfkit.cli import main
+from surfkit.raster import native
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 TESTS = Path(__file__).parent
@@ -68,6 +71,16 @@ def test_tests_ask_for_optional_packages_in_one_way():
     assert not {name: wrong for name, wrong in found.items() if wrong}
     seen = "import os, ray\nfrom trimesh.creation import box\ndef f():\n    open3d = pytest.importorskip('open3d')"
     assert list(unguarded(seen)) == ["ray", "trimesh.creation", "importorskip"]
+
+
+def test_without_a_compiler_the_reference_trains(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(native, "module", lambda: None)
+    monkeypatch.setattr("surfkit.raster.select.warnings", warnings)  # not the skip of conftest.py
+    write_colmap(tmp_path / "data", photograph(Flight(views=4, width=16, height=12, points=30)))
+    words = ["recipe:2dgs", "mesh:none", "--steps", "2", "--primitive.sh-degree", "0", "--pictures-every", "0"]
+    assert main(["train", *words, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 0
+    assert "without its compiled rasterizer" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["device"].startswith("cpu reference")
 
 
 @pytest.fixture

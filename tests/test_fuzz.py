@@ -4,11 +4,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from needs import needs
+from needs import needs, needs_native
 
 from surfkit.core.check import BadInput
 
 hypothesis = needs("hypothesis")
+pytestmark = needs_native
 BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (

@@ -1,5 +1,7 @@
 """The device decides which rasterizer draws."""
 
+import warnings
+
 import pytest
 from needs import needs_native
 
@@ -11,6 +13,7 @@ from surfkit.raster.select import select
 
 def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkeypatch):
     monkeypatch.setattr(native, "module", lambda: None)
+    monkeypatch.setattr("surfkit.raster.select.warnings", warnings)  # not the skip of conftest.py
     with pytest.warns(UserWarning, match="without its compiled rasterizer") as warned:
         rasterizer, name = select()
     assert isinstance(rasterizer, Reference) and name.startswith("cpu reference")
