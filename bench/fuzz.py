@@ -333,6 +333,7 @@ class Fuzz:
 
     def judged(self, words: list[str]) -> tuple[str | None, str]:
         """What is wrong with how a command ends, if anything is, and what it said."""
+        import surfkit
         from surfkit.cli import main, parse
 
         before, held, out = self.state(), peak(), io.StringIO()
@@ -343,7 +344,8 @@ class Fuzz:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), limited(), self.remembered(parse):
                 status = main(words)
         except BaseException as error:
-            where = [f for f in traceback.extract_tb(error.__traceback__) if "/surfkit/" in f.filename][-1]
+            ours = f"{Path(surfkit.__file__).parent}{os.sep}"  # not every folder of this name: a clone may have it
+            where = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(ours)][-1]
             place = f"{Path(where.filename).name} {where.name}"
             return f"{type(error).__name__} in {place}", out.getvalue() + traceback.format_exc()
         finally:

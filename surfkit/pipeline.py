@@ -100,6 +100,8 @@ def run(
     store.bytes()  # or BadInput, before anything is done
     if recipe.partition is not None:
         hands.workers.ready()
+    if recipe.mesh is not None:
+        recipe.mesh.ready()
     with noted() as notes, held(out), in_one_line(out), bars():
         sweep(out, out / "blocks")
         refuse_other(this)

@@ -123,6 +123,21 @@ class Plugin:
         return {"discs": Recipe("Flat\n  discs."), "balls": Recipe("Round balls.", pretrain=Stage(prune=(Relocate(),)))}
 
 
+@pytest.fixture(scope="session", autouse=True)
+def compiled():
+    """Without the native module, tests that draw with what `select` chooses are skipped: it would take minutes."""
+    from needs import NO_NATIVE, native
+
+    class Slow:
+        def warn(self, *args, **more):
+            pytest.skip(f"this draws with the native rasterizer: {NO_NATIVE}")
+
+    with pytest.MonkeyPatch.context() as patch:
+        if native.module() is None:
+            patch.setattr("surfkit.raster.select.warnings", Slow())
+        yield
+
+
 @pytest.fixture
 def bare(monkeypatch):
     """The registry with nothing in it; as it was again afterwards."""

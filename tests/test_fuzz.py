@@ -4,10 +4,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from needs import needs, needs_native
 
 from surfkit.core.check import BadInput
 
+hypothesis = needs("hypothesis")
+pytestmark = needs_native
 BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (
@@ -39,15 +41,15 @@ def test_damage_is_one_line(bench, name, tmp_path):
     case = fuzz.Fuzz(name, tmp_path)
     assert case.case([]) is None and case.files, "what is whole is taken"
 
-    @settings(
+    @hypothesis.settings(
         max_examples=CASES,
         deadline=None,
         database=None,
         derandomize=True,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
+        phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
     )
-    @given(damage.damages(case.files))
+    @hypothesis.given(damage.damages(case.files))
     def check(listed):
         assert (found := case.case(listed)) is None, found
 
@@ -72,7 +74,7 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
         while True:
             pass
 
-    monkeypatch.setattr(fuzz, "SECONDS", 1)
     assert found(lambda path: 1 // 0) == "ZeroDivisionError in transforms.py points"
     assert found(writing).startswith("wrote outside the run folder: ['open ")
+    monkeypatch.setattr(fuzz, "SECONDS", 1)
     assert found(looping).startswith("TimeoutError")

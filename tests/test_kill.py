@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import needs_native
 
 BENCH = Path(__file__).parents[1] / "bench" / "kill.py"
 
 
+@needs_native
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked, so that torch is loaded once")
 def test_killed_runs_end_in_the_same_bits(tmp_path):
     words = [sys.executable, str(BENCH), "--kills", "6", "--seed", "1", "--out", str(tmp_path / "kill.json")]

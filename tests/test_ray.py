@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from needs import needs
 from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # noqa: F401 (fixtures)
 
 from surfkit import blocks, tuning
@@ -21,7 +22,7 @@ from surfkit.partition.executor import LOG, Job
 from surfkit.partition.state import read_state
 from surfkit.pipeline import run
 
-pytest.importorskip("ray", reason="pip install 'surfkit[ray]'")
+ray = needs("ray", "executor:ray")
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 SMALL = {"object_store_memory": 80_000_000, "memory": 2_000_000_000, "include_dashboard": False}
 
@@ -30,7 +31,7 @@ SMALL = {"object_store_memory": 80_000_000, "memory": 2_000_000_000, "include_da
 def cluster():
     """A head of one processor, and room for more nodes."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    from ray.cluster_utils import Cluster
+    Cluster = needs("ray.cluster_utils").Cluster
 
     before = signal.getsignal(signal.SIGTERM)
     for left in (2, 1, 0):  # Ray gives itself 30 s to start, which a busy machine may miss
@@ -99,8 +100,6 @@ def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
         if (tmp_path / "000" / "began").exists():
             raise Stop
         return [], []
-
-    import ray
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
         real = ray.wait

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from needs import needs
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
 
 from surfkit import blocks
@@ -21,7 +22,7 @@ from surfkit.partition.executor import LOG, Job
 from surfkit.partition.state import read_state
 from surfkit.pipeline import run
 
-pytest.importorskip("submitit", reason="pip install 'surfkit[slurm]'")
+submitit = needs("submitit", "executor:slurm")
 
 
 def job(folder: Path, index: int, code: str = "pass", **more) -> Job:
@@ -105,8 +106,6 @@ def test_it_is_saved_before_it_is_queued_again(tmp_path):
 
 def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     """Its command notices, and saves."""
-    import submitit
-
     monkeypatch.setattr(submitit.Job, "_results_timeout_s", 1)
     folder = tmp_path / "000"
 

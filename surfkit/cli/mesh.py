@@ -70,6 +70,7 @@ class MeshOf:
     def run(self) -> None:
         """Mesh, and show what came out."""
         budget = cache_bytes(self.memory, "--memory")
+        self.mesh.ready()
         with noted(), bars():
             this, state, scene = load_run(self.run_folder)
             if self.metres_per_unit is not None:

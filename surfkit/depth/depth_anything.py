@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
+from surfkit.core.optional import needed
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.scene.photos import read_photo
 
@@ -70,12 +71,10 @@ class DepthAnythingV2(DepthEstimator):
         """The network with its weights.
 
         Raises:
-            BadInput: transformers is missing, or the weights cannot be had.
+            BadInput: transformers is missing or cannot be loaded, or the weights cannot be had.
         """
-        try:
+        with needed("transformers", "estimator:depth-anything-v2"):
             from transformers import AutoModelForDepthEstimation
-        except ImportError as error:
-            raise BadInput(f"depth-anything-v2 needs transformers ({error}): pip install 'surfkit[depth]'") from error
         try:
             return AutoModelForDepthEstimation.from_pretrained(self.source)
         except (OSError, ValueError, RuntimeError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.core.optional import needed
 from surfkit.scene.ply import TYPES, read_vertices
 from surfkit.scene.sparse_ply import read_points
 
@@ -134,10 +135,8 @@ def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.nda
 
 
 def _other(path: Path) -> Surface:
-    try:
+    with needed("trimesh", f"{path}: a file that is not binary PLY"):
         import trimesh
-    except ImportError:
-        raise BadInput(f"{path}: only binary PLY is read without trimesh; pip install trimesh, or convert it") from None
     try:
         loaded = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):

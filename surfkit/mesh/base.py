@@ -68,6 +68,13 @@ class Subject:
 class Mesher(Component):
     """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`."""
 
+    def ready(self) -> None:
+        """Look, before hours are spent, whether it can work.
+
+        Raises:
+            BadInput: A package that it is made with cannot be loaded on this machine.
+        """
+
     @abstractmethod
     def mesh(self, subject: Subject) -> Mesh:
         """The surface.

@@ -41,11 +41,13 @@ class Poisson(Mesher):
             allowed = f"give {ENOUGH} or more, and 0 or more below 1"
             raise BadInput(f"mesh: poisson.points is {self.points} and thin {self.thin}; {allowed}")
 
+    def ready(self) -> None:
+        """See `Mesher.ready`."""
+        require("mesh:poisson")
+
     def mesh(self, subject: Subject) -> Mesh:
         """See `Mesher.mesh`."""
-        require("mesh:poisson")
-        import open3d
-
+        open3d = require("mesh:poisson")
         found = [self._seen(subject, at) for at in range(len(subject.views))]
         points, normals, colors = (torch.cat(parts).double().numpy() for parts in zip(*found, strict=True))
         if len(points) < ENOUGH:

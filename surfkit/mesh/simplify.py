@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
 
 
-def require(what: str = "--lods") -> None:
-    """BadInput if Open3D, which `what` is made with, is not there."""
-    try:
-        import open3d  # noqa: F401
-    except ImportError as error:
-        raise BadInput(
-            f"{what} needs Open3D, which cannot be imported ({error}); pip install 'surfkit[mesh]'"
-        ) from error
+def require(what: str = "--lods") -> ModuleType:
+    """Open3D, which `what` is made with; BadInput that tells what to install where it cannot be loaded."""
+    with needed("open3d", what):
+        import open3d
+    return open3d
 
 
 def simplified(mesh: Mesh, share: float) -> Mesh:
     """The mesh with about a share of its triangles, by quadric error (Garland and Heckbert 1997, in Open3D)."""
-    import open3d
-
+    open3d = require()
     whole = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
     )

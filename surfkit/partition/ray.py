@@ -12,6 +12,7 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.errand import CRASHED, POLL_S, attend
+from surfkit.core.optional import needed
 from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 
@@ -121,10 +122,8 @@ class Ray(Executor):
 
 def _imported() -> ModuleType:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
+    with needed("ray", "executor:ray"):
         import ray
-    except ImportError as error:
-        raise BadInput(f"executor:ray needs the package ray ({error}): pip install 'surfkit[ray]'") from error
     return ray
 
 

@@ -20,6 +20,7 @@ from typing import Any, Literal
 from surfkit.core.check import BadInput
 from surfkit.core.errand import CRASHED, POLL_S, Errand
 from surfkit.core.events import say
+from surfkit.core.optional import needed
 from surfkit.partition.executor import Ended, Executor, Job, largest_first, terminable
 from surfkit.partition.shared import errand, marked
 from surfkit.partition.state import worked_on
@@ -243,10 +244,8 @@ class Queue:
 
 
 def _imported() -> ModuleType:
-    try:
+    with needed("submitit", "executor:slurm"):
         import submitit
-    except ImportError as error:
-        raise BadInput(f"executor:slurm needs the package submitit ({error}): pip install 'surfkit[slurm]'") from error
     return submitit
 
 

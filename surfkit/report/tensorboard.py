@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surfkit.core.check import BadInput
 from surfkit.core.events import Measured, StageBegan, StepDone
+from surfkit.core.optional import needed
 from surfkit.core.registry import hookimpl, plugins
 
 
@@ -59,12 +59,10 @@ def tensorboard(out: Path) -> Iterator[None]:
     """Within, scalars of the run are written to tensorboard/ in its folder.
 
     Raises:
-        BadInput: The package is missing.
+        BadInput: The package is missing or cannot be loaded.
     """
-    try:
+    with needed("tensorboard", "--tensorboard"):
         from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise BadInput("--tensorboard needs the package tensorboard: pip install 'surfkit[tensorboard]'") from error
     scalars = Scalars(out / "tensorboard", SummaryWriter)
     plugins().register(scalars, "tensorboard")
     try:

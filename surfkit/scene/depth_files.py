@@ -13,6 +13,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.files import replacing
+from surfkit.core.optional import needed
 from surfkit.scene.photos import opened
 
 EXR = ".exr"
@@ -176,10 +177,8 @@ def _number(path: Path, at: str, value: Any) -> float:
 
 def _exr(path: Path) -> np.ndarray:
     """(h, w) float32, the red or only channel of an OpenEXR file; 0 where that is the largest half float."""
-    try:
+    with needed("OpenEXR", "an .exr file"):
         import OpenEXR
-    except ImportError as error:
-        raise BadInput("needs the package OpenEXR: pip install 'surfkit[exr]'") from error
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
     except (RuntimeError, ValueError, OSError) as error:

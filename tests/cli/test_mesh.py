@@ -4,12 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
+trimesh = needs("trimesh")
 TRAIN = ["recipe:2dgs", "--steps", "60", "--pictures-every", "0", "--primitive.sh-degree", "0"]
 
 
@@ -57,7 +58,7 @@ def test_the_same_command_again_makes_nothing_and_another_mesher_only_the_mesh(f
 
 def test_another_mesh_of_the_same_run(finished, tmp_path, capsys):
     out, _ = finished
-    pytest.importorskip("open3d")
+    needs("open3d", "--lods")
     words = ["mesh:tsdf", "--mesh.voxel", "0.5", "--mesh.least-views", "0.5", "--metres-per-unit", "1"]
     words += ["--formats", "ply", "obj", "glb", "--lods", "0.5", "--least-triangles", "20", "--crop-box"]
     assert main(["mesh", str(out), *words, "-50", "-50", "-2", "50", "50", "3"]) == 0

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from needs import needs
 from PIL import Image
 
 from surfkit.core.check import BadInput
@@ -20,9 +21,7 @@ NOTHING = Observations(np.zeros((0, 3)), np.zeros(0), {})
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     """A folder with random weights of a network a thousand times smaller than the published ones."""
-    transformers = pytest.importorskip(
-        "transformers", reason="transformers is not installed: pip install surfkit[depth]"
-    )
+    transformers = needs("transformers", "depth-anything-v2")
     stages = {"out_features": ["stage1", "stage2", "stage3", "stage4"], "reshape_hidden_states": False}
     backbone = transformers.Dinov2Config(
         hidden_size=8, num_hidden_layers=4, num_attention_heads=2, image_size=28, patch_size=14, **stages
@@ -59,7 +58,7 @@ def test_maps_have_the_shape_of_the_photograph_and_weights_come_from_the_folder(
 
 
 def test_weights_that_cannot_be_had_are_one_line(tmp_path):
-    pytest.importorskip("transformers", reason="transformers is not installed: pip install surfkit[depth]")
+    needs("transformers", "depth-anything-v2")
     with pytest.raises(BadInput, match="cannot be had: download them .* --estimator.weights"):
         DepthAnythingV2(weights=str(tmp_path)).network()
 

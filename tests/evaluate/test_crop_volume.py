@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from needs import needs
 from scipy.spatial import Delaunay
 
 from surfkit.core.check import BadInput
@@ -35,7 +36,7 @@ def test_crop_files_go_round_and_agree_with_open3d(tmp_path, axis):
     points = np.random.default_rng(0).uniform(-2, 9, (20_000, 3))
     inside = found.inside(points)
     assert 500 < inside.sum() < 5_000
-    o3d = pytest.importorskip("open3d", exc_type=ImportError)
+    o3d = needs("open3d", "the comparison with Open3D")
     volume = o3d.visualization.read_selection_polygon_volume(str(tmp_path / "crop.json"))
     kept = volume.crop_point_cloud(o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
     assert np.array_equal(np.asarray(kept.points), points[inside])

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -20,6 +20,8 @@ from surfkit.evaluate.transform import apply, write_transform
 from surfkit.scene.crop import Crop, write_crop
 from surfkit.scene.ply import read_vertices, write_points
 from surfkit.scene.synthetic import Flight, photograph
+
+trimesh = needs("trimesh")
 
 
 def lattice(shift=(0, 0, 0), side=60, step=0.1):

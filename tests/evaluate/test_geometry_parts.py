@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -16,6 +16,8 @@ from surfkit.evaluate.scores import Distances, chamfer, curve, nearest, shares, 
 from surfkit.evaluate.surface import Surface
 from surfkit.evaluate.thinning import thin, voxel_for
 from surfkit.evaluate.transform import apply, fitted, read_transform, scale_of, write_transform
+
+trimesh = needs("trimesh")
 
 
 def rng(seed=0):
@@ -66,7 +68,7 @@ def test_thinning_is_the_mean_of_each_voxel_whatever_the_blocks(monkeypatch):
 
 
 def test_thinning_as_open3d_does():
-    o3d = pytest.importorskip("open3d", exc_type=ImportError)
+    o3d = needs("open3d", "the comparison with Open3D")
     points = rng().random((20_000, 3))
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(0.05)
     found = thin([points], 0.05, points.min(0) - 0.025)
@@ -99,7 +101,7 @@ def test_figures_agree_with_brute_force_and_open3d():
         p, r = (a < tau).mean(), (b < tau).mean()
         assert shares(distances, tau) == pytest.approx((p, r, 2 * p * r / (p + r)), abs=1e-6)
     assert chamfer(distances)["overall"] == pytest.approx((a.mean() + b.mean()) / 2, abs=1e-12)
-    o3d = pytest.importorskip("open3d", exc_type=ImportError)
+    o3d = needs("open3d", "the comparison with Open3D")
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (ours, truth)]
     assert np.abs(np.asarray(clouds[0].compute_point_cloud_distance(clouds[1])) - distances.to_truth).max() < 1e-6
     back = np.asarray(clouds[1].compute_point_cloud_distance(clouds[0]))
@@ -163,7 +165,7 @@ def test_icp_of_the_same_points_is_exact():
 
 
 def test_icp_as_open3d_does_one_round():
-    o3d = pytest.importorskip("open3d", exc_type=ImportError)
+    o3d = needs("open3d", "the comparison with Open3D")
     registration = o3d.pipelines.registration
     source, target = (
         o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (bumpy(4_000, 1), bumpy(9_000, 0))

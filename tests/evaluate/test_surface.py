@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate import surface
 from surfkit.evaluate.surface import read_surface
 from surfkit.scene.ply import write_points
 
+trimesh = needs("trimesh")
 BOX = trimesh.creation.box((1, 2, 3))
 
 

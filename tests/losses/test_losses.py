@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
@@ -68,7 +69,7 @@ def random_maps(seed: int = 0) -> Maps:
     )
 
 
-@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its native module")
+@needs_native
 @pytest.mark.parametrize("kernels", native.module().kernels() if native.module() else [])
 def test_the_native_normals_agree_with_the_reference(kernels):
     maps, before = random_maps(), native.module().kernels_in_use()

@@ -4,12 +4,14 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import boundaries, clean, clusters
 from surfkit.scene.crop import box, read_crop
+
+trimesh = needs("trimesh")
 
 
 def ball(centre=(0, 0, 0), divisions=2):

@@ -1,9 +1,11 @@
 """The table of marching cubes keeps what it promises."""
 
 import numpy as np
-import trimesh
+from needs import needs
 
 from surfkit.mesh.cubes import EDGES, triangles
+
+trimesh = needs("trimesh")
 
 
 def case_triangles(case):

@@ -4,13 +4,14 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from needs import needs
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.mesh.simplify import simplified
 from surfkit.scene.scene import Frame
 
+trimesh = needs("trimesh")
 UTM = Frame(np.array([412_345.678, 5_712_345.678, 99.5]), 0.01, 1.0, "EPSG:32632")
 
 
@@ -66,7 +67,7 @@ def test_meshes_without_colour_and_large_ones(tmp_path, kind, monkeypatch):
 
 
 def test_fewer_triangles_of_the_same_surface():
-    pytest.importorskip("open3d")
+    needs("open3d", "simplification")
     mesh = ball(4)
     small = simplified(mesh, 0.1)
     assert 0.08 * len(mesh.faces) < len(small.faces) < 0.12 * len(mesh.faces)

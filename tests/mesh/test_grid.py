@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
+from needs import needs, needs_native
 
 from surfkit.mesh.lattice import Lattice, Picture
 from surfkit.mesh.native import NativeGrid
@@ -14,8 +14,8 @@ from surfkit.raster.native import module
 
 from .shapes import around, look_at, seen, slope, sphere, torus
 
+trimesh = needs("trimesh")
 VOXEL = 0.03
-needs_native = pytest.mark.skipif(module() is None, reason="surfkit was built without a compiler")
 
 
 def pictures(cameras, shape, seed=0):

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.poisson import Poisson
 
 from .test_tetra import RADIUS, ball, volume
 
-pytest.importorskip("open3d", reason="mesh:poisson needs open3d")
+needs("open3d", "mesh:poisson")
 
 
 def test_a_ball():

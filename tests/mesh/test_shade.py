@@ -1,14 +1,14 @@
 """Pictures of meshes show what a ray would meet."""
 
 import numpy as np
-import pytest
-import trimesh
+from needs import needs, needs_native
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces, draw_in_numpy, from_above, shaded, up_of
-from surfkit.raster.native import module
 
 from .shapes import around, look_at, seen, sphere
+
+trimesh = needs("trimesh")
 
 
 def triangles(count=300, seed=0):
@@ -18,7 +18,7 @@ def triangles(count=300, seed=0):
     return corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
 
 
-@pytest.mark.skipif(module() is None, reason="surfkit was built without a compiler")
+@needs_native
 def test_compiled_and_numpy_agree():
     vertices, faces = triangles()
     vertices[5, 2] = -1

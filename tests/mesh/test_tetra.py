@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
@@ -182,6 +183,6 @@ def test_points_in_a_plane_enclose_nothing():
 def test_every_mesher_keeps_the_contract(name):
     mesher = components(Mesher)[name]()
     if name == "poisson":
-        pytest.importorskip("open3d", reason="mesh:poisson needs open3d")
+        needs("open3d", "mesh:poisson")
         mesher = replace(mesher, octree=5, points=5_000)
     check_mesher(mesher, ball())

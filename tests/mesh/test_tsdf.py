@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
+from needs import needs, needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
@@ -16,6 +16,8 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 
 from .shapes import around, maps_of, slope, sphere, subject, torus
+
+trimesh = needs("trimesh")
 
 
 def faces_by_place(mesh):
@@ -203,7 +205,7 @@ def test_what_cannot_be_meshed_is_said():
             TSDF(**wrong)
 
 
-@pytest.mark.skipif(native.module() is None, reason="surfkit was built without a compiler")
+@needs_native
 def test_compiled_shades_are_those_of_numpy(monkeypatch):
     from surfkit.mesh import picture
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import pytest
 import torch
+from needs import needs_native
 from torch import Tensor
 
 from surfkit.core.check import BadInput
@@ -18,7 +19,7 @@ from surfkit.scene.camera import Camera
 
 from .scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
 
-pytestmark = pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+pytestmark = needs_native
 each_case = pytest.mark.parametrize(("name", "kind"), CASES)
 MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
 FORWARD, BACKWARD = 1e-5, 1e-4

@@ -1,6 +1,9 @@
 """The device decides which rasterizer draws."""
 
+import warnings
+
 import pytest
+from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.raster import native
@@ -10,13 +13,14 @@ from surfkit.raster.select import select
 
 def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkeypatch):
     monkeypatch.setattr(native, "module", lambda: None)
+    monkeypatch.setattr("surfkit.raster.select.warnings", warnings)  # not the skip of conftest.py
     with pytest.warns(UserWarning, match="without its compiled rasterizer") as warned:
         rasterizer, name = select()
     assert isinstance(rasterizer, Reference) and name.startswith("cpu reference")
     assert len(warned) == 1
 
 
-@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+@needs_native
 def test_the_compiled_module_is_preferred():
     rasterizer, name = select("cpu")
     assert isinstance(rasterizer, native.NativeRasterizer)

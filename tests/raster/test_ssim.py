@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from needs import needs_native
 
 from surfkit.raster import native
 from surfkit.raster.ssim import ssim, ssim_reference
@@ -113,7 +114,7 @@ def test_slices_of_larger_images_are_read_as_they_lie():
     assert ssim(x[part], y[part].double()).item() == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.skipif(native.module() is None, reason="surfkit was installed without its compiled rasterizer")
+@needs_native
 @each
 def test_every_compilation_agrees(kind):
     x, y = images((3, 47, 61), kind)

@@ -3,6 +3,7 @@ import types
 from pathlib import Path
 
 import pytest
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Measured, StageBegan, StepDone, emit
@@ -18,7 +19,7 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path, monkeypatch
 
 
 def test_scalars_of_steps_taken_again_replace_those_before(tmp_path):
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator").EventAccumulator
+    accumulator = needs("tensorboard.backend.event_processing.event_accumulator").EventAccumulator
     for first, last, loss in ((1, 6, 0.5), (4, 8, 0.25)):
         with tensorboard(tmp_path):
             emit(StageBegan("pretrain", 8, 10, first))

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from needs import needs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -89,7 +89,7 @@ def squarely(truth, view):
 
 
 def write_exr(path, depth):
-    import OpenEXR
+    OpenEXR = needs("OpenEXR", "an .exr file")
 
     path.parent.mkdir(parents=True, exist_ok=True)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -105,7 +105,7 @@ DEPTHS = {
 
 def city(folder, truth, kind):
     """small_city as MatrixCity hands it out: metres and shrunken rotations, archives unpacked in three ways."""
-    pytest.importorskip("OpenEXR")
+    needs("OpenEXR", "an .exr file")
     pattern, dtype = DEPTHS[kind]
     root, held = folder / "city" / kind, {view.name for view in truth.scene.held_out}
     inside = {"aerial": "", "street": "{block}/", "beside": "rgb/"}[kind]

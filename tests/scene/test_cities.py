@@ -84,7 +84,7 @@ def test_depth_without_its_package_or_of_another_kind_is_said(tmp_path, truth, m
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with noted() as notes:
         assert read_priors(data, scene) is None
-    assert "needs the package OpenEXR: pip install 'surfkit[exr]'" in notes.texts[0]
+    assert "needs the package OpenEXR, which is not installed: pip install 'surfkit[exr]'" in notes.texts[0]
     assert len(read(data).cloud.xyz) == RANDOM_POINTS
 
 

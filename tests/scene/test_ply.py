@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.scene import ply
@@ -92,7 +93,7 @@ def test_antialiasing_is_told(tmp_path):
 
 
 def test_trimesh_reads_the_same(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
+    trimesh = needs("trimesh")
     splats = table("surfel", count=20)
     write_splats(tmp_path / "a.ply", splats)
     data = trimesh.load(tmp_path / "a.ply").metadata["_ply_raw"]["vertex"]["data"]
