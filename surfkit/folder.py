@@ -95,9 +95,11 @@ class Run:
 
     @property
     def needs_priors(self) -> bool:
-        """Whether a loss of the recipe looks at depth priors."""
+        """Whether training looks at depth priors: a loss of the recipe, or its start."""
         stages = [replace(self, part=part).stage for part in self.parts]
-        return any(loss.needs_prior for stage in stages for loss in stage.losses.values())
+        return self.recipe.start.needs_prior or any(
+            loss.needs_prior for stage in stages for loss in stage.losses.values()
+        )
 
     @property
     def checkpoint(self) -> Path:

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from surfkit.beginning import Beginning, priors_of
 from surfkit.blocks import Hands, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -112,12 +113,14 @@ def run(
         if recipe.partition is None and hands.workers != Inline():
             emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
         unfinished = state is None or state.index < recipe.pretrain.steps
-        given = read_ahead(this.data, scene, recipe.pretrain.losses, store) if unfinished else None
+        fits = priors_of(this, scene, begun=state is not None) if unfinished else None
+        given = read_ahead(this.data, scene, recipe.pretrain.losses, store, fits) if unfinished else None
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
             if given is not None:
                 discard_results(this)
-                state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
+                cloud = Beginning(this, scene, given, fits)
+                state = optimise(Job(this, scene, rasterizer, every, given, meter, cloud=cloud), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
                 state = None  # it is in the folder

@@ -17,7 +17,15 @@ from surfkit.core.codec import dump
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.scene.data import Data
-from surfkit.scene.depth_files import FOLDER, confidence_path, map_path, read_record, write_map, write_record
+from surfkit.scene.depth_files import (
+    FOLDER,
+    confidence_path,
+    map_path,
+    normal_path,
+    read_record,
+    write_map,
+    write_record,
+)
 from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene, View
 
@@ -94,6 +102,7 @@ class Preparation:
             for path in paths:
                 path.unlink(missing_ok=True)
                 confidence_path(path).unlink(missing_ok=True)
+                normal_path(path).unlink(missing_ok=True)
         elif before != record and (before or any(path.exists() for path in paths)):
             made = "with other settings" if before else "by another program"
             raise BadInput(f"{root / FOLDER} holds depth maps made {made}; --again replaces them")
@@ -128,5 +137,6 @@ class Preparation:
         if estimate.inverse is None or estimate.confidence is None:
             return None
         inverse: Tensor = estimate.inverse * (scene.frame.scale if self.estimator.aligned else 1.0)
-        write_map(self.data.path, view.name, inverse.numpy(), estimate.confidence.numpy())
+        normal = None if estimate.normal is None else estimate.normal.numpy()
+        write_map(self.data.path, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > TRUSTED).float().mean())

@@ -45,8 +45,8 @@ def ignoring(maps: Maps, sample: Sample) -> tuple[Maps, Sample]:
     held = Maps(**{name: torch.where(keep, value, value.detach()) for name, value in maps.present().items()})
     prior = sample.prior
     if prior is not None:
-        known = {name: torch.where(keep, getattr(prior, name), 0) for name in ("inverse", "confidence")}
-        prior = replace(prior, **known)
+        there = {name: getattr(prior, name) for name in ("inverse", "confidence", "normal")}
+        prior = replace(prior, **{n: torch.where(keep, value, 0) for n, value in there.items() if value is not None})
     return held, replace(sample, photo=torch.where(keep, sample.photo, held.color.detach()), prior=prior)
 
 
@@ -54,11 +54,13 @@ class Loss(Component):
     """A term of the objective.
 
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
-    priors are only read when a term has `needs_prior`; a photograph may still be without one.
+    priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
+    may still be without one, and a data set without normals.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)
     needs_prior: ClassVar[bool] = False
+    needs_normals: ClassVar[bool] = False
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:
