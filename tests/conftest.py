@@ -144,6 +144,14 @@ def world(bare, monkeypatch):
     return types.SimpleNamespace(**globals())
 
 
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """The user's cache, empty; the real one is left alone."""
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("SURFKIT_CACHE", str(folder))
+    return folder
+
+
 class Crowded:
     """Answers of twenty views about points of known contribution (`densify.base.Views`)."""
 

@@ -24,6 +24,7 @@ FLOORS = (
     "refining foresight merging",
     "blocks",
     "surface",
+    "preparing",
     "pipeline",
     "report doctor",
     "recipes",

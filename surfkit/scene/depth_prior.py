@@ -17,6 +17,7 @@ from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sam
 from surfkit.scene.cache import Cache
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import DepthFile, find_maps, read_record
+from surfkit.scene.made_maps import located
 from surfkit.scene.observations import Observations
 from surfkit.scene.read import model_folder, observations
 from surfkit.scene.scene import Scene, View
@@ -128,8 +129,11 @@ def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
-    """The depth map of each training photograph that has one, by name."""
-    return find_maps(data.path, model_folder(data), [view.name for view in scene.train], scene.frame.metres)
+    """The depth map of each training photograph that has one, by name: of the data set, or made for it."""
+    names = [view.name for view in scene.train]
+    if data.priors is not None:
+        return find_maps(folder := located(data.priors), folder, names)
+    return find_maps(data.path, model_folder(data), names, scene.frame.metres)
 
 
 def read_priors(
@@ -154,7 +158,8 @@ def read_priors(
     maps = prior_files(data, scene)
     lost = [view.name for view in scene.train if view.name in known.fits and view.name not in maps]
     if lost:
-        raise BadInput(f"{data.path}: the depth map of {lost[0]} is gone; put it back")
+        again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it anew"
+        raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
     fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
@@ -267,7 +272,7 @@ def _outliers(fits: Sequence[Fit | None]) -> list[int]:
 
 def _warn_of_leaks(data: Data, scene: Scene) -> None:
     """Maps made from several photographs must not have seen those that are kept to measure with."""
-    used = read_record(data.path).get("matched")
+    used = read_record(data.path).get("matched") if data.priors is None else None  # a run matches what it trains on
     seen = [view.name for view in scene.held_out if isinstance(used, list) and view.name in used]
     if seen:
         text = (

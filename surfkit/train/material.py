@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
 from surfkit.losses.base import Loss
 from surfkit.scene.cache import Cache, share
@@ -29,14 +30,23 @@ class Store:
     Attributes:
         cache: Memory for them, such as "4GB"; "auto" takes half of what is free.
         copies: Whether photographs that do not fit are also kept on disk as they are used, decoded and reduced.
+        maps: Disk, in the user's cache, for depth maps that runs make whose data sets have none, such as "20GB"; None
+            makes none, which does change the result of recipes that want some.
     """
 
     cache: str = "auto"
     copies: bool = False
+    maps: str | None = "20GB"
 
     def bytes(self) -> int:
         """The memory that may be taken now."""
         return cache_bytes(self.cache)
+
+    def maps_bytes(self) -> int:
+        """The disk that depth maps in the user's cache may take."""
+        if (self.maps or "").strip().lower() == "auto":
+            raise BadInput("--prepare-cache auto: give a size such as 20GB")
+        return 0 if self.maps is None else cache_bytes(self.maps, "--prepare-cache")
 
 
 @dataclass(frozen=True)
