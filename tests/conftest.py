@@ -144,9 +144,17 @@ def world(bare, monkeypatch):
     return types.SimpleNamespace(**globals())
 
 
+@pytest.fixture(autouse=True, scope="session")
+def user_cache(tmp_path_factory):
+    """The user's own cache is left alone, also by what modules of tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SURFKIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
-    """The user's cache, empty; the real one is left alone."""
+    """The user's cache of one test, empty."""
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("SURFKIT_CACHE", str(folder))
     return folder

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from surfkit.blocks import Hands
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.lock import USED, held, is_used, used
@@ -20,6 +21,7 @@ from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.losses import DepthRegression
+from surfkit.partition import PictureShare, Pool, QuantileGrid
 from surfkit.pipeline import run
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
@@ -30,7 +32,7 @@ from surfkit.start.stereo import StereoStart
 from surfkit.train.material import Store
 from surfkit.train.stage import Stage
 
-SWEEP = PlaneSweep(longest=40, neighbours=3, max_planes=24)
+SWEEP = PlaneSweep(longest=32, neighbours=2, max_planes=16)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def made(tmp_path_factory):
 @pytest.fixture
 def farm(made, tmp_path):
     """A data set with tracks; one of its eight photographs is held out."""
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     return Data(Path(shutil.copytree(made, tmp_path / "farm")))
 
 
@@ -218,7 +220,7 @@ def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, o
 
 
 def test_maps_of_the_data_set_come_first(farm, recipe, tmp_path, own_cache, monkeypatch):
-    words = ["--estimator.longest", "40", "--estimator.neighbours", "3", "--estimator.max-planes", "24"]
+    words = ["--estimator.longest", "32", "--estimator.neighbours", "2", "--estimator.max-planes", "16"]
     assert main(["prepare", "depth", str(farm.path), *words]) == 0
     seen = counting(monkeypatch)
     metrics = run(recipe, farm, tmp_path / "own")
@@ -331,6 +333,28 @@ def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
     costs = [record(tmp_path / name)["prepare_cpu_seconds"] for name in "ab"]
     assert costs[0] == costs[1]
     assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
+
+
+def test_blocks_in_processes_of_their_own_find_the_maps(farm, recipe, tmp_path, own_cache, monkeypatch, capsys):
+    tune = replace(recipe.pretrain, steps=6, sh_every=1)
+    recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
+    out = tmp_path / "run"
+    run(recipe, farm, out, Hands("cpu", Pool(2)))
+    assert not [note for note in record(out)["notes"] if not note.startswith("depth maps of 7")]
+    run(recipe, farm, tmp_path / "inline")
+    assert (out / "point_cloud.ply").read_bytes() == (tmp_path / "inline/point_cloud.ply").read_bytes()
+    with monkeypatch.context() as patch:  # a machine that does not see the cache
+        patch.setenv("SURFKIT_CACHE", str(tmp_path / "elsewhere"))
+        (own_cache / "depth").rename(own_cache / "gone")
+        shutil.rmtree(tmp_path / "inline/blocks/000/tune")
+        state = tmp_path / "inline/blocks/000/state.json"
+        assert main(["tune", str(tmp_path / "inline"), "0"]) == 2
+        err = capsys.readouterr().err
+        assert "set SURFKIT_CACHE to a folder that both see" in err and state.exists()
+        (own_cache / "gone").rename(tmp_path / "elsewhere-too")
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "elsewhere-too").rename(tmp_path / "elsewhere/depth")
+        assert main(["tune", str(tmp_path / "inline"), "0"]) == 0
 
 
 def test_the_words_of_the_command_line(farm, tmp_path, own_cache, capsys):
