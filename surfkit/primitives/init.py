@@ -27,7 +27,7 @@ def seeds(cloud: Cloud, axes: int, sh_degree: int) -> Columns:
     count = len(cloud.xyz)
     if count == 0:
         raise BadInput("the scene has no sparse points to start from; triangulate some (COLMAP point_triangulator)")
-    sizes = gaps(cloud.xyz)
+    sizes = gaps(cloud.xyz) if cloud.size is None else cloud.size.float().clamp_min(SMALLEST)
     return {
         "means": cloud.xyz.float().clone(),
         "scales": sizes.log()[:, None].repeat(1, axes),

@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.primitives.init import gaps
 from surfkit.scene.camera import Camera
 from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
@@ -56,11 +57,14 @@ class StereoStart(Start):
     opacity: float = 0.5
     """Opacity to begin with; what depth maps show is there, so it may be higher than that of sparse points, 0.1."""
 
+    size: float = 0.65
+    """Standard deviation of a splat to begin with, as a share of the gaps between points; sparse points have all."""
+
     def __post_init__(self) -> None:
         if self.points != "auto" and self.points < 1:
             raise BadInput(f"start.points is {self.points}; it must be auto, or 1 or more")
-        if self.most < 1 or not self.spacing_px > 0:
-            raise BadInput("start.most must be 1 or more, and start.spacing_px above 0")
+        if self.most < 1 or not (self.spacing_px > 0 and self.size > 0):
+            raise BadInput("start.most must be 1 or more, and start.spacing_px and start.size above 0")
         if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
             raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
 
@@ -70,7 +74,7 @@ class StereoStart(Start):
         if not len(stereo):
             emit(Warned("no pixel of a depth map is trusted, so the run begins at the sparse points alone"))
             return known.scene.cloud
-        return filled(stereo, known, self.opacity)
+        return filled(stereo, known, self)
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
@@ -170,7 +174,7 @@ def _slope(values: Tensor, dim: int) -> Tensor:
     return slope
 
 
-def filled(stereo: Thinned, known: Known, opacity: float) -> Cloud:
+def filled(stereo: Thinned, known: Known, start: StereoStart) -> Cloud:
     """Points of depth maps, and sparse points where there are none of those."""
     from scipy.spatial import cKDTree
 
@@ -178,10 +182,12 @@ def filled(stereo: Thinned, known: Known, opacity: float) -> Cloud:
     distance, near = cKDTree(stereo.xyz).query(sparse.xyz.numpy())
     more = torch.from_numpy(distance > FILL * stereo.size[near])
     anyhow = torch.randn(int(more.sum()), 3, generator=known.generator)
-    opacities = torch.full((len(stereo),), opacity), torch.full((len(anyhow),), SPARSE_OPACITY)
+    xyz = torch.cat([torch.from_numpy(stereo.xyz).float(), sparse.xyz[more]])
+    counts = torch.tensor([len(stereo), len(anyhow)])
     return Cloud(
-        xyz=torch.cat([torch.from_numpy(stereo.xyz).float(), sparse.xyz[more]]),
+        xyz=xyz,
         rgb=torch.cat([torch.from_numpy(stereo.rgb.round().clip(0, 255)).to(torch.uint8), sparse.rgb[more]]),
         normals=torch.cat([torch.from_numpy(stereo.normals).float(), normalize(anyhow, dim=1)]),
-        opacity=torch.cat(opacities),
+        opacity=torch.tensor([start.opacity, SPARSE_OPACITY]).repeat_interleave(counts),
+        size=gaps(xyz) * torch.tensor([start.size, 1.0]).repeat_interleave(counts),
     )

@@ -139,6 +139,9 @@ def test_sparse_points_only_where_depth_maps_have_none(farm):
     assert cKDTree(stereo.xyz).query(added.numpy())[0].min() > 2 * stereo.size.min()
     assert cloud.opacity[: len(stereo)].unique() == 0.5 and (cloud.opacity[len(stereo) :] == 0.1).all()
     assert torch.allclose(cloud.normals.norm(dim=1), torch.ones(len(cloud.xyz))) and cloud.rgb.dtype == torch.uint8
+    near = cKDTree(cloud.xyz.numpy()).query(cloud.xyz.numpy(), k=4)[0][:, 1:]
+    share = cloud.size.numpy() / np.sqrt((near**2).mean(1))
+    np.testing.assert_allclose(share, np.where(np.arange(len(share)) < len(stereo), 0.65, 1.0), rtol=1e-4)
     again = start.cloud(known(farm, spoilt=half))
     assert all(torch.equal(a, b) for a, b in zip(vars(cloud).values(), vars(again).values(), strict=True))
 
@@ -236,9 +239,11 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
     draw = torch.Generator().manual_seed(0)
     normals = normalize(torch.randn(9, 3, generator=draw), dim=1)
     cloud = Cloud(torch.rand(9, 3), torch.zeros(9, 3, dtype=torch.uint8), normals, torch.linspace(0.1, 0.9, 9))
+    cloud = replace(cloud, size=torch.linspace(1, 9, 9))
     for primitive in (Surfel2D(), Gaussian3D()):
         splats = primitive.shape(primitive.init(cloud, draw), 0)
         assert torch.allclose(splats.opacities, torch.linspace(0.1, 0.9, 9), atol=1e-6)
+        assert torch.allclose(splats.scales, torch.linspace(1, 9, 9)[:, None])
     surfels = Surfel2D().shape(Surfel2D().init(cloud, draw), 0)
     z = torch.tensor([0.0, 0.0, 1.0]).expand(9, 3)
     assert torch.allclose(rotated(z, surfels.quats), normals, atol=1e-5)
@@ -248,7 +253,8 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
     ("settings", "message"),
     [
         ({"points": 0}, "start.points is 0"),
-        ({"spacing_px": 0.0}, "start.spacing_px above 0"),
+        ({"spacing_px": 0.0}, "start.spacing_px and start.size above 0"),
+        ({"size": 0.0}, "start.spacing_px and start.size above 0"),
         ({"opacity": 1.0}, "start.opacity"),
         ({"min_confidence": 0.0}, "start.min_confidence"),
     ],
