@@ -25,6 +25,7 @@ from surfkit.refine.base import Refine
 from surfkit.scene.data import Data
 from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, changed, fingerprint
+from surfkit.scene.made_maps import is_there, located, read_made
 from surfkit.scene.scene import Frame, Scene
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
@@ -95,9 +96,16 @@ class Run:
 
     @property
     def needs_priors(self) -> bool:
-        """Whether a loss of the recipe looks at depth priors."""
+        """Whether training looks at depth priors: a loss of the recipe, or its start."""
         stages = [replace(self, part=part).stage for part in self.parts]
-        return any(loss.needs_prior for stage in stages for loss in stage.losses.values())
+        return self.recipe.start.needs_prior or any(
+            loss.needs_prior for stage in stages for loss in stage.losses.values()
+        )
+
+    @property
+    def wants_priors(self) -> bool:
+        """Whether anything looks at depth priors: training, or the mesher."""
+        return self.needs_priors or (self.recipe.mesh is not None and self.recipe.mesh.needs_prior)
 
     @property
     def checkpoint(self) -> Path:
@@ -198,7 +206,7 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
 
 def refuse_other(this: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
-    there = recipe_before(this.out / "recipe.json")
+    there = recipe_before(this.out / "recipe.json", this.recipe)
     now = dump(this.recipe)
     remesh = isinstance(there, dict) and there.get("mesh") != now["mesh"]
     if isinstance(there, dict):
@@ -218,7 +226,7 @@ def refuse_other(this: Run) -> None:
         )
     if not found and this.record.exists():
         before = dump(read_data(this.out))  # with defaults of newer settings
-        found = difference(before, dump(this.data), "data")
+        found = difference(before | {"priors": None}, dump(this.data) | {"priors": None}, "data")
     if found:
         at, old, new = found
         raise BadInput(
@@ -229,9 +237,14 @@ def refuse_other(this: Run) -> None:
         this.mesh_record.unlink(missing_ok=True)
 
 
-def recipe_before(path: Path) -> Any:
-    """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none."""
+def recipe_before(path: Path, now: Recipe) -> Any:
+    """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none.
+
+    Runs of before made no depth maps: they go on as they began, however the recipe makes them `now`.
+    """
     there = read_json(path, Any) if path.exists() else None
+    if isinstance(there, dict):
+        there = {"depth": dump(now.depth)} | there
     try:
         return dump(load(Recipe, there)) if there is not None else None
     except BadInput:
@@ -279,7 +292,8 @@ def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
     before = read_json(this.inputs, Fingerprint) if this.inputs.exists() else None
-    now = fingerprint(scene, before, prior_files(this.data, scene) if this.needs_priors else None)
+    own = replace(this.data, priors=None)  # of maps that were made for the run, the name of their folder tells
+    now = fingerprint(scene, before, prior_files(own, scene) if this.needs_priors else None)
     if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise BadInput(
@@ -301,6 +315,7 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Fra
             "threads": torch.get_num_threads(),
             "seed": this.recipe.seed,
             "data": this.data,
+            "prepare_cpu_seconds": prepare_cpu_seconds(this, before),
             "frame": {
                 "origin": frame.origin.tolist(),
                 "scale": frame.scale,
@@ -313,6 +328,15 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Fra
     )
     write_json(this.inputs, prints)
     write_json(this.out / "recipe.json", this.recipe)
+
+
+def prepare_cpu_seconds(this: Run, before: dict[str, Any]) -> float | None:
+    """What the depth maps have cost that were made for a run; None where it uses those of the data set, or none."""
+    if this.data.priors is None:
+        return None
+    if not is_there(this.data.priors):
+        return before.get("prepare_cpu_seconds")
+    return round(read_made(located(this.data.priors)).cpu_seconds, 2)
 
 
 def relay(out: Path, folder: Path, prefix: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.scene.memory import free_bytes
-from surfkit.scene.scene import Scene
+from surfkit.scene.scene import Cloud, Scene
 from surfkit.train import checkpoint
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
@@ -58,7 +59,8 @@ class Job:
         every: When to write what.
         given: What to look at.
         meter: Sees what memory is taken by.
-        start: The points to begin with; the sparse ones of the scene if None.
+        start: Raw parameters of the points to begin with; if None, those of the `cloud`.
+        cloud: Gives the points to begin at; the sparse ones of the scene if None.
         before: The model that it goes on from, if its times count too.
     """
 
@@ -70,6 +72,7 @@ class Job:
     meter: Meter
     start: Callable[[], Columns] | None = None
     before: StageState | None = None
+    cloud: Callable[[], Cloud] | None = None
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -94,7 +97,7 @@ def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
 
 
 def optimise(job: Job, state: StageState | None) -> StageState:
-    """Run the stage from its last state, or from the sparse points, to its end.
+    """Run the stage from its last state, or from its beginning, to its end.
 
     After numbers that are not finite it goes back to its last checkpoint with half the learning rates, twice at most.
     When memory gives out, it goes back with a smaller cache, until there is none.
@@ -107,8 +110,12 @@ def optimise(job: Job, state: StageState | None) -> StageState:
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
-        params = job.start() if job.start else primitive.init(job.scene.cloud, generator)
+        began = time.perf_counter(), time.process_time()
+        cloud = job.cloud() if job.cloud else job.scene.cloud
+        params = job.start() if job.start else primitive.init(cloud, generator)
         fresh = trainer.begin(Points.fresh(params), generator)
+        if job.cloud:
+            fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
         if job.before is not None:
             for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
                 setattr(fresh, name, getattr(job.before, name))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
+from surfkit.beginning import Beginning, priors_of
 from surfkit.blocks import Hands, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -37,6 +38,7 @@ from surfkit.mesh.base import Subject
 from surfkit.notes import noted
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
 from surfkit.partition.executor import Inline
+from surfkit.preparing import with_maps
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.recipe import Recipe
@@ -97,12 +99,12 @@ def run(
     if every.pictures is None:
         every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_file(out)
-    store.bytes()  # or BadInput, before anything is done
+    store.bytes(), store.maps_bytes()  # or BadInput, before anything is done
     if recipe.partition is not None:
         hands.workers.ready()
     if recipe.mesh is not None:
         recipe.mesh.ready()
-    with noted() as notes, held(out), in_one_line(out), bars():
+    with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
         sweep(out, out / "blocks")
         refuse_other(this)
         scene = read(this.data)
@@ -111,15 +113,18 @@ def run(
         state = saved(this, scene, repair=True)
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
+        this = use.enter_context(with_maps(this, scene, prints, store, hands.device, state is not None))
         if recipe.partition is None and hands.workers != Inline():
             emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
         unfinished = state is None or state.index < recipe.pretrain.steps
-        given = read_ahead(this.data, scene, recipe.pretrain.losses, store) if unfinished else None
+        fits = priors_of(this, scene, begun=state is not None) if unfinished else None
+        given = read_ahead(this.data, scene, recipe.pretrain.losses, store, fits) if unfinished else None
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
             if given is not None:
                 discard_results(this)
-                state = optimise(Job(this, scene, rasterizer, every, given, meter), state)
+                cloud = Beginning(this, scene, given, fits)
+                state = optimise(Job(this, scene, rasterizer, every, given, meter, cloud=cloud), state)
                 del given  # its memory is free for what comes
             if recipe.partition is not None:
                 state = None  # it is in the folder
@@ -193,7 +198,8 @@ def evaluate(
         measured["images"]["lpips_not_measured"] = lacking
     if meter:
         emit(MemoryTaken(meter.report()))
-    memory = read_record(this.out).get("memory_bytes") or {}
+    record = read_record(this.out)
+    memory = record.get("memory_bytes") or {}
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
@@ -201,6 +207,7 @@ def evaluate(
         "steps": sum(replace(this, part=part).stage.steps for part in this.parts[: this.parts.index(this.part) + 1]),
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
+        "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
         "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,
         "memory_bytes": memory,
     }

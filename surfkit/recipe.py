@@ -9,12 +9,15 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
+from surfkit.depth.base import DepthEstimator
 from surfkit.mesh.base import Mesher
 from surfkit.partition.assign import Assign, SSIMDifference
 from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.refine.base import Refine
+from surfkit.start.base import Start
+from surfkit.start.plain import SparseStart
 from surfkit.train.stage import Stage
 
 
@@ -27,6 +30,12 @@ class Recipe:
 
     primitive: Annotated[Primitive, choice(Primitive)] = Surfel2D()
     """What the scene is made of."""
+
+    depth: Annotated[DepthEstimator | None, choice(DepthEstimator, optional=True)] = None
+    """How depth maps are made for recipes that need priors where the data set has none; none makes none."""
+
+    start: Annotated[Start, choice(Start)] = SparseStart()
+    """Where the points of pretraining begin."""
 
     pretrain: Stage = field(default_factory=Stage)
     """Optimisation of the whole scene."""

@@ -159,6 +159,22 @@ def world(bare, monkeypatch):
     return types.SimpleNamespace(**globals())
 
 
+@pytest.fixture(autouse=True, scope="session")
+def user_cache(tmp_path_factory):
+    """The user's own cache is left alone, also by what modules of tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SURFKIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """The user's cache of one test, empty."""
+    folder = tmp_path_factory.mktemp("cache")
+    monkeypatch.setenv("SURFKIT_CACHE", str(folder))
+    return folder
+
+
 class Crowded:
     """Answers of twenty views about points of known contribution (`densify.base.Views`)."""
 

@@ -25,7 +25,7 @@ from surfkit.evaluate import images
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.scene.data import Data
-from surfkit.scene.depth_files import confidence_path, map_path, write_map, write_record
+from surfkit.scene.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint, stage
 
@@ -183,7 +183,7 @@ def test_masks_and_depth_maps_that_changed_are_named(data, recipe, tmp_path, mon
     for name, exact in scene.exact.items():
         Image.fromarray(np.full((30, 40), 255, np.uint8)).save(masks / name)
         inverse = scene.scene.frame.scale / exact.depth.numpy()
-        write_map(data.path, name, inverse, np.ones_like(inverse))
+        write_map(data.path, name, inverse, np.ones_like(inverse), exact.normal.numpy())
     write_record(data.path, {"aligned": True})
     interrupted(recipe, data, out, 5, monkeypatch)
     depth = map_path(data.path, "view_005.png")
@@ -191,6 +191,7 @@ def test_masks_and_depth_maps_that_changed_are_named(data, recipe, tmp_path, mon
         (masks / "view_003.png", "the mask of view_003.png has changed, come or gone; put"),
         (depth, "the depth map of view_005.png has changed, come or gone; put"),
         (confidence_path(depth), "the confidence of depth of view_005.png has changed, come or gone; put"),
+        (normal_path(depth), "the normal map of view_005.png has changed, come or gone; put"),
     ]:
         before = path.read_bytes()
         touched(path, flip if path != masks / "view_003.png" else lambda content: content.extend(b"more"))

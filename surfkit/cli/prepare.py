@@ -14,11 +14,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.table import print_table
-from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.prepare import Preparation, Prepared
+from surfkit.depth.prepare import Preparation, Prepared, torch_device
 from surfkit.evaluate.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
 from surfkit.scene.data import Reading
@@ -70,13 +69,6 @@ class Depth:
         write_overview(path, self.data, views)
         show(done)
         print(f"depth maps in {self.data / FOLDER}; look at {path}")
-
-
-def torch_device(device: Device) -> torch.device:
-    """Where torch computes; unlike the rasterizer, an estimator runs on any device."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise BadInput("--device cuda: torch finds no CUDA device here; use --device cpu")
-    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def watched(steps: Iterable[Prepared], total: int) -> list[Prepared]:

@@ -31,6 +31,8 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
         ("steps", f"{metrics['steps']:,}"),
         ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of processor time)"),
     ]
+    if metrics.get("prepare_cpu_seconds") is not None:
+        rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of processor time"))
     if metrics["peak_memory_bytes"]:
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
     if metrics["fps"]:

@@ -92,6 +92,13 @@ class Train:
     """Keep photographs that do not fit into the cache on disk too, decoded and reduced, in DATA/resized: worth its
     space when large photographs are used much smaller. The result does not depend on it."""
 
+    prepare: bool = True
+    """Make depth maps by itself where the recipe wants some and the data set has none, once: they are kept in
+    $SURFKIT_CACHE, or ~/.cache/surfkit."""
+
+    prepare_cache: str = "20GB"
+    """Disk for such depth maps, of all data sets together; those longest unused are deleted when there are more."""
+
     folder: tyro.conf.Suppress[str] = ""
 
     def __post_init__(self) -> None:
@@ -113,7 +120,8 @@ class Train:
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
-            every, store = Every(self.checkpoint_every, self.pictures_every), Store(self.cache, self.resized_copies)
+            every = Every(self.checkpoint_every, self.pictures_every)
+            store = Store(self.cache, self.resized_copies, self.prepare_cache if self.prepare else None)
             metrics = run(recipe, data, out, Hands(self.device, self.executor, self.tensorboard), every, store)
         show(Run(out, recipe, data), metrics)
 

@@ -15,6 +15,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 
 NAME = "lock"
+USED = "in-use"
+"""File of a folder that several processes may use at once; its time is when one last began to."""
+DAY_S = 86_400
 PATIENCE_S = 0.5
 """How long to ask again: a process that only looks (`holder`) has the lock for a moment."""
 
@@ -56,6 +59,40 @@ def holder(folder: Path) -> str | None:
     finally:
         os.close(file)
     return None
+
+
+@contextmanager
+def used(folder: Path) -> Iterator[None]:
+    """Within, `is_used` is true of a folder, for other processes too."""
+    import fcntl
+
+    file = os.open(folder / USED, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        os.utime(folder / USED)
+        with suppress(OSError):  # where there are no locks, the time alone tells
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(file)
+
+
+def is_used(folder: Path) -> bool:
+    """Whether a process uses a folder; where files cannot be locked, whether one began to within a day."""
+    import fcntl
+
+    try:
+        file = os.open(folder / USED, os.O_RDWR)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            return True
+        return time.time() - os.fstat(file).st_mtime < DAY_S
+    finally:
+        os.close(file)
+    return False
 
 
 def _make(folder: Path) -> list[Path]:

@@ -24,8 +24,8 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
-_PARTS = ("scene", "primitives", "losses", "depth", "appearance", "densify", "mesh", "partition", "refine", "recipes")
-BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS)
+_PARTS = "scene primitives losses depth start appearance densify mesh partition refine recipes"
+BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS.split())
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
 
 

@@ -16,8 +16,18 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.raster.select import Device
 from surfkit.scene.data import Data
-from surfkit.scene.depth_files import FOLDER, confidence_path, map_path, read_record, write_map, write_record
+from surfkit.scene.depth_files import (
+    FOLDER,
+    confidence_path,
+    map_path,
+    normal_path,
+    read_record,
+    write_map,
+    write_record,
+)
+from surfkit.scene.observations import Observations
 from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene, View
 
@@ -48,34 +58,45 @@ class Preparation:
         data: The data set; photographs that it keeps from training are not used by estimators that compare.
         estimator: How.
         device: Where to compute.
+        root: The folder in which estimated_depths/ is written; the data set if None.
     """
 
     data: Data
     estimator: DepthEstimator
     device: torch.device
+    root: Path | None = None
+
+    @property
+    def place(self) -> Path:
+        """The folder in which estimated_depths/ is."""
+        return self.root or self.data.path
 
     @property
     def work(self) -> Path:
         """What an interrupted estimate goes on from."""
-        return self.data.path / FOLDER / ".work"
+        return self.place / FOLDER / ".work"
 
     def views(self, scene: Scene) -> tuple[View, ...]:
         """The photographs to estimate."""
         return scene.train if self.estimator.matched else (*scene.train, *scene.held_out)
 
-    def material(self, scene: Scene) -> Material:
-        """What the estimator works from.
+    def material(self, scene: Scene, tracks: Observations | None = None) -> Material:
+        """What the estimator works from; `tracks` are read if None.
 
         Raises:
             BadInput: The sparse model does not tell which photographs to compare.
         """
-        tracks = observations(self.data, scene)
+        tracks = tracks or observations(self.data, scene)
+        self.refuse_unseen(tracks)
+        return Material(self.views(scene), tracks, self.device, self.work)
+
+    def refuse_unseen(self, tracks: Observations) -> None:
+        """BadInput if the sparse model does not tell which photographs to compare, and the estimator compares some."""
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(
                 f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
                 "triangulate it in COLMAP"
             )
-        return Material(self.views(scene), tracks, self.device, self.work)
 
     def begin(self, scene: Scene, again: bool) -> list[int]:
         """Positions of the views that are still to be estimated.
@@ -87,21 +108,32 @@ class Preparation:
         Raises:
             BadInput: There are maps that something else made, or other settings.
         """
-        root, views = self.data.path, self.views(scene)
+        root, views = self.place, self.views(scene)
         record, before = self.record(views), read_record(root)
         paths = [map_path(root, view.name) for view in views]
         if again:
             for path in paths:
                 path.unlink(missing_ok=True)
                 confidence_path(path).unlink(missing_ok=True)
+                normal_path(path).unlink(missing_ok=True)
         elif before != record and (before or any(path.exists() for path in paths)):
             made = "with other settings" if before else "by another program"
             raise BadInput(f"{root / FOLDER} holds depth maps made {made}; --again replaces them")
         if before != record or again:
             shutil.rmtree(self.work, ignore_errors=True)
-            write_record(root, record)
-        self.work.mkdir(parents=True, exist_ok=True)
+        self.open(views)
         return [at for at, path in enumerate(paths) if not path.exists()]
+
+    def open(self, views: Sequence[View]) -> None:
+        """Make the folders, and say what the maps are."""
+        record = self.record(views)
+        if read_record(self.place) != record:
+            write_record(self.place, record)
+        self.work.mkdir(parents=True, exist_ok=True)
+
+    def lacking(self, scene: Scene) -> list[str]:
+        """Names of the views that have no map."""
+        return [view.name for view in self.views(scene) if not map_path(self.place, view.name).exists()]
 
     def record(self, views: Sequence[View]) -> dict[str, Any]:
         """What depth.json says of the maps."""
@@ -128,5 +160,13 @@ class Preparation:
         if estimate.inverse is None or estimate.confidence is None:
             return None
         inverse: Tensor = estimate.inverse * (scene.frame.scale if self.estimator.aligned else 1.0)
-        write_map(self.data.path, view.name, inverse.numpy(), estimate.confidence.numpy())
+        normal = None if estimate.normal is None else estimate.normal.numpy()
+        write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > TRUSTED).float().mean())
+
+
+def torch_device(device: Device) -> torch.device:
+    """Where torch computes; unlike the rasterizer, an estimator runs on any device."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BadInput("--device cuda: torch finds no CUDA device here; use --device cpu")
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")

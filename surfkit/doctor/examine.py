@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import Counter
@@ -14,6 +15,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
+from surfkit.core.registry import name_of
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
@@ -26,6 +28,8 @@ from surfkit.scene.data import Data
 from surfkit.scene.depth_files import find_maps
 from surfkit.scene.read import RANDOM_POINTS, check_size, model_folder
 from surfkit.scene.undistort import cache_folder, is_pinhole
+from surfkit.start.plain import SparseStart
+from surfkit.train.material import needs_priors
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -107,7 +111,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
     ]
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     found = _found(data, gathered, geometry, looks)
-    diagnosis = Diagnosis(data.path, found, _will(data, gathered, known), tuple(findings))
+    diagnosis = Diagnosis(data.path, found, _will(data, gathered, known, recipe), tuple(findings))
     return Examined(diagnosis, gathered, known, seconds, peak)
 
 
@@ -238,14 +242,19 @@ def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) 
 
 def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     """Depth priors, where the recipe uses them."""
-    train = gathered.train
-    if not train or not any(loss.needs_prior for loss in recipe.pretrain.losses.values()):
+    train, stereo = gathered.train, recipe.start.needs_prior
+    if not train or not (stereo or needs_priors(recipe.pretrain.losses)):
         return []
     make = f"make them with `surfkit prepare depth {data.path}`"
     try:
         maps = find_maps(data.path, model_folder(data), [shot.name for shot in train])
     except BadInput as error:
         return from_errors("depth-priors", [error])
+    if not maps and recipe.depth is not None:
+        text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
+        return [Finding("note", "depth-priors", text)]
+    if not maps and stereo:
+        return [Finding("error", "depth-priors", f"the run begins at depth maps, and there are none; {make}")]
     if not maps:
         text = f"the recipe has a depth loss, and there are no depth priors, so it will be off; {make}"
         return [Finding("warning", "depth-priors", text)]
@@ -291,7 +300,7 @@ def counted(values: Iterable[str], most: int = 4) -> str:
     return "; ".join(shown) + (f"; and {len(counts) - most} other kinds" if len(counts) > most else "")
 
 
-def _will(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> tuple[str, ...]:
+def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> tuple[str, ...]:
     """What a run will do, in words."""
     shots: Sequence[Shot] = gathered.capture.shots
     if not shots:
@@ -310,4 +319,8 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> tuple
     if gathered.masks:
         told.append(f"ignore what is black in the masks of {len(gathered.masks)} photographs")
     start = f"{len(gathered.capture.xyz):,} sparse" if len(gathered.capture.xyz) else f"{RANDOM_POINTS:,} random"
+    if not isinstance(recipe.start, SparseStart):
+        pixels = sum(math.prod(data.size(*look.size)) for look in known.values() if look.size)
+        count = recipe.start.expected(len(gathered.capture.xyz), pixels)
+        start = f"about {count:,} ({name_of(recipe.start)})"
     return (*told, f"start from {start} points")

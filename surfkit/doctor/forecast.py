@@ -22,10 +22,12 @@ from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import find_maps
+from surfkit.scene.depth_prior import prior_bytes
 from surfkit.scene.memory import cache_bytes, free_bytes
 from surfkit.scene.read import assembled, model_folder
 from surfkit.scene.scene import Scene
 from surfkit.scene.undistort import cache_folder, is_pinhole
+from surfkit.train.material import needs_normals, needs_priors
 
 VIEWS = 10
 """Photographs that the probe trains on, evenly chosen; each part of it sees all of them."""
@@ -78,10 +80,12 @@ def forecast(
         except BadInput as error:
             return None, from_errors("probe", [error])
         pixels = sum(w * h for w, h in _sizes(data, examined, {s.name for s in examined.gathered.train}))
-        rising = growth(recipe.pretrain, len(scene.cloud.xyz), pixels, plan.points)
+        first = recipe.start.expected(len(scene.cloud.xyz), pixels)
+        rising = growth(recipe.pretrain, first, pixels, plan.points)
         parts = schedule(recipe.pretrain.steps, rising)
         held_back = within(parts, min(MOST_POINTS, int(0.4 * room.memory_bytes / POINT_BYTES)))
-        priors = load.view_bytes > 0 and _needs_priors(recipe) and bool(_maps(data, examined))
+        wanted = load.view_bytes > 0 and needs_priors(recipe.pretrain.losses)
+        priors = wanted and bool(_with_maps(data, examined, recipe))
         job = Job(recipe, scene, held_back, plan.steps, SECONDS, priors, plan.device)
         probed = probe(job, None if told is None else lambda done, all_: told("probe", done, all_))
     if probed.failure is not None or probed.written is None:
@@ -95,6 +99,7 @@ def beyond(recipe: Recipe) -> list[Finding]:
     """What of the run the forecast leaves out."""
     later = ["the blocks, which are foretold when they are planned,"] if recipe.partition is not None else []
     later += ["what the recipe refines"] if recipe.refine else []
+    later += ["making depth maps, where the data set has none,"] if recipe.depth is not None else []
     text = f"memory, disk and time are those of pretraining; {' and '.join(later)} come on top"
     return [Finding("note", "forecast", text)] if later else []
 
@@ -131,22 +136,22 @@ def _sizes(data: Data, examined: Examined, names: set[str]) -> list[tuple[int, i
     return [data.size(*look.size) for look in looks if look.size]
 
 
-def _needs_priors(recipe: Recipe) -> bool:
-    return any(loss.needs_prior for loss in recipe.pretrain.losses.values())
-
-
-def _maps(data: Data, examined: Examined) -> dict:
-    return find_maps(data.path, model_folder(data), [shot.name for shot in examined.gathered.train])
+def _with_maps(data: Data, examined: Examined, recipe: Recipe) -> set[str]:
+    """Names of the training photographs that have a depth map, or will have."""
+    names = [shot.name for shot in examined.gathered.train]
+    found = set(find_maps(data.path, model_folder(data), names))
+    return found or (set(names) if recipe.depth is not None else set())
 
 
 def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
     """What does not depend on points, as far as it is known without a probe."""
     gathered = examined.gathered
     train = {shot.name for shot in gathered.train}
-    priors = set(_maps(data, examined)) if _needs_priors(recipe) else set()
+    losses = recipe.pretrain.losses
+    priors = _with_maps(data, examined, recipe) if needs_priors(losses) else set()
     view_bytes = 3 * sum(w * h for w, h in _sizes(data, examined, train))
     view_bytes += sum(w * h for w, h in _sizes(data, examined, train & set(gathered.masks)))
-    view_bytes += 8 * sum(w * h for w, h in _sizes(data, examined, train & priors))
+    view_bytes += prior_bytes(needs_normals(losses)) * sum(w * h for w, h in _sizes(data, examined, train & priors))
     bent = sum(not is_pinhole(shot.camera) for shot in gathered.capture.shots)
     there = sum(not path.stem.endswith("-mask") for path in cache_folder(data.path).glob("*.png")) if bent else 0
     return Load(

@@ -28,6 +28,7 @@ class NormalPrior(Loss):
 
     reads: ClassVar[tuple[str, ...]] = ("alpha", "normal")
     needs_prior: ClassVar[bool] = True
+    needs_normals: ClassVar[bool] = True
 
     start: float = 0.05
     """Share in the objective at the first step."""

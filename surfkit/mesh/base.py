@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -66,7 +66,12 @@ class Subject:
 
 
 class Mesher(Component):
-    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`."""
+    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`.
+
+    Depth priors are only made for a run whose data set has none, and read, when it has `needs_prior`.
+    """
+
+    needs_prior: ClassVar[bool] = False
 
     def ready(self) -> None:
         """Look, before hours are spent, whether it can work.

@@ -15,7 +15,7 @@ from surfkit.scene.scene import Cloud
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
 OPACITY = 0.1
-"""Opacity of a new point."""
+"""Opacity of a new point, where its cloud names none."""
 SMALLEST = 1e-5
 """Smallest size of a new point, local units: 1 cm in a scene of 1 km."""
 ALONE = 0.01
@@ -23,18 +23,25 @@ ALONE = 0.01
 
 
 def seeds(cloud: Cloud, axes: int, sh_degree: int) -> Columns:
-    """Every raw column but the rotations: one point per cloud point, round, of its colour, opacity 0.1."""
+    """Every raw column but the rotations: one point per cloud point, round, of its colour and opacity."""
     count = len(cloud.xyz)
     if count == 0:
         raise BadInput("the scene has no sparse points to start from; triangulate some (COLMAP point_triangulator)")
-    sizes = gaps(cloud.xyz)
+    sizes = gaps(cloud.xyz) if cloud.size is None else cloud.size.float().clamp_min(SMALLEST)
     return {
         "means": cloud.xyz.float().clone(),
         "scales": sizes.log()[:, None].repeat(1, axes),
-        "opacities": torch.full((count,), math.log(OPACITY / (1 - OPACITY))),
+        "opacities": opacity_logits(cloud),
         "sh0": ((cloud.rgb.float() / 255 - 0.5) / SH_C0)[:, None],
         "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
     }
+
+
+def opacity_logits(cloud: Cloud) -> Tensor:
+    """(N,) logits of the cloud's opacities; of OPACITY where it has none."""
+    if cloud.opacity is None:
+        return torch.full((len(cloud.xyz),), math.log(OPACITY / (1 - OPACITY)))
+    return torch.logit(cloud.opacity.float())
 
 
 def gaps(xyz: Tensor) -> Tensor:

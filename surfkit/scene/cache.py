@@ -25,6 +25,7 @@ class Cache(Sequence, Generic[T]):
         sizes: Sequence[int],
         budget_bytes: int | None = None,
         threads: int | None = None,
+        opened: Callable[[T], T] | None = None,
     ) -> None:
         """Start reading, in the order of the positions.
 
@@ -33,9 +34,11 @@ class Cache(Sequence, Generic[T]):
             sizes: Bytes of each value in memory.
             budget_bytes: Most bytes to keep; None keeps all.
             threads: Readers; as many as there are cores, 4 at most, by default.
+            opened: Makes what is given of what is kept, each time, where values are kept in fewer bytes.
         """
         threads = threads or min(4, os.cpu_count() or 1)
         self._read, self._sizes, self._ahead = read, list(sizes), 2 * threads
+        self._opened = opened
         self._budget = sum(self._sizes) if budget_bytes is None else budget_bytes
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="read")
         self._stop = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
@@ -57,9 +60,10 @@ class Cache(Sequence, Generic[T]):
         at = range(len(self))[at]
         self._turn = self._needed.get(at, self._turn)
         try:
-            return self._value(at)
+            value = self._value(at)
         finally:
             del self._needed[at]
+        return value if self._opened is None else self._opened(value)
 
     def aside(self, at: int) -> T:
         """The value of a position out of turn: when it is to be asked for next, and what is read ahead, stay.
@@ -69,11 +73,12 @@ class Cache(Sequence, Generic[T]):
         """
         due = self._needed.get(at)
         try:
-            return self._value(at)
+            value = self._value(at)
         finally:
             del self._needed[at]
             if due is not None:
                 self._needed[at] = due
+        return value if self._opened is None else self._opened(value)
 
     def expect(self, coming: Sequence[int]) -> None:
         """Read in this order from now on: positions in the order in which they will be asked for."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.core.caches import cache_root
 from surfkit.core.files import replacing
 
 FOLDER = "resized"
@@ -53,8 +54,7 @@ def place(root: Path, name: str) -> Path:
     """A folder for copies in the data set; where that cannot be written, in the user's own cache."""
     if os.access(root, os.W_OK):
         return root / name
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "surfkit" / name
+    return cache_root() / name
 
 
 def digest(root: Path, key: str, paths: Sequence[Path]) -> str:

@@ -112,6 +112,9 @@ class Data(Reading):
     """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
     another layout that `surfkit components reader` lists."""
 
+    priors: Annotated[Path | None, tyro.conf.Suppress] = None
+    """Folder of the depth maps that a run made for it, where it has none of its own."""
+
 
 def nearest(name: str, known: Sequence[str]) -> str:
     """A question to add to a message, such as "; did you mean 'a.jpg'?", or "" when nothing is near."""

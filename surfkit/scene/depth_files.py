@@ -24,6 +24,8 @@ PHOTOS = ("rgb", "images", "input")
 """Folders of photographs inside a block of MatrixCity, which has none or one of them."""
 FOLDER = "estimated_depths"
 RECORD = "depth.json"
+UNIT = 127
+"""What a component of 1 of a normal is stored as."""
 warnings.filterwarnings("ignore", r"Reading `\.npy`", UserWarning)  # of Python 2, whose arrays are as good
 MILLIMETRE = 1e-3
 """Nerfstudio's `depth_unit_scale_factor`, where a data set does not say another."""
@@ -76,6 +78,19 @@ class DepthFile:
         values = stored.astype(np.float32) / (255 if stored.dtype == np.uint8 else 1)
         return np.nan_to_num(values).clip(0, 1)
 
+    def read_normal(self) -> np.ndarray | None:
+        """(3, h, w) int8 from the file `<image>.normal.npy` beside the map; None where there is none.
+
+        They are normals of the surface times 127, in the camera's axes and towards the camera; 0 where there is none.
+        """
+        path = normal_path(self.path)
+        if not path.exists():
+            return None
+        stored = _stored(path)
+        if stored.ndim != 3 or len(stored) != 3 or stored.dtype != np.int8:
+            raise BadInput(f"normals are {stored.dtype} of shape {stored.shape}, not int8 of (3, height, width)")
+        return stored
+
 
 def find_maps(root: Path, model: Path, names: Sequence[str], metres: float | None = None) -> dict[str, DepthFile]:
     """The depth map of each photograph that has one; the first convention of which the data set has any files.
@@ -108,17 +123,29 @@ def confidence_path(path: Path) -> Path:
     return path.with_name(f"{path.name.removesuffix('.npy')}.confidence.npy")
 
 
-def write_map(root: Path, name: str, inverse: np.ndarray, confidence: np.ndarray) -> None:
-    """Save a map and its confidence; the map comes last and is whole or not there, also when the process dies.
+def normal_path(path: Path) -> Path:
+    """The normals that belong to a map."""
+    return path.with_name(f"{path.name.removesuffix('.npy')}.normal.npy")
+
+
+def write_map(
+    root: Path, name: str, inverse: np.ndarray, confidence: np.ndarray, normal: np.ndarray | None = None
+) -> None:
+    """Save a map and what belongs to it; the map comes last and is whole or not there, also when the process dies.
 
     Args:
         root: The data set.
         name: Of the photograph.
         inverse: (h, w) inverse depth; 0 where there is none.
         confidence: (h, w) in [0, 1].
+        normal: (3, h, w) unit normals of the surface in the camera's axes, towards the camera; 0 where there is none.
     """
     path = map_path(root, name)
     save_array(confidence_path(path), (confidence.clip(0, 1) * 255).round().astype(np.uint8))
+    if normal is None:
+        normal_path(path).unlink(missing_ok=True)
+    else:
+        save_array(normal_path(path), (normal.clip(-1, 1) * UNIT).round().astype(np.int8))
     save_array(path, inverse.astype(np.float32))
 
 

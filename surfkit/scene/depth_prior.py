@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sam
 from surfkit.scene.cache import Cache
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import DepthFile, find_maps, read_record
+from surfkit.scene.made_maps import located
 from surfkit.scene.observations import Observations
 from surfkit.scene.read import model_folder, observations
 from surfkit.scene.scene import Scene, View
@@ -71,44 +72,85 @@ class Fit:
 
 
 def prior_cache(
-    views: Sequence[View], fits: Sequence[Fit | None], typical: float, budget_bytes: int | None = None
+    views: Sequence[View],
+    fits: Sequence[Fit | None],
+    typical: float,
+    budget_bytes: int | None = None,
+    normals: bool = False,
 ) -> Priors:
-    """The priors of training views by position, as `fits` says how to read them."""
+    """The priors of training views by position, as `fits` says how to read them; with normals if there are any."""
 
     def read(at: int) -> DepthPrior | None:
         fit = fits[at]
-        return None if fit is None else _read(views[at], fit, typical)
+        return None if fit is None else _read(views[at], fit, typical, normals)
 
-    sizes = [8 * v.camera.width * v.camera.height if f else 0 for v, f in zip(views, fits, strict=True)]
-    return Cache(read, sizes, budget_bytes)
+    each = prior_bytes(normals)
+    sizes = [each * v.camera.width * v.camera.height if f else 0 for v, f in zip(views, fits, strict=True)]
+    return Cache(read, sizes, budget_bytes, opened=_unpacked)
 
 
-def _read(view: View, fit: Fit, typical: float) -> DepthPrior:
+def prior_bytes(normals: bool) -> int:
+    """What a prior takes for each pixel in a cache: float32 for depth and confidence, int8 for normals."""
+    return 8 + 3 * normals
+
+
+def _unpacked(prior: DepthPrior | None) -> DepthPrior | None:
+    """A prior whose normals are unit vectors again."""
+    if prior is None or prior.normal is None:
+        return prior
+    return replace(prior, normal=torch.nn.functional.normalize(prior.normal.to(torch.float32), dim=0))
+
+
+def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
     size = (view.camera.height, view.camera.width)
     try:
         inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
         confidence = fit.file.read_confidence()
+        normal = fit.file.read_normal() if normals else None
     except BadInput as error:
         raise BadInput(f"{fit.file.path}: {error}") from error
+    if normal is not None:
+        normal = _nearest(torch.from_numpy(np.array(normal)), size)
     inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
     there = (inverse > 0).to(torch.float32)
     if confidence is None:
-        return DepthPrior(inverse, there, typical)
+        return DepthPrior(inverse, there, typical, normal)
     grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
-    return DepthPrior(inverse, grown * there, typical)
+    return DepthPrior(inverse, grown * there, typical, normal)
+
+
+def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """(3, H, W) of (3, h, w) of any type: the value of the pixel in whose place the middle of each one lies."""
+    rows, columns = (
+        ((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new)).long().clamp_max(old - 1)
+        for new, old in zip(size, values.shape[1:], strict=True)
+    )
+    return values[:, rows][:, :, columns]
 
 
 def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
-    """The depth map of each training photograph that has one, by name."""
-    return find_maps(data.path, model_folder(data), [view.name for view in scene.train], scene.frame.metres)
+    """The depth map of each training photograph that has one, by name: of the data set, or made for it."""
+    names = [view.name for view in scene.train]
+    if data.priors is not None:
+        return find_maps(folder := located(data.priors), folder, names)
+    return find_maps(data.path, model_folder(data), names, scene.frame.metres)
 
 
 def read_priors(
-    data: Data, scene: Scene, budget_bytes: int | None = None, known: Alignment | None = None
+    data: Data,
+    scene: Scene,
+    budget_bytes: int | None = None,
+    known: Alignment | None = None,
+    normals: bool = False,
 ) -> Priors | None:
     """The depth priors of a data set; None where there are none.
 
-    `known`: how they are aligned, where `scene` has only some of the photographs; by itself if None, see `alignment`.
+    Args:
+        data: The data set.
+        scene: That `read` gave for it, or some of its photographs.
+        budget_bytes: Memory to keep them in; None keeps all.
+        known: How they are aligned, where the scene has only some of the photographs; see `alignment` for None.
+        normals: Whether to read their normals too, where there are any.
     """
     known = known or alignment(data, scene)
     if not any(view.name in known.fits for view in scene.train):
@@ -116,9 +158,10 @@ def read_priors(
     maps = prior_files(data, scene)
     lost = [view.name for view in scene.train if view.name in known.fits and view.name not in maps]
     if lost:
-        raise BadInput(f"{data.path}: the depth map of {lost[0]} is gone; put it back")
+        again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it anew"
+        raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
     fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
-    return prior_cache(scene.train, fits, known.typical, budget_bytes)
+    return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
 
 def alignment(data: Data, scene: Scene) -> Alignment:
@@ -187,6 +230,7 @@ def _fit(view: View, file: DepthFile | None, observations: Observations, scene: 
     try:
         values = file.read()
         file.read_confidence()
+        file.read_normal()
         _check_map(values, view)
         at, inverse = observations.of(view, MAX_ERROR_PX)
         values = sample(values, at)
@@ -228,7 +272,7 @@ def _outliers(fits: Sequence[Fit | None]) -> list[int]:
 
 def _warn_of_leaks(data: Data, scene: Scene) -> None:
     """Maps made from several photographs must not have seen those that are kept to measure with."""
-    used = read_record(data.path).get("matched")
+    used = read_record(data.path).get("matched") if data.priors is None else None  # a run matches what it trains on
     seen = [view.name for view in scene.held_out if isinstance(used, list) and view.name in used]
     if seen:
         text = (

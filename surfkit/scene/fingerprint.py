@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from surfkit.scene.depth_files import DepthFile, confidence_path
+from surfkit.scene.depth_files import DepthFile, confidence_path, normal_path
 from surfkit.scene.scene import Scene, View
 
 PIECE = 1 << 16
@@ -45,7 +45,7 @@ class Print:
         time_ns: When the file was last written. While this and the size stay, its content is not read again.
         content: Digest of three pieces of the file, or of all of it when it is not longer.
         held_out: Whether it is kept from training.
-        beside: Its mask, depth map and confidence, those that there are, by what they are.
+        beside: Its mask, depth map, confidence and normals, those that there are, by what they are.
     """
 
     camera: str
@@ -139,6 +139,8 @@ def _feed(found: Any, value: Any) -> None:
         value = value.detach().cpu().numpy()
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
+            if not field.metadata.get("digest", True):
+                continue
             found.update(f"\0{field.name}".encode())
             _feed(found, getattr(value, field.name))
     elif isinstance(value, (np.ndarray, float)):
@@ -166,6 +168,8 @@ def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Pa
         yield "depth map", file.path, digest((file.aligned, file.scale, file.offset, file.metric))
         if (path := confidence_path(file.path)).exists():
             yield "confidence of depth", path, ""
+        if (path := normal_path(file.path)).exists():
+            yield "normal map", path, ""
 
 
 def _stamp(path: Path, before: Stamp | Print | None, meaning: str = "") -> Stamp:

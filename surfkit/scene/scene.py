@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -39,17 +39,21 @@ class View:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Sparse points from structure from motion.
+    """Points that splats begin at: sparse ones from structure from motion, or others.
 
     Attributes:
         xyz: (P, 3) float32, local frame.
         rgb: (P, 3) uint8.
         normals: (P, 3) float32 unit vectors, or None.
+        opacity: (P,) float32 in (0, 1) to begin with; None leaves it to the primitive.
+        size: (P,) float32 standard deviation to begin with, local units; None takes the gaps between the points.
     """
 
     xyz: Tensor
     rgb: Tensor
     normals: Tensor | None = None
+    opacity: Tensor | None = field(default=None, metadata={"digest": False})  # no part of a data set's fingerprint
+    size: Tensor | None = field(default=None, metadata={"digest": False})
 
 
 @dataclass(frozen=True)

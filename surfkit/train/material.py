@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
 from surfkit.losses.base import Loss
 from surfkit.scene.cache import Cache, share
 from surfkit.scene.copies import Copies
 from surfkit.scene.data import Data
-from surfkit.scene.depth_prior import Alignment, Priors, read_priors
+from surfkit.scene.depth_prior import Alignment, Priors, prior_bytes, read_priors
 from surfkit.scene.masks import mask_cache, mask_sizes
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
@@ -29,14 +30,23 @@ class Store:
     Attributes:
         cache: Memory for them, such as "4GB"; "auto" takes half of what is free.
         copies: Whether photographs that do not fit are also kept on disk as they are used, decoded and reduced.
+        maps: Disk, in the user's cache, for depth maps that runs make whose data sets have none, such as "20GB"; None
+            makes none, which does change the result of recipes that want some.
     """
 
     cache: str = "auto"
     copies: bool = False
+    maps: str | None = "20GB"
 
     def bytes(self) -> int:
         """The memory that may be taken now."""
         return cache_bytes(self.cache)
+
+    def maps_bytes(self) -> int:
+        """The disk that depth maps in the user's cache may take."""
+        if (self.maps or "").strip().lower() == "auto":
+            raise BadInput("--prepare-cache auto: give a size such as 20GB")
+        return 0 if self.maps is None else cache_bytes(self.maps, "--prepare-cache")
 
 
 @dataclass(frozen=True)
@@ -84,18 +94,23 @@ def needs_priors(losses: Mapping[str, Loss]) -> bool:
     return any(loss.needs_prior for loss in losses.values())
 
 
+def needs_normals(losses: Mapping[str, Loss]) -> bool:
+    """Whether any loss looks at the normals of depth priors."""
+    return any(loss.needs_prior and loss.needs_normals for loss in losses.values())
+
+
 def read_ahead(
     data: Data, scene: Scene, losses: Mapping[str, Loss], store: Store, known: Alignment | None = None
 ) -> Material:
     """The photographs, masks and depth priors of the training views, as far as losses need them.
 
-    `known`: how the depth priors are aligned, where the scene has only some of the photographs.
+    `known`: how the depth priors are aligned, where that is known; see `read_priors`.
     """
     budget = store.bytes()
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
-    needed = needs_priors(losses)
-    wanted = [3 * pixels, sum(mask_sizes(scene.train)), 8 * pixels if needed else 0]
+    needed, normals = needs_priors(losses), needs_normals(losses)
+    wanted = [3 * pixels, sum(mask_sizes(scene.train)), prior_bytes(normals) * pixels if needed else 0]
     for_photos, for_masks, for_priors = share(budget, wanted)
-    priors = read_priors(data, scene, for_priors, known) if needed else None
+    priors = read_priors(data, scene, for_priors, known, normals) if needed else None
     copies = Copies(data.path) if store.copies and 3 * pixels > for_photos else None
     return Material(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)

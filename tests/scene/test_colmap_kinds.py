@@ -244,6 +244,7 @@ def test_a_folder_that_cannot_be_written_uses_the_cache_of_the_user(farm, monkey
     distort(farm, "RADIAL")
     monkeypatch.setattr(copies.os, "access", lambda path, mode: False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("SURFKIT_CACHE")
     view = read(Data(farm)).train[0]
     assert view.path.parent == tmp_path / "cache" / "surfkit" / "undistorted" and view.path.exists()
 

@@ -15,7 +15,7 @@ from surfkit.notes import noted
 from surfkit.scene import read as scenes
 from surfkit.scene.align import align, sample
 from surfkit.scene.data import Data
-from surfkit.scene.depth_files import confidence_path, find_maps, map_path, write_map, write_record
+from surfkit.scene.depth_files import confidence_path, find_maps, map_path, normal_path, write_map, write_record
 from surfkit.scene.depth_prior import read_priors, resized
 from surfkit.scene.read import observations
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
@@ -278,3 +278,37 @@ def test_memory_is_bounded_and_priors_are_read_ahead(farm):
     half = replace(scene.train[0], camera=scene.train[0].camera.resized(32, 24))
     smaller = read_priors(data, replace(scene, train=(half, *scene.train[1:])))[0]
     assert smaller.inverse.shape == smaller.confidence.shape == (24, 32)
+
+
+def test_normals_are_kept_in_bytes_and_given_as_unit_vectors(made, farm):
+    data, scene, exact = farm
+    truth = made[1].exact
+    for name, inverse in exact.items():
+        write_map(data.path, name, inverse, np.ones_like(inverse), truth[name].normal.numpy())
+    write_record(data.path, {"aligned": True})
+    assert np.load(normal_path(map_path(data.path, scene.train[0].name))).dtype == np.int8
+    plain, priors = read_priors(data, scene), read_priors(data, scene, normals=True)
+    assert plain[0].normal is None and list(plain.sizes) == [8 * 64 * 48] * len(plain)
+    assert list(priors.sizes) == [11 * 64 * 48] * len(priors)
+    for view, prior in zip(scene.train, priors, strict=True):
+        wanted = truth[view.name].normal.float()
+        there = wanted.abs().sum(0) > 0
+        assert prior.normal.dtype == torch.float32 and (prior.normal[:, ~there] == 0).all()
+        torch.testing.assert_close(prior.normal.norm(dim=0)[there], torch.ones(int(there.sum())))
+        assert (prior.normal - wanted).abs().max() < 1 / 127
+    half = replace(scene.train[0], camera=scene.train[0].camera.resized(32, 24))
+    smaller = read_priors(data, replace(scene, train=(half, *scene.train[1:])), normals=True)[0].normal
+    torch.testing.assert_close(smaller, priors[0].normal[:, 1::2, 1::2])  # the pixel right of and below the middle
+    write_map(data.path, scene.train[0].name, exact[scene.train[0].name], np.ones((48, 64)))
+    assert read_priors(data, scene, normals=True)[0].normal is None
+
+
+def test_normals_of_another_kind_are_a_reason_not_to_use_a_map(farm):
+    data, scene, exact = farm
+    for name, inverse in exact.items():
+        write_map(data.path, name, inverse, np.ones_like(inverse))
+    write_record(data.path, {"aligned": True})
+    np.save(normal_path(map_path(data.path, scene.train[1].name)), np.zeros((48, 64, 3), np.float32))
+    priors, notes = read(data, scene)
+    assert priors[1] is None and priors[0] is not None
+    assert "normals are float32 of shape (48, 64, 3), not int8 of (3, height, width)" in notes[0]

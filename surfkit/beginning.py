@@ -1,0 +1,67 @@
+"""What the points of pretraining begin at, as the recipe has it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.folder import Run
+from surfkit.scene.depth_prior import Alignment, alignment, prior_bytes, read_priors
+from surfkit.scene.scene import Cloud, Scene
+from surfkit.start.base import Known
+from surfkit.train.material import Material, needs_priors
+
+AHEAD = 4
+"""Depth maps in memory while points are made of them: each is needed once."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Where a run begins.
+
+    Attributes:
+        this: The run.
+        scene: Its data.
+        given: Its photographs and masks.
+        known: How the depth priors are aligned, if the start needs any.
+    """
+
+    this: Run
+    scene: Scene
+    given: Material
+    known: Alignment | None
+
+    def __call__(self) -> Cloud:
+        """The points."""
+        start, scene, given = self.this.recipe.start, self.scene, self.given
+        priors = None
+        if start.needs_prior:
+            largest = max(view.camera.width * view.camera.height for view in scene.train)
+            priors = read_priors(self.this.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
+        generator = torch.Generator().manual_seed(self.this.recipe.seed)
+        try:
+            return start.cloud(Known(scene, given.photos, given.masks, priors, generator))
+        finally:
+            if priors is not None:
+                priors.close()
+
+
+def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
+    """How the depth priors of a run fit its scene, if pretraining needs any.
+
+    Raises:
+        BadInput: The run is still to begin, at depth maps, and there are none that can be used.
+    """
+    needed = this.recipe.start.needs_prior and not begun
+    if not needed and not needs_priors(this.recipe.pretrain.losses):
+        return None
+    known = alignment(this.data, scene)
+    if needed and not known.fits:
+        raise BadInput(
+            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; make "
+            f"some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:plane-sweep, or "
+            "choose start:sparse"
+        )
+    return known

@@ -1,0 +1,186 @@
+"""Depth maps for runs whose data set has none: made once, kept in the user's cache, and thrown away when it is full."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump
+from surfkit.core.events import Progress, Warned, emit, say
+from surfkit.core.lock import USED, held, holder, is_used, used
+from surfkit.depth.base import DepthEstimator
+from surfkit.depth.prepare import Preparation
+from surfkit.scene.fingerprint import Fingerprint, digest
+from surfkit.scene.made_maps import Made, folder_of, read_made, write_made
+from surfkit.scene.observations import Observations
+from surfkit.scene.photos import view_photo
+from surfkit.scene.scene import Scene, View
+
+POLL_S = 1.0
+"""Between two looks whether another process is done."""
+DROPPED = ".dropped-"
+"""What names of folders begin with that are being deleted."""
+
+
+def key_of(estimator: DepthEstimator, scene: Scene, prints: Fingerprint, tracks: Observations) -> str:
+    """The name of the maps of the training views of a scene: another one when anything differs that they are made from.
+
+    Args:
+        estimator: How they are made.
+        scene: With the training views.
+        prints: Of its photographs, cameras and masks.
+        tracks: Its observations.
+    """
+    parts = [str(dump(estimator)), str(estimator.version), repr(float(scene.frame.scale))]
+    parts += [digest(tracks.xyz), digest(tracks.error_px)]
+    for view in scene.train:
+        known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
+        mask = known.beside["mask"].content if "mask" in known.beside else ""
+        parts += [view.name, known.camera, str(known.size), known.content, mask, str(view.white)]
+        parts.append("" if seen is None else digest(seen))
+    return digest("\0".join(parts))
+
+
+@contextmanager
+def maps(
+    preparation: Preparation, scene: Scene, tracks: Observations, key: str, budget_bytes: int
+) -> Iterator[tuple[Path, Made]]:
+    """Within, there are maps of the training views of a scene: their folder, and what is known of them.
+
+    Those that are not there are made; nobody deletes them meanwhile.
+
+    Args:
+        preparation: How; of its folder, nothing is used.
+        scene: The scene.
+        tracks: Its observations.
+        key: Name of the maps.
+        budget_bytes: Of all maps in the cache together; those longest unused are deleted when there are more.
+
+    Raises:
+        BadInput: The cache cannot be written to, or the estimator cannot work.
+    """
+    folder = folder_of(key)
+    with ExitStack() as use:
+        with entered(folder, preparation.data.path):
+            use.enter_context(used(folder))
+            fresh, made = completed(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
+        if fresh:
+            make_room(folder, budget_bytes)
+        yield folder, made
+
+
+@contextmanager
+def entered(folder: Path, data: Path) -> Iterator[None]:
+    """Within, no other process writes into a folder of the cache; waits for one that does."""
+    with ExitStack() as inside:
+        told = False
+        while True:
+            try:
+                inside.enter_context(held(folder))
+                break
+            except BadInput:
+                if not told:
+                    say(f"waiting for the depth maps that {holder(folder) or 'another process'} makes in {folder}")
+                told = True
+            except FileNotFoundError:  # it was deleted just now, to make room
+                pass
+            except OSError as error:
+                raise BadInput(
+                    f"{folder}: cannot be written ({error.strerror}); set SURFKIT_CACHE to a folder for depth maps, "
+                    f"make them with `surfkit prepare depth {data}`, or do without: --no-prepare"
+                ) from error
+            time.sleep(POLL_S)
+        yield
+
+
+def completed(preparation: Preparation, scene: Scene, tracks: Observations) -> tuple[bool, Made]:
+    """Make the maps that are not there, one after the other; whether there were any, and what is known of all."""
+    folder, names = preparation.place, [view.name for view in scene.train]
+    made = read_made(folder)
+    lacking = [name for name in preparation.lacking(scene) if name not in made.without]
+    if not lacking:
+        return False, made
+    readable = tuple(readable_views(scene.train))
+    given = preparation.material(replace(scene, train=readable), tracks)
+    preparation.open(given.views)
+    unread = set(lacking) - {view.name for view in readable}
+    wanted = [at for at, view in enumerate(readable) if view.name in lacking]
+    count = len(names) - len(lacking) - len(made.without)
+    made = replace(made, maps=count, without=(*made.without, *sorted(unread)))
+    write_made(folder, made)
+    begun, before, total = time.process_time(), made.cpu_seconds, len(names) - len(made.without)
+    emit(Progress("depth maps", count, total))
+    for done, step in enumerate(preparation.run(scene, given, wanted), 1):
+        none = (step.view.name,) if step.coverage is None else ()
+        spent = before + time.process_time() - begun
+        made = Made(made.maps + 1 - len(none), spent, (*made.without, *none))
+        write_made(folder, made)
+        emit(Progress("depth maps", count + done, total))
+    return True, made
+
+
+def readable_views(views: Sequence[View]) -> Iterator[View]:
+    """The views whose photographs are whole; training passes over the others too."""
+
+    def fault(view: View) -> str | None:
+        try:
+            view_photo(view)
+        except BadInput as error:
+            return str(error)
+        return None
+
+    with ThreadPoolExecutor(4) as pool:
+        for view, error in zip(views, pool.map(fault, views), strict=True):
+            if error is None:
+                yield view
+            else:
+                emit(Warned(f"no depth map is made of a damaged photograph: {error}"))
+
+
+def make_room(mine: Path, budget_bytes: int) -> None:
+    """Delete the folders of maps that are longest unused, and not in use, until all take no more than a budget."""
+    for left in mine.parent.glob(f"{DROPPED}*"):  # of a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    folders = [path for path in mine.parent.iterdir() if path.is_dir() and not path.name.startswith(".")]
+    sizes = {path: taken(path) for path in folders}
+    total = sum(sizes.values())
+    for path in sorted(folders, key=last_used):
+        if total > budget_bytes and path != mine and dropped(path):
+            total -= sizes[path]
+
+
+def taken(folder: Path) -> int:
+    """Bytes of the files in a folder."""
+    found = 0
+    for path in folder.rglob("*"):
+        with suppress(OSError):  # another process has just deleted it
+            found += path.stat().st_size if path.is_file() else 0
+    return found
+
+
+def last_used(folder: Path) -> float:
+    """When a run last began to use the maps in a folder."""
+    with suppress(OSError):
+        return (folder / USED).stat().st_mtime
+    return 0.0
+
+
+def dropped(folder: Path) -> bool:
+    """Delete a folder of maps, unless somebody works with it; whether it is gone."""
+    aside = folder.with_name(f"{DROPPED}{folder.name}-{os.getpid()}")
+    try:
+        with held(folder):
+            if is_used(folder):
+                return False
+            os.replace(folder, aside)
+    except (BadInput, OSError):
+        return False
+    shutil.rmtree(aside, ignore_errors=True)
+    return True

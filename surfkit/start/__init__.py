@@ -1,0 +1,10 @@
+"""Ways to begin, by the name users type."""
+
+from surfkit.core.registry import hookimpl
+from surfkit.start.plain import RandomStart, SparseStart
+from surfkit.start.stereo import StereoStart
+
+
+@hookimpl
+def surfkit_components():
+    return {"sparse": SparseStart, "stereo": StereoStart, "random": RandomStart}

@@ -1,0 +1,193 @@
+"""Begin at the points of depth maps that several photographs agree on."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, Warned, emit
+from surfkit.primitives.init import gaps
+from surfkit.scene.camera import Camera
+from surfkit.scene.depth_prior import DepthPrior
+from surfkit.scene.scene import Cloud, Scene
+from surfkit.start.base import Known, Start
+from surfkit.start.voxels import Collected, Samples, Thinned, lonely, thinned_to
+
+EDGE = 0.02
+"""Three inverse depths in a row that are bent by a larger share of the middle one do not lie on one surface."""
+FILL = 2.0
+"""A sparse point is used where no point of the depth maps lies within so many voxels."""
+SPARSE_OPACITY = 0.1
+"""Of sparse points that fill gaps, as of a start from them alone."""
+LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
+"""Voxels kept while depth maps are read, at least, and for each point wanted."""
+OVERLAP = 10
+"""How often a place is photographed, for a forecast; a rule of thumb for aerial surveys."""
+
+
+@dataclass(frozen=True)
+class StereoStart(Start):
+    """Begin at the depth maps of all views, fused and thinned evenly (as EDGS, Kotovenko et al. 2025, from matches).
+
+    Colours come from the photographs, and directions from normal maps or the slopes of the depth maps. Sparse points
+    are used only where the maps have none; what neither knows is left to densification.
+    """
+
+    needs_prior: ClassVar[bool] = True
+
+    points: int | Literal["auto"] = "auto"
+    """How many; auto is one every `spacing_px` pixels at the typical depth of the data set, `most` at most."""
+
+    spacing_px: float = 3.0
+    """Distance between points when their number is auto, pixels of a training photograph at the typical depth."""
+
+    most: int = 2_000_000
+    """Most points when their number is auto."""
+
+    min_confidence: float = 0.5
+    """Pixels of a lower confidence are not used."""
+
+    opacity: float = 0.5
+    """Opacity to begin with; what depth maps show is there, so it may be higher than that of sparse points, 0.1."""
+
+    size: float = 0.65
+    """Standard deviation of a splat to begin with, as a share of the gaps between points; sparse points have all."""
+
+    def __post_init__(self) -> None:
+        if self.points != "auto" and self.points < 1:
+            raise BadInput(f"start.points is {self.points}; it must be auto, or 1 or more")
+        if self.most < 1 or not (self.spacing_px > 0 and self.size > 0):
+            raise BadInput("start.most must be 1 or more, and start.spacing_px and start.size above 0")
+        if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
+            raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
+
+    def cloud(self, known: Known) -> Cloud:
+        """See `Start.cloud`."""
+        stereo = self.fused(known)
+        if not len(stereo):
+            emit(Warned("no pixel of a depth map is trusted, so the run begins at the sparse points alone"))
+            return known.scene.cloud
+        return filled(stereo, known, self)
+
+    def expected(self, sparse: int, pixels: int) -> int:
+        """See `Start.expected`."""
+        if self.points != "auto":
+            return self.points
+        return max(sparse, min(self.most, round(pixels / (OVERLAP * self.spacing_px**2))))
+
+    def fused(self, known: Known) -> Thinned:
+        """The points of all depth maps, thinned."""
+        wanted = self.most if self.points == "auto" else self.points
+        unit = self.spacing_px if self.points == "auto" else 1.0
+        priors, collected, scene = known.priors or (), None, known.scene
+        for at, view in enumerate(scene.train):
+            prior = priors[at] if len(priors) else None
+            if prior is not None:
+                if collected is None:
+                    side = unit * pixel_size(scene, prior)
+                    collected = Collected(side, max(LEAST_VOXELS, VOXELS_A_POINT * wanted))
+                with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
+                    found = samples(view.camera, prior, known.photos[at], self.trusted(known, at, prior))
+                    collected.add(replace(found, grain=unit * found.grain))
+            emit(Progress("points of depth maps", at + 1, len(scene.train)))
+        if collected is None:
+            return Thinned(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
+        voxels = collected.settle()
+        rough = thinned_to(voxels, wanted)
+        noise = rough.take(lonely(rough))
+        return thinned_to(voxels.away_from(noise), wanted) if len(noise) else rough
+
+    def trusted(self, known: Known, at: int, prior: DepthPrior) -> Tensor:
+        """(H, W) which pixels of a depth map are used."""
+        mask = None if known.masks is None else known.masks[at]
+        trusted = (prior.inverse > 0) & (prior.confidence >= self.min_confidence)
+        return trusted if mask is None else trusted & mask
+
+
+def pixel_size(scene: Scene, prior: DepthPrior) -> float:
+    """Side of a pixel at the typical depth of a data set, local units, in the median over its views."""
+    return 1 / (prior.typical * float(np.median([focal(view.camera) for view in scene.train])))
+
+
+def focal(camera: Camera) -> float:
+    """Focal length in pixels, of pixels that need not be square."""
+    return (camera.fx * camera.fy) ** 0.5
+
+
+def samples(camera: Camera, prior: DepthPrior, photo: Tensor, there: Tensor) -> Samples:
+    """The points of a depth map where it is trusted, in the world; their grain is a pixel.
+
+    Args:
+        camera: Of the map.
+        prior: The map.
+        photo: (3, H, W) uint8.
+        there: (H, W) bool, where it has a depth that is trusted.
+    """
+    depth = 1 / prior.inverse[there].double()
+    rays = camera.rays(torch.float64)[:, there]
+    slopes = normals_of(camera, prior.inverse)
+    given = slopes if prior.normal is None else torch.where(prior.normal.abs().sum(0) > 0, prior.normal, slopes)
+    normal = given[:, there].double()
+    normal = torch.where(normal.abs().sum(0) > 0, normal, -normalize(rays, dim=0))
+    turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3:]
+    return Samples(
+        xyz=(turn.T @ (rays * depth - shift)).T.numpy(),
+        rgb=photo[:, there].float().T.numpy(),
+        normals=(turn.T @ normal).float().T.numpy(),
+        weight=prior.confidence[there].numpy(),
+        grain=(depth / focal(camera)).numpy(),
+    )
+
+
+def normals_of(camera: Camera, inverse: Tensor) -> Tensor:
+    """(3, H, W) unit normals of a depth map, towards the camera; 0 at edges and where a neighbour has no depth.
+
+    On a plane n . x = h the inverse depth c is linear in the image: with the ray r of a pixel, c = n . r / h. So its
+    differences give n up to length: (fx dc/dx, fy dc/dy, c - (u - cx) dc/dx - (v - cy) dc/dy).
+
+    Args:
+        camera: Of the map.
+        inverse: (H, W) inverse camera z; 0 where there is none.
+    """
+    c = inverse.double()
+    across, along = _slope(c, 1), _slope(c, 0)
+    rays = camera.rays(torch.float64)
+    nx, ny = camera.fx * across, camera.fy * along
+    normal = torch.stack([nx, ny, c - rays[0] * nx - rays[1] * ny])
+    known = (across.isfinite() & along.isfinite() & (c > 0))[None]
+    return torch.where(known, -normalize(normal.nan_to_num(), dim=0), 0).to(inverse.dtype)
+
+
+def _slope(values: Tensor, dim: int) -> Tensor:
+    """(H, W) change from a pixel to the next along an axis, NaN where it is not known or not that of one surface."""
+    before, after = values.roll(1, dim), values.roll(-1, dim)
+    smooth = ((before + after) / 2 - values).abs() < EDGE * values
+    slope = torch.where(smooth & (before > 0) & (after > 0), (after - before) / 2, torch.nan)
+    slope.index_fill_(dim, torch.tensor([0, values.shape[dim] - 1]), torch.nan)
+    return slope
+
+
+def filled(stereo: Thinned, known: Known, start: StereoStart) -> Cloud:
+    """Points of depth maps, and sparse points where there are none of those."""
+    from scipy.spatial import cKDTree
+
+    sparse = known.scene.cloud
+    distance, near = cKDTree(stereo.xyz).query(sparse.xyz.numpy())
+    more = torch.from_numpy(distance > FILL * stereo.size[near])
+    anyhow = torch.randn(int(more.sum()), 3, generator=known.generator)
+    xyz = torch.cat([torch.from_numpy(stereo.xyz).float(), sparse.xyz[more]])
+    counts = torch.tensor([len(stereo), len(anyhow)])
+    return Cloud(
+        xyz=xyz,
+        rgb=torch.cat([torch.from_numpy(stereo.rgb.round().clip(0, 255)).to(torch.uint8), sparse.rgb[more]]),
+        normals=torch.cat([torch.from_numpy(stereo.normals).float(), normalize(anyhow, dim=1)]),
+        opacity=torch.tensor([start.opacity, SPARSE_OPACITY]).repeat_interleave(counts),
+        size=gaps(xyz) * torch.tensor([start.size, 1.0]).repeat_interleave(counts),
+    )

@@ -1,0 +1,369 @@
+"""Depth maps that a run makes by itself: kept in a cache, made once, gone on with, and refused."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from surfkit.blocks import Hands
+from surfkit.cli import main
+from surfkit.core.check import BadInput
+from surfkit.core.lock import USED, held, is_used, used
+from surfkit.core.tree import evolve
+from surfkit.depth.keep import make_room
+from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.losses import DepthRegression
+from surfkit.partition import PictureShare, Pool, QuantileGrid
+from surfkit.pipeline import run
+from surfkit.recipe import Recipe
+from surfkit.scene.data import Data
+from surfkit.scene.depth_files import map_path
+from surfkit.scene.made_maps import folder_of, located, read_made
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.start.stereo import StereoStart
+from surfkit.train.material import Store
+from surfkit.train.stage import Stage
+
+SWEEP = PlaneSweep(longest=32, neighbours=2, max_planes=16)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "farm"
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=48, height=36, points=300)), tracks=True)
+    return folder
+
+
+@pytest.fixture
+def farm(made, tmp_path):
+    """A data set with tracks; one of its eight photographs is held out."""
+    torch.set_num_threads(1)
+    return Data(Path(shutil.copytree(made, tmp_path / "farm")))
+
+
+@pytest.fixture
+def recipe():
+    losses = Stage().losses | {"depth": DepthRegression()}
+    stage = Stage(steps=12, losses=losses, densify=None)
+    return evolve(Recipe(depth=SWEEP, start=StereoStart(points=400), pretrain=stage), "primitive.sh_degree", 0)
+
+
+def contents(folder):
+    """Every file in a folder and when it was written."""
+    return {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*"))}
+
+
+def maps(cache):
+    return {path.name: path.read_bytes() for path in sorted(cache.rglob("estimated_depths/*.npy"))}
+
+
+def record(out):
+    return json.loads((out / "run.json").read_text())
+
+
+def counting(monkeypatch, stop_after=None):
+    """The positions that the sweep estimates; it is interrupted after so many."""
+    seen, estimate = [], PlaneSweep.estimate
+
+    def watched(self, given, wanted):
+        for found in estimate(self, given, wanted):
+            if stop_after is not None and len(seen) == stop_after:
+                raise KeyboardInterrupt
+            seen.append(given.views[found.at].name)
+            yield found
+
+    monkeypatch.setattr(PlaneSweep, "estimate", watched)
+    return seen
+
+
+def test_a_run_makes_its_maps_once_and_leaves_the_data_alone(farm, recipe, tmp_path, own_cache, monkeypatch):
+    before, seen = contents(farm.path), counting(monkeypatch)
+    metrics = run(recipe, farm, tmp_path / "a")
+    assert contents(farm.path) == before
+    (folder,) = (own_cache / "depth").iterdir()
+    assert seen == [f"view_{at:03d}.png" for at in range(1, 8)]  # the first is held out
+    assert len(maps(own_cache)) == 14 and read_made(folder).maps == 7
+    assert not (folder / "estimated_depths/.work").exists()
+    assert metrics["prepare_cpu_seconds"] == round(read_made(folder).cpu_seconds, 2) > 0
+    (note,) = record(tmp_path / "a")["notes"]
+    assert note.startswith("depth maps of 7 photographs made with plane-sweep in ") and note.endswith(f", in {folder}")
+    assert record(tmp_path / "a")["data"]["priors"] == str(folder)
+
+    again = run(recipe, farm, tmp_path / "b")
+    assert len(seen) == 7, "the maps are there already"
+    assert again["prepare_cpu_seconds"] == metrics["prepare_cpu_seconds"]
+    assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
+    assert run(recipe, farm, tmp_path / "b") == again
+
+
+def test_a_start_from_stereo_is_denser_and_on_the_surface(farm, recipe, tmp_path):
+    from surfkit.train.checkpoint import load
+
+    run(recipe, farm, tmp_path / "a")
+    points = load(tmp_path / "a/pretrain/checkpoint.safetensors").points
+    run(replace(recipe, start=Recipe().start), farm, tmp_path / "b")
+    sparse = load(tmp_path / "b/pretrain/checkpoint.safetensors").points
+    assert len(sparse) == 300 and 390 < len(points) < 700
+    assert points.params["opacities"].sigmoid().median() > 0.4 > sparse.params["opacities"].sigmoid().median()
+
+
+@pytest.mark.parametrize(
+    ("changed", "same"),
+    [
+        (lambda farm, recipe: (farm, evolve(recipe, "depth.window", 7)), False),
+        (lambda farm, recipe: (replace(farm, test_every=4), recipe), False),
+        (lambda farm, recipe: (replace(farm, longest=40), recipe), False),
+        (lambda farm, recipe: (farm, evolve(recipe, "seed", 3)), True),
+    ],
+    ids=["estimator", "split", "size", "seed"],
+)
+def test_other_maps_are_made_when_what_they_are_made_from_differs(farm, recipe, tmp_path, own_cache, changed, same):
+    run(recipe, farm, tmp_path / "a")
+    farm, recipe = changed(farm, recipe)
+    run(recipe, farm, tmp_path / "b")
+    assert len(list((own_cache / "depth").iterdir())) == (1 if same else 2)
+
+
+def test_another_photograph_or_version_of_the_estimator_is_another_key(farm, recipe, tmp_path, own_cache, monkeypatch):
+    run(recipe, farm, tmp_path / "a")
+    monkeypatch.setattr(PlaneSweep, "version", 2)
+    run(recipe, farm, tmp_path / "b")
+    photo = farm.path / "images/view_003.png"
+    shutil.copy(farm.path / "images/view_004.png", photo)
+    run(recipe, farm, tmp_path / "c")
+    assert len({record(tmp_path / name)["data"]["priors"] for name in "abc"}) == 3
+
+
+def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, recipe, tmp_path, own_cache, monkeypatch):
+    run(recipe, farm, tmp_path / "whole")
+    expected, points = maps(own_cache), (tmp_path / "whole/point_cloud.ply").read_bytes()
+    shutil.rmtree(own_cache / "depth")
+    with monkeypatch.context() as patch:
+        counting(patch, stop_after=3)
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, farm, tmp_path / "run")
+    (folder,) = (own_cache / "depth").iterdir()
+    spent = read_made(folder).cpu_seconds
+    assert read_made(folder).maps == 3 and spent > 0 and not (tmp_path / "run/recipe.json").exists()
+    seen = counting(monkeypatch)
+    run(recipe, farm, tmp_path / "run")
+    assert len(seen) == 4 and maps(own_cache) == expected
+    assert record(tmp_path / "run")["prepare_cpu_seconds"] > spent
+    assert (tmp_path / "run/point_cloud.ply").read_bytes() == points
+
+
+def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
+    farm, recipe, tmp_path, own_cache, monkeypatch
+):
+    run(recipe, farm, tmp_path / "whole")
+    from surfkit import optimise
+
+    take, steps = optimise.Trainer.step, []
+
+    def stopped(self, state):
+        steps.append(1)
+        if len(steps) == 6:
+            raise KeyboardInterrupt
+        return take(self, state)
+
+    from surfkit.optimise import Every
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optimise.Trainer, "step", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run(recipe, farm, tmp_path / "run", every=Every(checkpoint=2))
+    shutil.rmtree(own_cache / "depth")
+    with pytest.raises(BadInput, match="leave out --no-prepare to make them again"):
+        run(recipe, farm, tmp_path / "run", store=Store(maps=None))
+    seen = counting(monkeypatch)
+    run(recipe, farm, tmp_path / "run")
+    assert len(seen) == 7
+    ends = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("run", "whole")]
+    assert ends[0] == ends[1]
+    shutil.rmtree(own_cache / "depth")
+    metrics = run(recipe, farm, tmp_path / "run")  # finished: nothing needs maps
+    assert len(seen) == 7 and metrics["prepare_cpu_seconds"] > 0
+    (tmp_path / "run/metrics.json").unlink()
+    assert run(recipe, farm, tmp_path / "run")["prepare_cpu_seconds"] > 0
+
+
+def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, recipe, tmp_path, own_cache, monkeypatch):
+    seen = counting(monkeypatch)
+    with pytest.raises(BadInput, match="surfkit prepare depth .*depth:plane-sweep, or choose start:sparse") as refused:
+        run(recipe, farm, tmp_path / "a", store=Store(maps=None))
+    assert "\n" not in str(refused.value) and not (tmp_path / "a").exists()
+    sparse = replace(recipe, start=Recipe().start)
+    metrics = run(sparse, farm, tmp_path / "b", store=Store(maps=None))
+    (note,) = record(tmp_path / "b")["notes"]
+    assert "has no depth priors, so the depth loss is off" in note and metrics["prepare_cpu_seconds"] is None
+    assert not seen and not (own_cache / "depth").exists()
+
+
+def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, own_cache):
+    sparse = replace(recipe, start=Recipe().start)
+    run(sparse, farm, tmp_path / "run", store=Store(maps=None))
+    saved = json.loads((tmp_path / "run/recipe.json").read_text())
+    del saved["depth"], saved["start"]  # as surfkit of before wrote it
+    (tmp_path / "run/recipe.json").write_text(json.dumps(saved))
+    (tmp_path / "run/metrics.json").unlink()
+    longer = evolve(sparse, "pretrain.steps", 16)
+    assert run(longer, farm, tmp_path / "run")["steps"] == 16
+    assert not (own_cache / "depth").exists()
+
+
+def test_maps_of_the_data_set_come_first(farm, recipe, tmp_path, own_cache, monkeypatch):
+    words = ["--estimator.longest", "32", "--estimator.neighbours", "2", "--estimator.max-planes", "16"]
+    assert main(["prepare", "depth", str(farm.path), *words]) == 0
+    seen = counting(monkeypatch)
+    metrics = run(recipe, farm, tmp_path / "own")
+    assert not seen and not (own_cache / "depth").exists() and metrics["prepare_cpu_seconds"] is None
+    shutil.rmtree(farm.path / "estimated_depths")
+    run(recipe, farm, tmp_path / "made")
+    assert len(seen) == 7
+    ends = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("own", "made")]
+    assert ends[0] == ends[1]
+
+
+def test_a_model_without_tracks_trains_without_maps(tmp_path, recipe, own_cache):
+    write_colmap(tmp_path / "farm", photograph(Flight(views=4, width=24, height=18, points=40)))
+    with pytest.raises(BadInput, match="there are none that can be used"):
+        run(recipe, Data(tmp_path / "farm"), tmp_path / "a")
+    run(replace(recipe, start=Recipe().start), Data(tmp_path / "farm"), tmp_path / "b")
+    notes = record(tmp_path / "b")["notes"]
+    assert any(note.startswith("depth maps cannot be made: ") and "triangulate" in note for note in notes)
+    assert not (own_cache / "depth").exists()
+
+
+def test_a_damaged_photograph_gets_no_map(farm, recipe, tmp_path, own_cache):
+    photo = farm.path / "images/view_003.png"
+    photo.write_bytes(photo.read_bytes()[:400])
+    run(recipe, farm, tmp_path / "run")
+    (folder,) = (own_cache / "depth").iterdir()
+    assert read_made(folder).maps == 6 and read_made(folder).without == ("view_003.png",)
+    assert record(tmp_path / "run")["skipped"] == ["view_003.png"]
+
+
+def test_a_data_set_that_cannot_be_written_to_is_no_matter(farm, recipe, tmp_path, own_cache):
+    folders = [farm.path, *(path for path in farm.path.rglob("*") if path.is_dir())]
+    for folder in folders:
+        folder.chmod(0o555)
+    try:
+        run(recipe, farm, tmp_path / "run")
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert len(maps(own_cache)) == 14
+
+
+def test_a_cache_that_cannot_be_written_to_is_one_line(farm, recipe, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "file"))
+    with pytest.raises(BadInput, match="cannot be written .*; set SURFKIT_CACHE to a folder") as error:
+        run(recipe, farm, tmp_path / "run")
+    assert "\n" not in str(error.value) and not (tmp_path / "run").exists()
+
+
+def test_worker_elsewhere_finds_the_maps_in_its_own_cache_or_says_so(own_cache, tmp_path):
+    there = tmp_path / "other/depth/0123"
+    with pytest.raises(BadInput, match="set SURFKIT_CACHE to a folder that both see"):
+        located(there)
+    (folder_of("0123") / "estimated_depths").mkdir(parents=True)
+    assert located(there) == own_cache / "depth/0123"
+    (there / "estimated_depths").mkdir(parents=True)
+    assert located(there) == there
+
+
+def entry(cache, name, size, age):
+    folder = cache / "depth" / name
+    (folder / "estimated_depths").mkdir(parents=True)
+    np.save(folder / "estimated_depths/a.npy", np.zeros(size, np.uint8))
+    (folder / USED).touch()
+    os.utime(folder / USED, (time.time() - age,) * 2)
+    return folder
+
+
+def test_those_longest_unused_go_when_the_cache_is_full(own_cache):
+    old, older, mine = (entry(own_cache, name, 10_000, age) for name, age in (("b", 50), ("a", 90), ("c", 99)))
+    (own_cache / "depth/.dropped-x").mkdir()
+    make_room(mine, 1 << 20)
+    assert old.exists() and older.exists() and not (own_cache / "depth/.dropped-x").exists()
+    make_room(mine, 25_000)
+    assert old.exists() and not older.exists() and mine.exists()
+    with used(old):
+        make_room(mine, 0)
+        assert old.exists() and is_used(old)
+    with held(old):
+        make_room(mine, 0)
+        assert old.exists()
+    make_room(mine, 0)
+    assert [path.name for path in (own_cache / "depth").iterdir()] == ["c"]
+
+
+def test_making_maps_makes_room(farm, recipe, tmp_path, own_cache):
+    other = entry(own_cache, "other", 10_000, 50)
+    run(recipe, farm, tmp_path / "run", store=Store(maps="1MB"))
+    assert other.exists()
+    run(evolve(recipe, "depth.window", 7), farm, tmp_path / "b", store=Store(maps="1KB"))
+    (left,) = (own_cache / "depth").iterdir()
+    assert str(left) == record(tmp_path / "b")["data"]["priors"]
+    with pytest.raises(BadInput, match="--prepare-cache lots: give a size"):
+        run(recipe, farm, tmp_path / "c", store=Store(maps="lots"))
+    with pytest.raises(BadInput, match="--prepare-cache auto: give a size such as 20GB"):
+        run(recipe, farm, tmp_path / "c", store=Store(maps="auto"))
+
+
+def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
+    from surfkit.core.codec import write_json
+
+    write_json(tmp_path / "recipe.json", recipe)
+    words = [sys.executable, "-m", "surfkit.cli", "train", f"recipe:{tmp_path / 'recipe.json'}"]
+    words += ["--data", str(farm.path), "--pictures-every", "0", "--out"]
+    both = [subprocess.Popen([*words, str(tmp_path / name)], stderr=subprocess.PIPE, text=True) for name in "ab"]
+    told = [process.communicate(timeout=200)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], told
+    assert len(list((own_cache / "depth").iterdir())) == 1
+    costs = [record(tmp_path / name)["prepare_cpu_seconds"] for name in "ab"]
+    assert costs[0] == costs[1]
+    assert (tmp_path / "a/point_cloud.ply").read_bytes() == (tmp_path / "b/point_cloud.ply").read_bytes()
+
+
+def test_blocks_in_processes_of_their_own_find_the_maps(farm, recipe, tmp_path, own_cache, monkeypatch, capsys):
+    tune = replace(recipe.pretrain, steps=6, sh_every=1)
+    recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
+    out = tmp_path / "run"
+    run(recipe, farm, out, Hands("cpu", Pool(2)))
+    assert not [note for note in record(out)["notes"] if not note.startswith("depth maps of 7")]
+    run(recipe, farm, tmp_path / "inline")
+    assert (out / "point_cloud.ply").read_bytes() == (tmp_path / "inline/point_cloud.ply").read_bytes()
+    with monkeypatch.context() as patch:  # a machine that does not see the cache
+        patch.setenv("SURFKIT_CACHE", str(tmp_path / "elsewhere"))
+        (own_cache / "depth").rename(own_cache / "gone")
+        shutil.rmtree(tmp_path / "inline/blocks/000/tune")
+        state = tmp_path / "inline/blocks/000/state.json"
+        assert main(["tune", str(tmp_path / "inline"), "0"]) == 2
+        err = capsys.readouterr().err
+        assert "set SURFKIT_CACHE to a folder that both see" in err and state.exists()
+        (own_cache / "gone").rename(tmp_path / "elsewhere-too")
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "elsewhere-too").rename(tmp_path / "elsewhere/depth")
+        assert main(["tune", str(tmp_path / "inline"), "0"]) == 0
+
+
+def test_the_words_of_the_command_line(farm, tmp_path, own_cache, capsys):
+    words = ["train", "recipe:2dgs", "start:stereo", "depth:plane-sweep", "--data", str(farm.path), "--steps", "5"]
+    words += ["--depth.longest", "40", "--start.points", "200", "mesh:none", "--out", str(tmp_path / "run")]
+    assert main([*words, "--no-prepare"]) == 2
+    assert "surfkit prepare depth" in capsys.readouterr().err
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert "depth maps" in out and "depth maps  7/7" in err
+    assert main(words) == 0 and "is finished" in capsys.readouterr().err
+    assert not map_path(farm.path, "view_001.png").exists() and len(maps(own_cache)) == 14
