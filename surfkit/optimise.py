@@ -48,6 +48,19 @@ class Every:
 
 
 @dataclass(frozen=True)
+class Begun:
+    """What a stage begins with where it goes on from a model.
+
+    Attributes:
+        params: Raw parameters of the points.
+        sh_degree: Of the spherical harmonics that they have learnt so far.
+    """
+
+    params: Columns
+    sh_degree: int
+
+
+@dataclass(frozen=True)
 class Job:
     """What the steps of a run are made with.
 
@@ -58,7 +71,7 @@ class Job:
         every: When to write what.
         given: What to look at.
         meter: Sees what memory is taken by.
-        start: The points to begin with; the sparse ones of the scene if None.
+        start: Gives the points to begin with; the sparse ones of the scene if None.
         before: The model that it goes on from, if its times count too.
     """
 
@@ -68,7 +81,7 @@ class Job:
     every: Every
     given: Material
     meter: Meter
-    start: Callable[[], Columns] | None = None
+    start: Callable[[], Begun] | None = None
     before: StageState | None = None
 
 
@@ -107,8 +120,9 @@ def optimise(job: Job, state: StageState | None) -> StageState:
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
-        params = job.start() if job.start else primitive.init(job.scene.cloud, generator)
-        fresh = trainer.begin(Points.fresh(params), generator)
+        begun = job.start() if job.start else Begun(primitive.init(job.scene.cloud, generator), 0)
+        fresh = trainer.begin(Points.fresh(begun.params), generator)
+        fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         if job.before is not None:
             for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
                 setattr(fresh, name, getattr(job.before, name))
