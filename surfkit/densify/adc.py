@@ -16,6 +16,9 @@ from surfkit.primitives.base import SHRINK
 from surfkit.primitives.points import Edit, Points
 
 GRAD, SEEN, SIZE = "adc/grad", "adc/seen", "adc/size"
+START_STRETCH, EVERY_STRETCH = 12.0, 15.0
+"""How much longer than their share of a short run its first steps without an edit and its pauses between edits may be.
+Shares of the default `until`: 500 of 15,000 times 12 are two fifths, 100 times 15 a tenth."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +31,16 @@ class ADC(Densify):
     small: float = 0.01
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
 
-    start: Annotated[int, StepCount(floor=300)] = 500
-    """Steps before the first edit; short runs keep at least 300, as gradients mean little until colours settle."""
+    start: Annotated[int, StepCount(floor=300, stretch=START_STRETCH)] = 500
+    """Steps before the first edit; short runs keep at least 300, as gradients mean little until colours settle, but no
+    more than two fifths of the time up to `until`."""
 
     until: Steps = 15_000
     """Step from which on nothing is edited."""
 
-    every: Annotated[int, StepCount(floor=100)] = 100
-    """Steps between edits; short runs keep at least 100, which points need to find their place."""
+    every: Annotated[int, StepCount(floor=100, stretch=EVERY_STRETCH)] = 100
+    """Steps between edits; short runs keep at least 100, which points need to find their place, but no more than a
+    tenth of the time up to `until`: some edits remain in a run of any length."""
 
     cull_opacity: float = 0.005
     """Drop points fainter than this."""
@@ -96,6 +101,10 @@ class ADC(Densify):
             if self.cull_screen > 0:
                 drop |= points.stat(SIZE) > self.cull_screen
         return Edit(drop, clone, split, cap)
+
+    def edit_steps(self, steps: int) -> range:
+        """See `Densify.edit_steps`."""
+        return range((self.start // self.every + 1) * self.every, min(self.until, steps + 1), self.every)
 
     def _due(self, index: int) -> bool:
         return self.start < index < self.until and index % self.every == 0

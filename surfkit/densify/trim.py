@@ -11,10 +11,14 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import StepCount, Steps
+from surfkit.densify.adc import EVERY_STRETCH
 from surfkit.densify.base import Prune, Step, Views
 from surfkit.primitives.points import Edit, Points
 
 RELEASED_TOP = 5
+START_STRETCH, RECOVERY_STRETCH = 10.0, 9.0
+"""See `StepCount.stretch`: of the default start, 1,000, over the default end, 15,000, two thirds; the default recovery,
+500, stays below that."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +37,21 @@ class Trim(Prune):
     gamma: float = 0.5
     """Power of alpha in a mean or a peak, the rest being that of the transmittance."""
 
-    start: Steps = 1_000
-    """First step that may trim; before it, only points that no view sees are dropped, at the first step."""
+    start: Annotated[int, StepCount(floor=600, stretch=START_STRETCH)] = 1_000
+    """First step that may trim; before it, only points that no view sees are dropped, at the first step. Short runs
+    keep at least 600, but no more than two thirds of the time up to `until`: `adc` has made two edits by then."""
 
     until: Steps = 15_000
     """Last step that may trim."""
 
-    every: Annotated[int, StepCount(floor=100)] = 500
-    """Fewest steps between trims, rounded up to whole epochs; short runs keep at least 100."""
+    every: Annotated[int, StepCount(floor=500, stretch=EVERY_STRETCH)] = 500
+    """Fewest steps between trims, rounded up to whole epochs, from the first end of an epoch after `start`. Short runs
+    keep at least 500, but no more than half of the time up to `until`: always five times the steps between edits of
+    `adc`, so that what an edit adds has learnt something before it is judged."""
 
-    recovery: Annotated[int, StepCount(floor=100)] = 500
-    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100."""
+    recovery: Annotated[int, StepCount(floor=100, stretch=RECOVERY_STRETCH)] = 500
+    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100 in runs that are
+    long enough for a reset."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ratio < 1:
@@ -57,11 +65,14 @@ class Trim(Prune):
         """Drop the lowest at the end of some epochs, and the unseen at the beginning."""
         if step.index == 1:
             return Edit(drop=step.views.survey(self.gamma, 1 - self.gamma).views == 0)
-        epochs = -(-self.every // len(step.views))
-        due = self.start <= step.index <= self.until and step.index % (epochs * len(step.views)) == 0
-        if not due or step.since_reset < self.recovery:
+        if step.index not in self.trims(len(step.views)) or step.since_reset < self.recovery:
             return None
         return Edit(drop=lowest(self._scores(step.views), self.ratio))
+
+    def trims(self, views: int) -> range:
+        """The steps that trim where so many views are an epoch, unless opacities have just been reset."""
+        first, period = (-(-steps // views) * views for steps in (max(self.start, 1), self.every))
+        return range(first, self.until + 1, period)
 
     def _scores(self, views: Views) -> Tensor:
         if self.score == "released":

@@ -88,6 +88,18 @@ def test_edits_happen_between_start_and_until():
     assert [i for i in range(1, 200) if watched(policy, scene(), [i])] == [30, 40, 50, 60, 70, 80, 90]
 
 
+@pytest.mark.parametrize("policy", [ADC(start=20, until=100, every=10), ADC(start=25, until=101, every=10), ADC()])
+@pytest.mark.parametrize("steps", [15, 60, 100, 700])
+def test_the_steps_of_edits_are_known_beforehand(policy, steps):
+    edited = [i for i in range(1, steps + 1) if (edit := watched(policy, scene(), [i])) and edit.clone is not None]
+    assert list(policy.edit_steps(steps)) == edited
+
+
+@pytest.mark.parametrize("steps", [*range(11, 60), 100, 300, 500, 700, 1_000, 1_499])
+def test_short_runs_have_some_edits(steps):
+    assert len(rescale(ADC(), steps / 30_000).edit_steps(steps)) >= 3
+
+
 def test_the_first_window_begins_at_the_first_step_and_each_edit_begins_another():
     policy, points, counts = ADC(start=20, until=100, every=10), scene(), {}
     for index in range(1, 120):

@@ -9,7 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import rescale
-from surfkit.densify import Faint, Importance, Trim
+from surfkit.densify import ADC, Faint, Importance, Trim
 from surfkit.densify.base import Tally
 from surfkit.densify.trim import lowest, released_score, summed
 from surfkit.raster.api import Splats
@@ -58,7 +58,7 @@ def test_the_lowest_share_goes_and_equal_scores_go_together():
 
 def test_trim_drops_the_unseen_at_the_first_step_and_then_the_lowest_means(crowd):
     assert dropped(Trim(), crowd, 1).nonzero().flatten().tolist() == list(range(9))
-    found = dropped(Trim(ratio=0.1, every=500), crowd, 504 * 2)
+    found = dropped(Trim(ratio=0.1, every=500), crowd, 1_001)
     mean = [
         np.mean([AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)]) for n in range(200)
     ]  # fmt: skip
@@ -66,20 +66,47 @@ def test_trim_drops_the_unseen_at_the_first_step_and_then_the_lowest_means(crowd
 
 
 def test_trim_by_the_view_that_shows_a_point_best(crowd):
-    found = dropped(Trim(ratio=0.1, every=500, score="peak"), crowd, 504 * 2)
+    found = dropped(Trim(ratio=0.1, every=500, score="peak"), crowd, 1_001)
     peak = [max(AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)) for n in range(200)]
     assert set(found.nonzero().flatten().tolist()) == set(np.argsort(peak, kind="stable")[:20].tolist())
 
 
 def test_trims_end_epochs_and_leave_reset_points_alone(crowd):
     policy = Trim(start=1_000, until=3_000, every=500)
-    assert [i for i in range(2, 5_000) if dropped(policy, crowd, i) is not None] == [1008, 1512, 2016, 2520]
-    assert dropped(policy, crowd, 1008, since_reset=499) is None
-    assert dropped(policy, crowd, 1008, since_reset=500) is not None
+    assert [i for i in range(2, 5_000) if dropped(policy, crowd, i) is not None] == [1001, 1505, 2009, 2513]
+    assert dropped(policy, crowd, 1001, since_reset=499) is None
+    assert dropped(policy, crowd, 1001, since_reset=500) is not None
     every = replace(policy, every=3)
     assert [i for i in range(2, 1_020) if dropped(every, crowd, i) is not None] == [1001, 1008, 1015]
     short = rescale(Trim(), 2_000 / 30_000)
-    assert (short.start, short.until, short.every, short.recovery) == (67, 1_000, 100, 100)
+    assert (short.start, short.until, short.every, short.recovery) == (600, 1_000, 500, 100)
+
+
+def schedule(recipe_steps, epoch):
+    """Steps that add points and steps that trim, of a run of so many steps with so many views."""
+    adc, trim = (rescale(policy, recipe_steps / 30_000) for policy in (ADC(), Trim()))
+    edits, trims, reset = list(adc.edit_steps(recipe_steps)), [], 0
+    for index in range(2, recipe_steps + 1):
+        if index in trim.trims(epoch) and index - reset >= trim.recovery:
+            trims.append(index)
+        if index % adc.reset_every == 0 and index < adc.until:
+            reset = index
+    return edits, trims
+
+
+@pytest.mark.parametrize("epoch", [1, 7, 21, 24, 45, 70, 100])
+@pytest.mark.parametrize("steps", [300, 1_000, 2_000, 4_000, 7_000, 30_000])
+def test_trims_and_edits_keep_their_ratio_at_any_length(steps, epoch):
+    edits, trims = schedule(steps, epoch)
+    assert len(edits) >= 5
+    assert trims and trims[0] >= edits[1], "the first edit is followed by a second one"
+    assert 4.5 <= len(edits) / len(trims) <= 7.5, "144 edits and 22 to 29 trims at full length"
+
+
+def test_no_trim_comes_before_the_second_edit():
+    for steps in range(20, 3_000, 7):
+        edits, trims = schedule(steps, 1)
+        assert len(trims) * 3 <= len(edits) and (not trims or trims[0] >= edits[1]), steps
 
 
 def test_the_released_score_is_the_mean_of_its_list_of_records():
@@ -102,7 +129,7 @@ def test_the_released_score_is_the_mean_of_its_list_of_records():
 
 
 def test_trim_by_the_released_score(crowd):
-    found = dropped(Trim(ratio=0.25, score="released"), crowd, 1008)
+    found = dropped(Trim(ratio=0.25, score="released"), crowd, 1001)
     order = released_score(Seven()).argsort()
     assert set(found.nonzero().flatten().tolist()) == set(order[:50].tolist())
 
@@ -158,7 +185,7 @@ def test_the_sum_of_a_disc_is_the_integral_of_its_kernel():
 
 
 def test_trim_by_the_sum(crowd):
-    found = dropped(Trim(ratio=0.25, score="sum"), crowd, 1008)
+    found = dropped(Trim(ratio=0.25, score="sum"), crowd, 1001)
     total = [sum(float(AMOUNT[v, n]) for v in range(7) if COUNT[v, n]) for n in range(200)]
     assert set(found.nonzero().flatten().tolist()) == set(np.argsort(total, kind="stable")[:50].tolist())
 
