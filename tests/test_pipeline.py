@@ -219,7 +219,7 @@ def test_points_multiply_in_a_short_run(data, tmp_path, name, primitive):
     run(recipe, data, tmp_path, every=Every(pictures=0))
     lines = map(json.loads, (tmp_path / "events.jsonl").read_text().splitlines())
     edits = [line for line in lines if line["event"] == "PointsEdited"]
-    assert sum(line["cloned"] + line["split"] > 0 for line in edits) >= 3
+    assert sum(line["cloned"] + line["split"] > 0 for line in edits) >= 2
 
 
 def test_an_executor_without_blocks_is_told(data, recipe, tmp_path, capsys):

@@ -11,14 +11,10 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import StepCount, Steps
-from surfkit.densify.adc import EVERY_STRETCH
 from surfkit.densify.base import Prune, Step, Views
 from surfkit.primitives.points import Edit, Points
 
 RELEASED_TOP = 5
-START_STRETCH, RECOVERY_STRETCH = 10.0, 9.0
-"""See `StepCount.stretch`: of the default start, 1,000, over the default end, 15,000, two thirds; the default recovery,
-500, stays below that."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +33,20 @@ class Trim(Prune):
     gamma: float = 0.5
     """Power of alpha in a mean or a peak, the rest being that of the transmittance."""
 
-    start: Annotated[int, StepCount(floor=600, stretch=START_STRETCH)] = 1_000
+    start: Annotated[int, StepCount(floor=800)] = 1_000
     """First step that may trim; before it, only points that no view sees are dropped, at the first step. Short runs
-    keep at least 600, but no more than two thirds of the time up to `until`: `adc` has made two edits by then."""
+    keep at least 800, as `adc` has made five edits by then; those of which `until` comes earlier are not trimmed."""
 
     until: Steps = 15_000
     """Last step that may trim."""
 
-    every: Annotated[int, StepCount(floor=500, stretch=EVERY_STRETCH)] = 500
+    every: Annotated[int, StepCount(floor=500)] = 500
     """Fewest steps between trims, rounded up to whole epochs, from the first end of an epoch after `start`. Short runs
-    keep at least 500, but no more than half of the time up to `until`: always five times the steps between edits of
-    `adc`, so that what an edit adds has learnt something before it is judged."""
+    keep at least 500: as in long ones, five times the steps between edits of `adc`, as what these add must learn before
+    it is judged."""
 
-    recovery: Annotated[int, StepCount(floor=100, stretch=RECOVERY_STRETCH)] = 500
-    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100 in runs that are
-    long enough for a reset."""
+    recovery: Annotated[int, StepCount(floor=100)] = 500
+    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ratio < 1:

@@ -24,14 +24,14 @@ class Relocation(Densify):
     cap: int = 1_000_000
     """The most points there may be."""
 
-    start: Annotated[int, StepCount(floor=100, stretch=12.0)] = 500
-    """Steps before the first move; short runs keep at least 100, but no more than a quarter of the way to `until`."""
+    start: Annotated[int, StepCount(floor=100, stretch=25.0)] = 500
+    """Steps before the first move; short runs keep at least 100, but no more than half of the way to `until`."""
 
     until: Steps = 25_000
     """Last step that moves points."""
 
-    every: Annotated[int, StepCount(floor=50, stretch=15.0)] = 100
-    """Steps between moves; short runs keep at least 50, but no more than 6 % of the time up to `until`."""
+    every: Annotated[int, StepCount(floor=50, stretch=50.0)] = 100
+    """Steps between moves; short runs keep at least 50, but no more than a fifth of the way to `until`."""
 
     growth: float = 0.05
     """Share by which the number of points grows at each move."""
