@@ -19,8 +19,8 @@ GRAD, SEEN, SIZE = "adc/grad", "adc/seen", "adc/size"
 START_STRETCH, EVERY_STRETCH = 15.0, 30.0
 """How much longer than their share of a short run its first steps without an edit and its pauses between edits may be.
 Of the default `until`, 15,000, 500 times 15 are a half, and 100 times 30 a fifth: two edits. On examples/boruszyn at
-a quarter of its size, 500 steps of 2DGS came to 18.7 dB so, to 17.4 without edits, and to 17.0 with five, as points were
-added faster than they could learn; 1,000 steps to 20.6, to 18.4 with one edit, and to 20.3 with five (69,000 points
+a quarter of its size, 500 steps of 2DGS came to 18.7 dB so, to 17.4 without edits, and to 17.0 with five, which add
+points faster than these can learn; 1,000 steps to 20.6, to 18.4 with one edit, and to 20.3 with five (69,000 points
 instead of 31,000)."""
 
 
