@@ -91,9 +91,10 @@ plan = read_json(this.out / "blocks" / "plan.json", Record).plan
 site = Site(this, read(this.data), select("cpu")[0], Every(pictures=0), Store("100MB"))
 for block in plan.blocks:
     views = tuple(view for view in site.scene.train if view.name in set(block.views))
-    params = Start(site, plan, block.index, views)()
+    begun = Start(site, plan, block.index, views)()
     steps = this.recipe.tune.steps
-    state = StageState(Points.fresh(params), Order(len(views)), torch.Generator(), index=steps, sh_degree=3)
+    points, degree = Points.fresh(begun.params), begun.sh_degree
+    state = StageState(points, Order(len(views)), torch.Generator(), index=steps, sh_degree=degree)
     checkpoint.save(site.block(block.index).checkpoint, state)
     write_state(site.place(block.index), status="done", step=steps, steps=steps)
 """

@@ -49,6 +49,19 @@ class Every:
 
 
 @dataclass(frozen=True)
+class Begun:
+    """What a stage begins with where it goes on from a model.
+
+    Attributes:
+        params: Raw parameters of the points.
+        sh_degree: Of the spherical harmonics that they have learnt so far.
+    """
+
+    params: Columns
+    sh_degree: int
+
+
+@dataclass(frozen=True)
 class Job:
     """What the steps of a run are made with.
 
@@ -59,7 +72,7 @@ class Job:
         every: When to write what.
         given: What to look at.
         meter: Sees what memory is taken by.
-        start: Raw parameters of the points to begin with; if None, those of the `cloud`.
+        start: Gives the points to begin with; if None, those of the `cloud`.
         cloud: Gives the points to begin at; the sparse ones of the scene if None.
         before: The model that it goes on from, if its times count too.
     """
@@ -70,7 +83,7 @@ class Job:
     every: Every
     given: Material
     meter: Meter
-    start: Callable[[], Columns] | None = None
+    start: Callable[[], Begun] | None = None
     before: StageState | None = None
     cloud: Callable[[], Cloud] | None = None
 
@@ -112,8 +125,9 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
         began = time.perf_counter(), time.process_time()
         cloud = job.cloud() if job.cloud else job.scene.cloud
-        params = job.start() if job.start else primitive.init(cloud, generator)
-        fresh = trainer.begin(Points.fresh(params), generator)
+        begun = job.start() if job.start else Begun(primitive.init(cloud, generator), 0)
+        fresh = trainer.begin(Points.fresh(begun.params), generator)
+        fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         if job.cloud:
             fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
         if job.before is not None:

@@ -113,6 +113,7 @@ def run(
         state = saved(this, scene, repair=True)
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
+        warn_of_no_edits(this)
         this = use.enter_context(with_maps(this, scene, prints, store, hands.device, state is not None))
         if recipe.partition is None and hands.workers != Inline():
             emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
@@ -244,6 +245,20 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     if ahead is not None:
         raise BadInput(f"{out}: {'not all blocks are tuned' if ahead == 'tune' else f'{ahead} is not begun'}; {again}")
     return this, state, scene
+
+
+def warn_of_no_edits(this: Run) -> None:
+    """Say which stages cannot add a point, though they are to."""
+    for part in this.parts:
+        run = replace(this, part=part)
+        steps = run.stage.densify.edit_steps(run.stage.steps) if run.stage.densify is not None else None
+        if steps is not None and len(steps) == 0:
+            emit(
+                Warned(
+                    f"{run.setting}: no point will be added, as no edit of densify falls within {run.stage.steps:,} "
+                    f"steps; more steps, or a lower {run.setting}.densify.start and every, change that"
+                )
+            )
 
 
 def warn_of_gaps(scene: Scene, state: StageState | None) -> None:

@@ -10,8 +10,7 @@ from torch import Tensor
 from surfkit.core.journal import kept
 from surfkit.folder import Run, discard_results
 from surfkit.notes import naming
-from surfkit.optimise import Job, drawing, optimise, saved
-from surfkit.primitives.points import Columns
+from surfkit.optimise import Begun, Job, drawing, optimise, saved
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import Scene
@@ -47,8 +46,9 @@ def _gone_through(site: Site, before: Run, given: StageState) -> StageState:
         return state
     discard_results(this)
 
-    def start() -> Columns:
-        return {name: value.clone() for name, value in refine.params(before.stage.finished(given)).items()}
+    def start() -> Begun:
+        params = refine.params(before.stage.finished(given))
+        return Begun({name: value.clone() for name, value in params.items()}, given.sh_degree)
 
     every, folder = replace(site.every, pictures=0), this.checkpoint.parent
     folder.mkdir(exist_ok=True)

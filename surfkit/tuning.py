@@ -25,7 +25,7 @@ from surfkit.core.registry import hookimpl, plugins
 from surfkit.folder import Run, refuse_file
 from surfkit.ladder import climb, eased
 from surfkit.notes import naming
-from surfkit.optimise import Every, Job, optimise, saved
+from surfkit.optimise import Begun, Every, Job, optimise, saved
 from surfkit.partition.base import Sight
 from surfkit.partition.executor import terminable
 from surfkit.partition.plan import Plan
@@ -174,10 +174,11 @@ class Start:
     index: int
     views: Sequence[View]
 
-    def __call__(self) -> Columns:
-        """Their raw parameters."""
-        kept = [self.wanted(piece) for piece in coarse_model(self.site.this).pieces()]
-        return {name: torch.cat([part[name] for part in kept]) for name in kept[0]}
+    def __call__(self) -> Begun:
+        """Their raw parameters, and the degree of harmonics that the coarse model has come to."""
+        coarse = coarse_model(self.site.this)
+        kept = [self.wanted(piece) for piece in coarse.pieces()]
+        return Begun({name: torch.cat([part[name] for part in kept]) for name in kept[0]}, coarse.state.sh_degree)
 
     def wanted(self, piece: StageState) -> Columns:
         """Those among some points of the coarse model."""

@@ -44,10 +44,10 @@ def data(tmp_path_factory) -> Data:
 
 @pytest.fixture(scope="module")
 def recipe() -> Recipe:
-    """Two blocks, half of the points each."""
-    stage = Stage(steps=STEPS)
+    """Two blocks, half of the points each; colours learn all degrees in pretraining, and none would while tuning."""
+    stage = Stage(steps=STEPS, sh_every=1_000)
     return Recipe(
-        pretrain=stage, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=replace(stage, sh_every=1)
+        pretrain=replace(stage, sh_every=STEPS // 3), partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=stage
     )
 
 
@@ -358,9 +358,18 @@ def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, m
         views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
         wanted = plan.cells.owner(coarse.points.params["means"]) == index
         wanted |= rasterizer.render(splats, views[0].camera, this.recipe.pretrain.near).seen
-        found = tuning.Start(site, plan, index, views)()
+        begun = tuning.Start(site, plan, index, views)()
+        found = begun.params
+        assert begun.sh_degree == coarse.sh_degree == 3
         assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
         assert all(torch.equal(value, coarse.points.params[name][wanted]) for name, value in found.items())
+
+
+def test_blocks_begin_with_the_harmonics_of_the_coarse_model(undisturbed):
+    """And so does what they are merged into."""
+    folders = [undisturbed / "blocks" / "000", undisturbed / "blocks" / "001", undisturbed]
+    states = [checkpoint.load(folder / "tune" / "checkpoint.safetensors") for folder in folders]
+    assert [state.sh_degree for state in states] == [3, 3, 3]
 
 
 def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_path, capsys):

@@ -15,8 +15,10 @@ from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
-from surfkit.partition import Pool
+from surfkit.folder import Run
+from surfkit.partition import Pool, QuantileGrid
 from surfkit.pipeline import Every, load_run, run, with_steps
+from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.scene.data import Data
 from surfkit.scene.ply import read_splats
 from surfkit.scene.read import read
@@ -186,10 +188,38 @@ def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypa
 
 
 def test_without_held_out_photographs_the_metrics_say_so(data, recipe, tmp_path, capsys):
-    metrics = run(with_steps(recipe, 2), replace(data, test_every=0), tmp_path)
+    fixed = evolve(with_steps(recipe, 2), "pretrain.densify", None)
+    metrics = run(fixed, replace(data, test_every=0), tmp_path)
     assert metrics["images"] == {"psnr": None, "ssim": None, "per_image": {}} and metrics["fps"] > 0
     notes = json.loads((tmp_path / "run.json").read_text())["notes"]
     assert len(notes) == 1 and "cannot be measured" in notes[0] and notes[0] in capsys.readouterr().err
+
+
+def test_a_stage_that_can_add_no_point_is_told_before_it_begins(data, recipe, tmp_path, capsys):
+    whole = recipes()["2dgs"].pretrain
+    run(replace(recipe, pretrain=replace(whole, steps=2), mesh=None), data, tmp_path / "run")
+    told = "note: pretrain: no point will be added, as no edit of densify falls within 2 steps; more steps"
+    assert told in capsys.readouterr().err
+    run(replace(recipe, pretrain=replace(whole, steps=2, densify=None), mesh=None), data, tmp_path / "fixed")
+    assert "no point" not in capsys.readouterr().err, "none is to be added"
+
+
+@pytest.mark.parametrize(("cut", "told"), [(None, []), (QuantileGrid((1, 1)), ["tune"])])
+def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data, tmp_path, monkeypatch, cut, told):
+    texts, whole = [], recipes()["2dgs"].pretrain
+    monkeypatch.setattr(pipeline, "emit", lambda event: texts.append(event.text))
+    tune = replace(whole, steps=600, densify=replace(whole.densify, start=600))
+    pipeline.warn_of_no_edits(Run(tmp_path, replace(recipe, partition=cut, tune=tune), data))
+    assert [text.partition(":")[0] for text in texts] == told
+
+
+@pytest.mark.parametrize(("name", "primitive"), [("2dgs", Surfel2D()), ("citygs2-coarse", Flat3D())])
+def test_points_multiply_in_a_short_run(data, tmp_path, name, primitive):
+    recipe = replace(with_steps(recipes()[name], 120), primitive=primitive, mesh=None)
+    run(recipe, data, tmp_path, every=Every(pictures=0))
+    lines = map(json.loads, (tmp_path / "events.jsonl").read_text().splitlines())
+    edits = [line for line in lines if line["event"] == "PointsEdited"]
+    assert sum(line["cloned"] + line["split"] > 0 for line in edits) >= 2
 
 
 def test_an_executor_without_blocks_is_told(data, recipe, tmp_path, capsys):
@@ -206,7 +236,7 @@ def test_warnings_of_a_run_become_notes_once(data, recipe, tmp_path, monkeypatch
 
     monkeypatch.setattr(pipeline, "read", warning)
     for _ in range(2):
-        run(with_steps(recipe, 1), data, tmp_path)
+        run(evolve(with_steps(recipe, 1), "pretrain.densify", None), data, tmp_path)
         assert json.loads((tmp_path / "run.json").read_text())["notes"] == ["the scene is odd"]
 
 

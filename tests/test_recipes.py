@@ -88,6 +88,13 @@ def test_citygs2_t_begins_its_blocks_from_the_first_7000_steps_of_the_same_pretr
     assert tiny.pretrain.densify == whole.pretrain.densify
 
 
+def test_citygs2_trims_by_the_mean_as_the_paper_does():
+    (trim,) = recipes()["citygs2"].tune.prune
+    assert (trim.ratio, trim.score, trim.gamma, trim.start, trim.until, trim.every) == (
+        0.025, "mean", 0.5, 1_000, 15_000, 500,
+    )  # fmt: skip
+
+
 def test_citygs2_short_goes_on_at_the_pace_of_pretraining():
     whole, short = recipes()["citygs2"], recipes()["citygs2-short"]
     assert short.pretrain == whole.pretrain and short.tune.rates == short.pretrain.rates != whole.tune.rates

@@ -18,15 +18,29 @@ class StepCount:
 
     Attributes:
         floor: Scaling down stops here: a count above 0 does not fall below it.
+        stretch: The floor gives way in runs so short that it would hold the count at more than this many times its
+            share of the run; a floor above 0 still keeps 1. Counts of the same stretch whose floors are in proportion
+            stay in proportion.
     """
 
     floor: int = 0
+    stretch: float = math.inf
+
+    def lowest(self, value: int, factor: float) -> int:
+        """The least that a count of `value` becomes in a run `factor` times as long."""
+        lowest = min(self.floor, value)
+        return lowest if math.isinf(self.stretch) else min(lowest, max(1, rounded(value * factor * self.stretch)))
 
 
 Steps = Annotated[int, StepCount()]
 """A position in the schedule, in steps."""
 Interval = Annotated[int, StepCount(floor=1)]
 """A number of steps between two events; at least 1 after scaling."""
+
+
+def rounded(value: float) -> int:
+    """The nearest whole number; halves go up."""
+    return math.floor(value + 0.5)
 
 
 def rescale(value: T, factor: float) -> T:
@@ -61,7 +75,7 @@ def log_linear(start: float, end: float, share: float) -> float:
 def _rescale(hint: Any, value: Any, factor: float, like: Any) -> Any:
     marker = _marker(hint)
     if marker is not None and isinstance(value, int) and value > 0:
-        scaled = max(math.floor(value * factor + 0.5), min(marker.floor, value))
+        scaled = max(rounded(value * factor), marker.lowest(value, factor))
         return like if isinstance(like, int) and _alike(marker, value, like, factor) else scaled
     if is_dataclass(value) and not isinstance(value, type):
         hints = get_type_hints(type(value), include_extras=True)
@@ -83,8 +97,11 @@ def _rescale(hint: Any, value: Any, factor: float, like: Any) -> Any:
 
 def _alike(marker: StepCount, value: int, like: int, factor: float) -> bool:
     """Whether one count may be rounded from what the other, times `factor`, was rounded from."""
-    lowest = marker.floor if value <= marker.floor else value * factor - (1 + factor) / 2
-    return lowest <= like <= value * factor + (1 + factor) / 2
+    slack = (1 + factor) / 2
+    lowest = value * factor - slack
+    if value <= marker.floor:  # held there, or by its stretch below it, or at 1
+        lowest = marker.floor if math.isinf(marker.stretch) else 1 if value == 1 else min(marker.floor, lowest)
+    return lowest <= like <= value * factor + slack
 
 
 def _alternatives(hint: Any) -> list[Any]:

@@ -90,6 +90,13 @@ class Policy(Component):
 class Densify(Policy):
     """A policy that adds points where detail is missing."""
 
+    def edit_steps(self, steps: int) -> Sequence[int] | None:
+        """The steps 1 to `steps` of a stage after which points may multiply, in order; None where that is not known.
+
+        Where there are none, the user is told so before the run.
+        """
+        return None
+
 
 class Prune(Policy):
     """A policy that removes points."""

@@ -20,7 +20,8 @@ class Elongation(Filter):
     """
 
     min_ratio: float = 0.01
-    """Ratio of the shortest to the longest axis (eta) above which a point may multiply."""
+    """Ratio of the second longest to the longest axis (eta) above which a point may multiply. The third axis of an
+    ellipsoid does not count: where it is short, the point is flat, which is no needle."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_ratio < 1:
@@ -28,8 +29,8 @@ class Elongation(Filter):
 
     def admits(self, step: Step, want: Tensor) -> Tensor:
         """(N,) bool, points that are no needles."""
-        scales = step.shape.scales
-        return scales.amin(-1) > self.min_ratio * scales.amax(-1)
+        longest, second = step.shape.scales.topk(2, dim=-1).values.unbind(-1)
+        return second > self.min_ratio * longest
 
 
 @dataclass(frozen=True)

@@ -12,44 +12,57 @@ from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
 from surfkit.losses.base import Loss, Sample
 from surfkit.raster.api import Maps
-from surfkit.raster.ssim import ssim
+from surfkit.raster.ssim import ssim_map
 
 
 @dataclass(frozen=True)
 class DepthRegression(Loss):
     """Difference of inverse depths, rendered and estimated, |D_hat - D| (CityGaussianV2, section 3.2).
 
-    Inverse depths are divided by one that is typical of the data set, so that no unit matters; pixels count by the
-    confidence of the estimate, and those without a rendered or an estimated depth do not count.
+    Inverse depths are divided by one that is typical of the data set, so that no unit matters. Either error is a mean
+    over the pixels with a rendered and an estimated depth, weighted by the confidence of the estimate.
     """
 
-    reads: ClassVar[tuple[str, ...]] = ("median",)
     needs_prior: ClassVar[bool] = True
 
     start: float = 0.5
-    """Share in the objective at the first step; it falls exponentially."""
+    """Share in the objective at the first step; from there to `end` along a straight line in the logarithm, constant
+    where both are the same."""
 
     end: float = 0.0025
-    """Share in the objective at the last step: estimates are coarser than what was learnt by then."""
+    """Share in the objective at the last step: small for estimates that are coarser than what was learnt by then, as
+    large as `start` or larger for those to be trusted to the end."""
 
     error: Literal["l1", "ssim"] = "l1"
-    """Mean absolute difference, as in the paper, or one minus the structural similarity, as in the released code."""
+    """Absolute difference, as in the paper, or one minus the structural similarity, as in the released code."""
+
+    depth: Literal["median", "expected"] = "median"
+    """Which rendered depth is compared: that of the splat where a ray becomes half opaque, or the mean along the ray,
+    from which all its splats learn."""
 
     def __post_init__(self) -> None:
         if not (self.start > 0 and self.end > 0):
             raise BadInput(f"the depth loss has start {self.start:g} and end {self.end:g}; both must be above 0")
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The maps of the depth that is compared."""
+        return ("median",) if self.depth == "median" else ("alpha", "depth")
+
     def weight_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
     def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+        depth = maps.median if self.depth == "median" else maps.expected_depth()
         prior = sample.prior
         if prior is None:
-            return 0 * maps.median.sum()
-        there = (maps.median > 0) & (prior.inverse > 0)
+            return 0 * depth.sum()
+        there = (depth > 0) & (prior.inverse > 0)
         weight = torch.where(there, prior.confidence, 0)
-        rendered = weight / (torch.where(there, maps.median, 1) * prior.typical)
-        estimated = weight * prior.inverse / prior.typical
+        rendered = torch.where(there, 1 / (torch.where(there, depth, 1) * prior.typical), 0)
+        estimated = torch.where(there, prior.inverse / prior.typical, 0)
         if self.error == "ssim":
-            return 1 - ssim(rendered[None], estimated[None])
-        return (rendered - estimated).abs().sum() / weight.sum().clamp_min(1)
+            difference = 1 - ssim_map(rendered[None], estimated[None])[0]
+        else:
+            difference = (rendered - estimated).abs()
+        return (weight * difference).sum() / weight.sum().clamp_min(1)

@@ -59,11 +59,8 @@ CITY = replace(
     tune=replace(
         COARSE.pretrain,
         losses=TUNED_LOSSES,
-        # The paper ranks by the mean over all views, and 0 counts for one that does not see a point: what few see,
-        # such as the rim of a survey, goes first. At a ratio of 0.1 that cost 0.7 to 1.2 dB, and the peak nothing.
-        prune=(Trim(ratio=0.025, score="peak"),),
+        prune=(Trim(ratio=0.025),),
         rates=RATES | {"means": Rate(6.4e-5, 6.4e-7), "scales": Rate(4e-3)},
-        sh_every=1,
     ),
 )
 
@@ -120,6 +117,6 @@ FIRST = Recipe(
     about="CityGaussian (Liu et al. 2024): 3DGS in blocks, then half as many points and simpler colours",
     primitive=Gaussian3D(),
     partition=ContractedGrid(blocks=(2, 2)),
-    tune=Stage(rates=CITY.tune.rates, sh_every=1),
+    tune=Stage(rates=CITY.tune.rates),
     refine=(Recover(), Distil()),
 )

@@ -35,7 +35,7 @@ class Recover(Refine):
     """Drop the points of least importance, and let the others make up for them."""
 
     stage: Stage = field(
-        default_factory=lambda: Stage(densify=None, prune=(Importance(at=(0,), ratio=0.5),), rates=RECOVERY, sh_every=1)
+        default_factory=lambda: Stage(densify=None, prune=(Importance(at=(0,), ratio=0.5),), rates=RECOVERY)
     )
     """The optimisation, with what it drops."""
 
@@ -46,7 +46,7 @@ class Distil(Refine):
 
     taught: ClassVar[bool] = True
 
-    stage: Stage = field(default_factory=lambda: Stage(steps=10_000, densify=None, rates=DISTILLATION, sh_every=1))
+    stage: Stage = field(default_factory=lambda: Stage(steps=10_000, densify=None, rates=DISTILLATION))
     """The optimisation."""
 
     sh_degree: int = 2

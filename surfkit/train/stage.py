@@ -77,7 +77,8 @@ class Stage:
     """Learning rates of the parameters; of positions as a share of the scene extent."""
 
     sh_every: Interval = 1_000
-    """Steps between degrees of the spherical harmonics, from 0 up to the primitive's."""
+    """Steps between degrees of the spherical harmonics, from 0 up to the primitive's; a stage that goes on from a model
+    begins at the model's degree."""
 
     near: float = 0.005
     """Nothing nearer to a camera than this is drawn, as a share of the scene extent."""

@@ -1,10 +1,11 @@
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.core.schedule import Interval, Steps, log_linear, rescale, rescale_like
+from surfkit.core.schedule import Interval, StepCount, Steps, log_linear, rescale, rescale_like
 
 
 def test_marked_counts_are_scaled_at_any_depth(world):
@@ -30,6 +31,28 @@ def test_floors(world):
     assert rescale(world.Adaptive(every=0, reset=10), 0.5) == world.Adaptive(every=0, reset=10)  # never, and small
     assert rescale(world.Depth(start=4, until=None), 0.1) == world.Depth(start=0, until=None)
     assert rescale(world.Depth(start=4, until=3), 2.5) == world.Depth(start=10, until=8)
+
+
+@dataclass(frozen=True)
+class Held:
+    every: Annotated[int, StepCount(floor=100, stretch=15)] = 100
+    each: Annotated[int, StepCount(floor=500, stretch=15)] = 500
+
+
+def test_a_floor_gives_way_in_runs_that_are_too_short_for_it():
+    lengths = (1.0, 0.5, 1 / 15, 0.05, 0.01, 1e-4)
+    assert [rescale(Held(), factor).every for factor in lengths] == [100, 100, 100, 75, 15, 1]
+    for factor in (1.0, 0.3, 0.07, 0.05, 0.01):
+        short = rescale(Held(), factor)
+        assert short.each == pytest.approx(5 * short.every, abs=2.5), "in proportion, up to rounding"
+
+
+@pytest.mark.parametrize("short", [1, 2, 17, 30, 100, 700, 2_000, 9_000])
+@pytest.mark.parametrize("long", [3, 60, 250, 1_000, 3_000, 30_000])
+def test_what_a_floor_gave_way_for_can_be_made_longer(short, long):
+    if long > short:
+        at_once = rescale(Held(), long / 30_000)
+        assert rescale_like(rescale(Held(), short / 30_000), long / short, at_once) == at_once
 
 
 def test_what_cannot_be_scaled(world):

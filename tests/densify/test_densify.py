@@ -1,3 +1,4 @@
+import math
 from dataclasses import dataclass, replace
 
 import pytest
@@ -9,8 +10,10 @@ from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, CountCap, Elongation, LossGradient
 from surfkit.densify.base import Densify, Filter, Policy, Signal, Step, Tally
+from surfkit.primitives import Flat3D, Gaussian3D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
+from surfkit.scene.scene import Cloud
 from surfkit.testing import check_policy
 
 
@@ -83,6 +86,18 @@ def test_the_gradient_is_averaged_over_the_views_that_saw_the_point():
 def test_edits_happen_between_start_and_until():
     policy = ADC(start=20, until=100, every=10, reset_every=1000)
     assert [i for i in range(1, 200) if watched(policy, scene(), [i])] == [30, 40, 50, 60, 70, 80, 90]
+
+
+@pytest.mark.parametrize("policy", [ADC(start=20, until=100, every=10), ADC(start=25, until=101, every=10), ADC()])
+@pytest.mark.parametrize("steps", [15, 60, 100, 700])
+def test_the_steps_of_edits_are_known_beforehand(policy, steps):
+    edited = [i for i in range(1, steps + 1) if (edit := watched(policy, scene(), [i])) and edit.clone is not None]
+    assert list(policy.edit_steps(steps)) == edited
+
+
+@pytest.mark.parametrize("steps", [*range(20, 80), 100, 300, 500, 700, 1_000, 1_499])
+def test_short_runs_have_some_edits(steps):
+    assert len(rescale(ADC(), steps / 30_000).edit_steps(steps)) >= 2
 
 
 def test_the_first_window_begins_at_the_first_step_and_each_edit_begins_another():
@@ -162,6 +177,25 @@ def test_needles_do_not_multiply():
     want = torch.ones(N)
     kept = Elongation(0.01).admits(replace(step(600), shape=replace(step(600).shape, scales=scales)), want)
     assert torch.equal(kept, scales[:, 1] / scales[:, 0] > 0.01) and kept.any() and not kept.all()
+
+
+def test_flat_points_multiply_and_needles_of_three_axes_do_not():
+    flat, ball, needle, blade = [0.05, 0.04, 1e-6], [0.05, 0.05, 0.05], [0.05, 1e-4, 1e-4], [1e-4, 1e-6, 0.05]
+    shape = replace(step(600).shape, kind="gaussian", scales=torch.tensor([flat, ball, needle, blade]))
+    kept = Elongation(0.01).admits(replace(step(600), shape=shape), torch.ones(4))
+    assert kept.tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize("primitive", [Flat3D(), Gaussian3D()])
+def test_every_primitive_multiplies_through_the_elongation_filter(primitive):
+    draw = torch.Generator().manual_seed(0)
+    cloud = Cloud(torch.rand(N, 3, generator=draw), torch.zeros(N, 3, dtype=torch.uint8))
+    points = Points.fresh(primitive.init(cloud, draw))
+    points.params["scales"][:, :2] = torch.tensor([0.05, 0.03]).log()
+    if points.params["scales"].shape[1] == 3:
+        points.params["scales"][:, 2] = math.log(1e-6)
+    edit = watched(ADC(filters=(Elongation(),)), points, [600], shape=primitive.shape(points.params, 0))
+    assert edit.split.all()
 
 
 @pytest.mark.parametrize("setting", [dict(every=0), dict(reset_every=0), dict(reset_opacity=1.0)])

@@ -1,5 +1,6 @@
 """Trim, importance and opacity pruning against plain evaluations of their formulas."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,14 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import rescale
-from surfkit.densify import Faint, Importance, Trim
+from surfkit.densify import ADC, Faint, Importance, Trim
 from surfkit.densify.base import Tally
-from surfkit.densify.trim import lowest, released_score
+from surfkit.densify.trim import lowest, released_score, summed
+from surfkit.raster.api import Splats
+from surfkit.raster.select import select
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import View
+from surfkit.train.views import Survey
 
 DRAW = torch.Generator().manual_seed(2)
 AMOUNT = torch.rand(7, 200, generator=DRAW) * 30
@@ -52,7 +58,7 @@ def test_the_lowest_share_goes_and_equal_scores_go_together():
 
 def test_trim_drops_the_unseen_at_the_first_step_and_then_the_lowest_means(crowd):
     assert dropped(Trim(), crowd, 1).nonzero().flatten().tolist() == list(range(9))
-    found = dropped(Trim(ratio=0.1, every=500), crowd, 504 * 2)
+    found = dropped(Trim(ratio=0.1, every=500), crowd, 1_001)
     mean = [
         np.mean([AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)]) for n in range(200)
     ]  # fmt: skip
@@ -60,20 +66,46 @@ def test_trim_drops_the_unseen_at_the_first_step_and_then_the_lowest_means(crowd
 
 
 def test_trim_by_the_view_that_shows_a_point_best(crowd):
-    found = dropped(Trim(ratio=0.1, every=500, score="peak"), crowd, 504 * 2)
+    found = dropped(Trim(ratio=0.1, every=500, score="peak"), crowd, 1_001)
     peak = [max(AMOUNT[v, n] / COUNT[v, n] if COUNT[v, n] else 0 for v in range(7)) for n in range(200)]
     assert set(found.nonzero().flatten().tolist()) == set(np.argsort(peak, kind="stable")[:20].tolist())
 
 
 def test_trims_end_epochs_and_leave_reset_points_alone(crowd):
     policy = Trim(start=1_000, until=3_000, every=500)
-    assert [i for i in range(2, 5_000) if dropped(policy, crowd, i) is not None] == [1008, 1512, 2016, 2520]
-    assert dropped(policy, crowd, 1008, since_reset=499) is None
-    assert dropped(policy, crowd, 1008, since_reset=500) is not None
+    assert [i for i in range(2, 5_000) if dropped(policy, crowd, i) is not None] == [1001, 1505, 2009, 2513]
+    assert dropped(policy, crowd, 1001, since_reset=499) is None
+    assert dropped(policy, crowd, 1001, since_reset=500) is not None
     every = replace(policy, every=3)
     assert [i for i in range(2, 1_020) if dropped(every, crowd, i) is not None] == [1001, 1008, 1015]
     short = rescale(Trim(), 2_000 / 30_000)
-    assert (short.start, short.until, short.every, short.recovery) == (67, 1_000, 100, 100)
+    assert (short.start, short.until, short.every, short.recovery) == (800, 1_000, 500, 100)
+
+
+def schedule(recipe_steps, epoch):
+    """Steps that add points and steps that trim, of a run of so many steps with so many views."""
+    adc, trim = (rescale(policy, recipe_steps / 30_000) for policy in (ADC(), Trim()))
+    edits, trims, reset = list(adc.edit_steps(recipe_steps)), [], 0
+    for index in range(2, recipe_steps + 1):
+        if index in trim.trims(epoch) and index - reset >= trim.recovery:
+            trims.append(index)
+        if index % adc.reset_every == 0 and index < adc.until:
+            reset = index
+    return edits, trims
+
+
+@pytest.mark.parametrize("epoch", [1, 7, 21, 24, 45, 70, 100])
+@pytest.mark.parametrize("steps", [2_000, 3_000, 4_000, 7_000, 30_000])
+def test_trims_and_edits_keep_their_ratio_at_any_length(steps, epoch):
+    edits, trims = schedule(steps, epoch)
+    assert 4.5 <= len(edits) / len(trims) <= 8, "144 edits and 22 to 29 trims at full length"
+    assert trims[0] >= edits[3]
+
+
+def test_no_trim_comes_before_the_second_edit():
+    for steps in range(20, 3_000, 7):
+        edits, trims = schedule(steps, 1)
+        assert len(trims) * 5 <= len(edits) and (not trims or trims[0] >= edits[3]), steps
 
 
 def test_the_released_score_is_the_mean_of_its_list_of_records():
@@ -96,9 +128,65 @@ def test_the_released_score_is_the_mean_of_its_list_of_records():
 
 
 def test_trim_by_the_released_score(crowd):
-    found = dropped(Trim(ratio=0.25, score="released"), crowd, 1008)
+    found = dropped(Trim(ratio=0.25, score="released"), crowd, 1001)
     order = released_score(Seven()).argsort()
     assert set(found.nonzero().flatten().tolist()) == set(order[:50].tolist())
+
+
+def discs():
+    """White discs, apart, half of them behind black ones, and three cameras that see 12, 12 and 6 of them."""
+    at = torch.tensor([(0.5 * (i % 4) - 0.75, 0.5 * (i // 4) - 0.5, 2.0) for i in range(12)])
+    veils = at[6:] - torch.tensor([0.0, 0, 0.5])
+    sizes = torch.cat([torch.linspace(0.03, 0.07, 12).roll(5), torch.full((6,), 0.2)])
+    opacities = torch.cat([torch.linspace(0.1, 0.9, 12).flip(0).roll(2), torch.linspace(0.3, 0.9, 6)])
+    colors = torch.cat([torch.full((12, 1, 3), 0.5), torch.full((6, 1, 3), -0.5)]) / 0.28209479
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(18, 1)
+    splats = Splats("surfel", torch.cat([at, veils]), quats, sizes[:, None].repeat(1, 2), opacities, colors)
+    cameras = []
+    for back, middle in ((0.0, 100.0), (0.3, 100.0), (0.0, 0.0)):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[2, 3] = back
+        cameras.append(Camera(pose, 150.0, 150.0, middle, 75.0, 200, 150))
+    return splats, cameras
+
+
+def test_the_sum_is_the_change_of_the_pictures_when_a_point_is_removed():
+    splats, cameras = discs()
+    rasterizer, _ = select("cpu")
+
+    def pictures(keep):
+        some = replace(splats, **{name: value[keep] for name, value in splats.tensors().items()})
+        return torch.stack([rasterizer.render(some, camera, 0.01, False).maps.color for camera in cameras]).double()
+
+    everything, whole = torch.ones(18, dtype=torch.bool), pictures(torch.ones(18, dtype=torch.bool))
+    change = []
+    for removed in range(12):
+        keep = everything.clone()
+        keep[removed] = False
+        change.append(float((whole - pictures(keep)).abs().sum()) / 3)
+    views = Survey([View(str(i), camera, None) for i, camera in enumerate(cameras)], rasterizer, splats, 0.01)
+    found = summed(views)[:12]
+    assert found.tolist() == pytest.approx(change, rel=1e-4)
+    tally = views.survey()
+    assert torch.equal(found.argsort(), torch.tensor(change).argsort())
+    for other in (tally.mean, tally.peak):
+        assert not torch.equal(other[:12].argsort(), found.argsort()), "no other score tells"
+
+
+def test_the_sum_of_a_disc_is_the_integral_of_its_kernel():
+    """2 pi sigma^2 (o - 1/255), with sigma in pixels: the tail below 1/255 is not drawn."""
+    splats, cameras = discs()
+    bare = replace(splats, **{name: value[:12] for name, value in splats.tensors().items()})
+    views = Survey([View("0", cameras[0], None)], select("cpu")[0], bare, 0.01)
+    sigma = 150 / 2 * bare.scales[:, 0]
+    wanted = 2 * math.pi * sigma**2 * (bare.opacities - 1 / 255)
+    assert torch.allclose(summed(views), wanted, rtol=0.02)
+
+
+def test_trim_by_the_sum(crowd):
+    found = dropped(Trim(ratio=0.25, score="sum"), crowd, 1001)
+    total = [sum(float(AMOUNT[v, n]) for v in range(7) if COUNT[v, n]) for n in range(200)]
+    assert set(found.nonzero().flatten().tolist()) == set(np.argsort(total, kind="stable")[:50].tolist())
 
 
 def test_importance_is_opacity_times_hits_times_a_power_of_the_area(crowd):

@@ -10,10 +10,11 @@ from surfkit.core.check import BadInput
 from surfkit.losses import DepthRegression
 from surfkit.losses.base import Sample
 from surfkit.raster.api import Maps
-from surfkit.raster.ssim import ssim_reference
+from surfkit.raster.ssim import ssim_map
 from surfkit.scene.camera import Camera
 from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
+from surfkit.testing import check_loss
 
 SIZE = (19, 23)
 TYPICAL = 0.7
@@ -45,12 +46,43 @@ def test_l1_is_the_mean_over_trusted_pixels():
     assert DepthRegression()(Maps(median=median), sample).item() == pytest.approx(wanted, rel=1e-5)
 
 
-def test_ssim_is_that_of_the_masked_maps():
+def test_ssim_is_the_mean_over_trusted_pixels_too():
     median, sample = scene()
     weight, rendered, estimated = masked(median, sample.prior)
-    maps = [torch.from_numpy(weight * values)[None] for values in (rendered, estimated)]
-    wanted = 1 - ssim_reference(*maps).item()
+    there = (median.numpy() > 0) & (sample.prior.inverse.numpy() > 0)
+    similar = ssim_map(*(torch.from_numpy(there * values)[None] for values in (rendered, estimated)))[0].numpy()
+    wanted = (weight * (1 - similar)).sum() / weight.sum()
     assert DepthRegression(error="ssim")(Maps(median=median), sample).item() == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("error", ["l1", "ssim"])
+def test_pixels_without_an_estimate_do_not_dilute_the_error(error):
+    size, shift = (40, 60), 1.3
+    median = torch.full(size, 2.0)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 30.0, 20.0, size[1], size[0])
+    view, photo = View("a", camera, None), torch.zeros(3, *size)
+    values = []
+    for confidence in (1.0, 0.25):
+        for columns in (60, 30):  # half of the pixels are known, and those are as wrong as before
+            known = torch.zeros(size)
+            known[:, :columns] = 1.0
+            prior = DepthPrior(known * shift / 2, known * confidence, 0.5)
+            values.append(DepthRegression(error=error)(Maps(median=median), Sample(view, photo, prior)).item())
+    assert values == pytest.approx(values[:1] * 4, rel=0.1 if error == "ssim" else 1e-5)  # rims have their say
+
+
+@pytest.mark.parametrize("error", ["l1", "ssim"])
+def test_the_expected_depth_is_compared_and_read_where_it_is_asked_for(error):
+    median, sample = scene()
+    expected, _ = scene(seed=1)
+    alpha = torch.where(expected > 0, 0.8, 0.0)
+    loss = DepthRegression(error=error, depth="expected")
+    assert set(loss.reads) == {"alpha", "depth"} and DepthRegression(error=error).reads == ("median",)
+    maps = Maps(alpha=alpha, depth=alpha * expected)
+    found = loss(maps, sample).item()
+    assert found == pytest.approx(DepthRegression(error=error)(Maps(median=expected), sample).item(), rel=1e-5)
+    assert found != pytest.approx(DepthRegression(error=error)(Maps(median=median), sample).item(), rel=1e-2)
+    check_loss(loss, SIZE)
 
 
 @pytest.mark.parametrize("error", ["l1", "ssim"])
@@ -92,3 +124,9 @@ def test_the_weight_falls_exponentially():
         assert loss.weight_at(index, 30_000) == pytest.approx(0.5 * math.exp(math.log(0.005) * index / 30_000))
     with pytest.raises(BadInput, match="both must be above 0"):
         DepthRegression(end=0)
+
+
+def test_the_weight_may_stay_or_rise():
+    constant, rising = DepthRegression(start=10.0, end=10.0), DepthRegression(start=0.5, end=2.0)
+    assert [constant.weight_at(index, 700) for index in range(701)] == pytest.approx([10.0] * 701, rel=1e-12)
+    assert [rising.weight_at(index, 100) for index in (0, 50, 100)] == pytest.approx([0.5, 1.0, 2.0])

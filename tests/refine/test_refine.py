@@ -91,6 +91,12 @@ def test_what_is_left(finished):
     assert 0 < spent[0] < spent[1] < spent[2] == metrics["cpu_seconds"], "all stages count"
 
 
+def test_refinement_begins_with_the_harmonics_of_the_model(finished):
+    """Its own steps are too few for any, and distillation leaves one degree."""
+    assert Recover().stage.sh_every == Distil().stage.sh_every == 1_000
+    assert [state_of(finished, part).sh_degree for part in ("tune", "refine0", "refine1")] == [2, 2, 1]
+
+
 def test_recovery_goes_on_from_the_merged_model(finished):
     """Its points are some of the merged ones, moved by four steps of Adam at most."""
     before, after = (state_of(finished, part).points.params for part in ("tune", "refine0"))

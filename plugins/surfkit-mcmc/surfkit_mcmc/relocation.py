@@ -24,14 +24,14 @@ class Relocation(Densify):
     cap: int = 1_000_000
     """The most points there may be."""
 
-    start: Annotated[int, StepCount(floor=100)] = 500
-    """Steps before the first move; short runs keep at least 100."""
+    start: Annotated[int, StepCount(floor=100, stretch=25.0)] = 500
+    """Steps before the first move; short runs keep at least 100, but no more than half of the way to `until`."""
 
     until: Steps = 25_000
     """Last step that moves points."""
 
-    every: Annotated[int, StepCount(floor=50)] = 100
-    """Steps between moves; short runs keep at least 50."""
+    every: Annotated[int, StepCount(floor=50, stretch=50.0)] = 100
+    """Steps between moves; short runs keep at least 50, but no more than a fifth of the way to `until`."""
 
     growth: float = 0.05
     """Share by which the number of points grows at each move."""
@@ -55,6 +55,10 @@ class Relocation(Densify):
                 f"densify: dead is {self.dead} (between 0 and 1), growth {self.growth} and noise {self.noise} "
                 "(0 or more); these do not fit"
             )
+
+    def edit_steps(self, steps: int) -> range:
+        """See `Densify.edit_steps`."""
+        return range((self.start // self.every + 1) * self.every, min(self.until, steps) + 1, self.every)
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Noise at every step, and moves every so often."""

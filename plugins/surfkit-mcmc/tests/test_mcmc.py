@@ -12,6 +12,7 @@ from surfkit_mcmc.relocation import Relocation, drawn, shared
 
 from surfkit import BadInput, Densify, Points, Step, components
 from surfkit.core.registry import plugins
+from surfkit.core.schedule import rescale
 from surfkit.densify import Elongation
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.primitives.base import apply
@@ -132,9 +133,16 @@ def test_steps_between_moves_only_add_noise():
 def test_needles_are_not_moved_onto():
     points, step = crowd()
     scales = step.shape.scales.clone()
-    scales[100:, 0] *= 1e-3
+    scales[100:, 1:] *= 1e-3
     edit = Relocation(filters=(Elongation(),)).edit(points, replace(step, shape=replace(step.shape, scales=scales)))
     assert edit.clone[60:100].any() and not edit.clone[100:].any()
+
+
+@pytest.mark.parametrize("steps", [20, 60, 100, 300, 2_000])
+def test_points_move_in_runs_of_any_length_at_the_steps_that_are_foretold(steps):
+    policy, (points, step) = replace(rescale(Relocation(), steps / 30_000), noise=0.0), crowd()
+    moved = [i for i in range(1, steps + 1) if policy.edit(points, replace(step, index=i)) is not None]
+    assert list(policy.edit_steps(steps)) == moved and len(moved) >= 2
 
 
 def test_without_a_live_point_nothing_moves():
