@@ -24,7 +24,9 @@ from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require, simplified
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.crop import Crop, box, read_crop
+from surfkit.scene.depth_prior import read_priors
 from surfkit.scene.masks import mask_cache
+from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene
 from surfkit.train.stage import StageState
 
@@ -76,11 +78,20 @@ class Delivery:
         return None if self.crop is None else read_crop(self.crop)
 
 
-def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int) -> Subject:
-    """The splats of a state, to be meshed."""
+def subject(
+    this: Run,
+    state: StageState,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    budget_bytes: int,
+    mesher: Mesher | None = None,
+) -> Subject:
+    """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
     stage = this.stage
     splats = this.primitive.shape(stage.finished(state), state.sh_degree)
     masks = mask_cache(scene.train, budget_bytes // 4)
+    wanted = mesher is not None and mesher.needs_prior
+    priors = read_priors(this.data, scene, budget_bytes // 4) if wanted else None
     return Subject(
         splats=splats,
         views=scene.train,
@@ -92,6 +103,8 @@ def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, 
         generator=torch.Generator().manual_seed(this.recipe.seed),
         scratch=this.out,
         keep=lambda at: None if masks is None else masks[at],
+        priors=priors,
+        photo=lambda at: view_photo(scene.train[at]),
     )
 
 

@@ -76,7 +76,7 @@ class MeshOf:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             rasterizer, _ = drawer(self.device)
             with held(this.out), in_one_line(this.out), kept(this.out):
-                what = subject(this, state, scene, rasterizer, budget)
+                what = subject(this, state, scene, rasterizer, budget, self.mesh)
                 record = deliver(this, self.mesh, self.delivery, what, state.index)
         show(this, record)
 
