@@ -52,6 +52,9 @@ class Delivery:
     least_triangles: int = 50
     """Drop loose clusters with fewer triangles."""
 
+    hole_edges: int = 0
+    """Fill holes of up to this many edges; 0 leaves all open."""
+
     crop_box: tuple[float, float, float, float, float, float] | None = None
     """Keep what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
 
@@ -62,6 +65,8 @@ class Delivery:
         for name in ("clusters", "least_triangles"):
             if getattr(self, name) < 1:
                 raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
+        if not 0 <= self.hole_edges <= 1000:
+            raise BadInput(f"--hole-edges {self.hole_edges}: give 0 to 1000")
         if wrong := [share for share in self.lods if not 0 < share < 1]:
             raise BadInput(f"--lods {wrong[0]:g}: a share of the triangles lies between 0 and 1")
         if not self.formats:
@@ -126,7 +131,7 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
         shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
-    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside)
+    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     facts = dict(raw.facts)
     del raw
     forget(this)

@@ -89,6 +89,7 @@ def show(this: Run, record: dict[str, Any]) -> None:
         ("vertices", f"{cleaning['vertices']:,}"),
         ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
         ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
+        *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
         *((name.replace("_", " "), f"{value:.6g}") for name, value in lengths.items()),
         ("seconds", f"{record['seconds']:.1f}"),
     ]
