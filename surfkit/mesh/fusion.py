@@ -15,6 +15,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.floaters import without_floaters
 from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
 from surfkit.mesh.overlap import Depths
@@ -26,6 +28,8 @@ TILES = ".tiles-*"
 """Name of the folder for what the views see."""
 PIXEL_BYTES = 8
 """Of a view on disk."""
+Made = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Vertices, faces and colours."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Task:
         scratch: Folder for what the views see, if there are tiles, or views are compared.
         label: Of the progress.
         compare: What the weights of the pixels of a view are multiplied with, by what all views see; None leaves them.
+        floaters: Parts go that are seen through so many times as often as seen; 0 keeps all.
         stored: Whether `see` costs little, as what the views see is on disk.
     """
 
@@ -54,10 +59,11 @@ class Task:
     scratch: Path | None
     label: str = "fusing views"
     compare: Callable[[int, Depths], Tensor] | None = None
+    floaters: float = 0.0
     stored: bool = False
 
 
-def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+def fuse(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """Vertices, faces and colours of the surface, and the number of tiles.
 
     Args:
@@ -65,10 +71,23 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np
         boxes: Of the tiles; those that turn out to need too many blocks are cut further.
     """
     with nullcontext(task) if task.compare is None else spooled(task) as ready:
-        return fuse_ready(ready, boxes)
+        made, tiles = fuse_ready(ready, boxes)
+        return (see_through(ready, made) if task.floaters and len(made[1]) else made), tiles
 
 
-def fuse_ready(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+def see_through(task: Task, made: Made) -> Made:
+    """The surface without its floaters."""
+
+    def pictures() -> Iterator[Picture]:
+        for at in range(len(task.cameras)):
+            yield task.see(at)
+            emit(Progress("looking for floaters", at + 1, len(task.cameras)))
+
+    mesh, _ = without_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
+    return mesh.vertices, mesh.faces, made[2]
+
+
+def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """The same for views whose weights are what they will be."""
     if len(boxes) == 1:
         whole = grid(task.lattice)
@@ -89,7 +108,7 @@ def step(task: Task, into: Grid, at: int) -> bool:
     return fits
 
 
-def in_tiles(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+def in_tiles(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """The surface, tile by tile."""
     views = [in_sight(camera, task) for camera in task.cameras]
     left, pieces, made = list(reversed(boxes)), [], 0

@@ -50,12 +50,18 @@ class TSDF(Mesher):
     least_views: float = 1.0
     """Views that must have seen a voxel, for it to count; one that looks aslant or from afar is less than one."""
 
+    floaters: float = 0.0
+    """Drop loose parts that views see through more than this many times as often as they see them; 0 keeps all. Without
+    `trust` every view is drawn once more for it."""
+
     trust: Annotated[Trust | None, choice(Trust, optional=True)] = None
     """How far pixels are trusted beyond their angle and size; none trusts all of them alike."""
 
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
             check_length(f"mesh.{name}", getattr(self, name))
+        if not 0 <= self.floaters <= 1000:
+            raise BadInput(f"mesh.floaters is {self.floaters:g}; it must be from 0 to 1000")
         if not 0 < self.least_views <= 1000:
             raise BadInput(f"mesh.least_views is {self.least_views:g}; it must be more than 0 and at most 1000")
 
@@ -81,7 +87,9 @@ class TSDF(Mesher):
         label = f"fusing views, {words(lengths, subject)}"
         compare = None if self.trust is None else self.trust.among
         see = self._eyes(subject, lengths)
-        task = Task(lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label, compare)
+        task = Task(
+            lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
+        )
         (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
