@@ -63,8 +63,8 @@ class Task:
     stored: bool = False
 
 
-def fuse(task: Task, boxes: list[Box]) -> tuple[Made, int]:
-    """Vertices, faces and colours of the surface, and the number of tiles.
+def fuse(task: Task, boxes: list[Box]) -> tuple[Made, dict[str, int]]:
+    """Vertices, faces and colours of the surface, and the numbers of tiles and, if they are looked for, of floaters.
 
     Args:
         task: What is to be fused.
@@ -72,23 +72,26 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """
     with nullcontext(task) if task.compare is None else spooled(task) as ready:
         made, tiles = fuse_ready(ready, boxes)
-        return (see_through(ready, made) if task.floaters and len(made[1]) else made), tiles
+        if not task.floaters or not len(made[1]):
+            return made, {"tiles": tiles}
+        made, floaters = see_through(ready, made)
+        return made, {"tiles": tiles, "floaters": floaters}
 
 
-def see_through(task: Task, made: Made) -> Made:
-    """The surface without its floaters."""
+def see_through(task: Task, made: Made) -> tuple[Made, int]:
+    """The surface without its floaters, and their number."""
 
     def pictures() -> Iterator[Picture]:
         for at in range(len(task.cameras)):
             yield task.see(at)
             emit(Progress("looking for floaters", at + 1, len(task.cameras)))
 
-    mesh, _ = without_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
-    return mesh.vertices, mesh.faces, made[2]
+    mesh, dropped = without_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
+    return (mesh.vertices, mesh.faces, made[2]), dropped
 
 
 def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
-    """The same for views whose weights are what they will be."""
+    """Vertices, faces and colours, and the number of tiles, of views whose weights are what they will be."""
     if len(boxes) == 1:
         whole = grid(task.lattice)
         if all(step(task, whole, at) for at in range(len(task.cameras))):

@@ -90,13 +90,13 @@ class TSDF(Mesher):
         task = Task(
             lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
         )
-        (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
+        (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
                 f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} "
                 "views; lower --mesh.least-views, or train for more steps"
             )
-        return Mesh(vertices, faces, colors, facts(lengths, subject) | {"tiles": tiles})
+        return Mesh(vertices, faces, colors, facts(lengths, subject) | counts)
 
     def _eyes(self, subject: Subject, lengths: Lengths) -> Callable[[int], Picture]:
         """What gives what the view at a position sees."""

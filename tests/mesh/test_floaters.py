@@ -56,6 +56,7 @@ def test_a_mesh_without_what_one_view_alone_sees():
         return (np.abs(mesh.vertices[mesh.faces].mean(1)[:, 2] - 0.75) < 0.08).sum()
 
     plain, judged = mesher.mesh(given), replace(mesher, floaters=1.0).mesh(given)
+    assert judged.facts["floaters"] >= 1 and "floaters" not in plain.facts
     assert blob(plain) > 20 and blob(judged) == 0 and ball(plain) == ball(judged) > 5
     assert len(clusters(judged)[1]) < len(clusters(plain)[1])
     trusted = replace(mesher, floaters=1.0, trust=Agreement(alone=1.0)).mesh(given)
