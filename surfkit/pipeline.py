@@ -137,7 +137,7 @@ def run(
             if not this.cloud.exists():
                 export(this, state, scene)
             if not meshed(this, state.index):
-                mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto")))
+                mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto"), recipe.mesh))
             return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
 
 

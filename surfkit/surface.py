@@ -24,7 +24,9 @@ from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require, simplified
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.crop import Crop, box, read_crop
+from surfkit.scene.depth_prior import read_priors
 from surfkit.scene.masks import mask_cache
+from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene
 from surfkit.train.stage import StageState
 
@@ -50,6 +52,9 @@ class Delivery:
     least_triangles: int = 50
     """Drop loose clusters with fewer triangles."""
 
+    hole_edges: int = 0
+    """Fill holes of up to this many edges; 0 leaves all open."""
+
     crop_box: tuple[float, float, float, float, float, float] | None = None
     """Keep what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
 
@@ -60,6 +65,8 @@ class Delivery:
         for name in ("clusters", "least_triangles"):
             if getattr(self, name) < 1:
                 raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
+        if not 0 <= self.hole_edges <= 1000:
+            raise BadInput(f"--hole-edges {self.hole_edges}: give 0 to 1000")
         if wrong := [share for share in self.lods if not 0 < share < 1]:
             raise BadInput(f"--lods {wrong[0]:g}: a share of the triangles lies between 0 and 1")
         if not self.formats:
@@ -76,11 +83,20 @@ class Delivery:
         return None if self.crop is None else read_crop(self.crop)
 
 
-def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, budget_bytes: int) -> Subject:
-    """The splats of a state, to be meshed."""
+def subject(
+    this: Run,
+    state: StageState,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    budget_bytes: int,
+    mesher: Mesher | None = None,
+) -> Subject:
+    """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
     stage = this.stage
     splats = this.primitive.shape(stage.finished(state), state.sh_degree)
     masks = mask_cache(scene.train, budget_bytes // 4)
+    wanted = mesher is not None and mesher.needs_prior
+    priors = read_priors(this.data, scene, budget_bytes // 4) if wanted else None
     return Subject(
         splats=splats,
         views=scene.train,
@@ -92,6 +108,8 @@ def subject(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, 
         generator=torch.Generator().manual_seed(this.recipe.seed),
         scratch=this.out,
         keep=lambda at: None if masks is None else masks[at],
+        priors=priors,
+        photo=lambda at: view_photo(scene.train[at]),
     )
 
 
@@ -113,7 +131,7 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
         shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
-    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside)
+    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     facts = dict(raw.facts)
     del raw
     forget(this)

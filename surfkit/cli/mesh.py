@@ -77,7 +77,7 @@ class MeshOf:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             rasterizer, _ = drawer(self.device)
             with held(this.out), in_one_line(this.out), kept(this.out):
-                what = subject(this, state, scene, rasterizer, budget)
+                what = subject(this, state, scene, rasterizer, budget, self.mesh)
                 record = deliver(this, self.mesh, self.delivery, what, state.index)
         show(this, record)
 
@@ -90,6 +90,7 @@ def show(this: Run, record: dict[str, Any]) -> None:
         ("vertices", f"{cleaning['vertices']:,}"),
         ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
         ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
+        *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
         *((name.replace("_", " "), f"{value:.6g}") for name, value in lengths.items()),
         ("seconds", f"{record['seconds']:.1f}"),
     ]

@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 
 from surfkit.core.registry import Component, hookimpl
+from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.poisson import Poisson
+from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tetra import Tetra
 from surfkit.mesh.tsdf import TSDF
 
@@ -11,4 +13,4 @@ from surfkit.mesh.tsdf import TSDF
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Names of what this folder offers."""
-    return {"tsdf": TSDF, "tetra": Tetra, "poisson": Poisson}
+    return {"tsdf": TSDF, "tetra": Tetra, "poisson": Poisson, "stereo": Stereo, "agreement": Agreement}

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Rasterizer, Splats
@@ -49,7 +50,8 @@ class Subject:
         generator: Of every random draw.
         scratch: Folder for large temporary files, which the mesher deletes; None for the system's own.
         keep: (H, W) bool mask of a view by its position, or None for all of it; false where nothing is to be fused.
-        priors: Estimated depths by position, where the data set has any.
+        priors: Estimated depths by position, if the mesher needs them and the data set has any.
+        photo: (3, H, W) uint8 photograph of a view by its position, at the size of its camera; None where none are.
     """
 
     splats: Splats
@@ -61,8 +63,9 @@ class Subject:
     budget_bytes: int
     generator: torch.Generator = field(default_factory=torch.Generator)
     scratch: Path | None = None
-    keep: Callable[[int], torch.Tensor | None] = lambda at: None
+    keep: Callable[[int], Tensor | None] = lambda at: None
     priors: Sequence[DepthPrior | None] | None = None
+    photo: Callable[[int], Tensor] | None = None
 
 
 class Mesher(Component):
@@ -79,6 +82,9 @@ class Mesher(Component):
         Raises:
             BadInput: A package that it is made with cannot be loaded on this machine.
         """
+
+    needs_prior: ClassVar[bool] = False
+    """Whether the mesher looks at depth priors, where there are any; settings of some decide."""
 
     @abstractmethod
     def mesh(self, subject: Subject) -> Mesh:

@@ -9,6 +9,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.holes import close_holes
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Report:
         boundaries: Closed runs of edges with one triangle: holes, and the rim of the mesh.
         longest_boundary: Length of the longest of them, local units; of open ground it is mostly the rim.
         boundary_share: Share of all edges that have one triangle only.
+        holes_closed: Small holes that were filled.
     """
 
     not_finite: int
@@ -40,13 +42,14 @@ class Report:
     boundaries: int
     longest_boundary: float
     boundary_share: float
+    holes_closed: int = 0
 
 
 Inside = Callable[[np.ndarray], np.ndarray]
 """Which of (M, 3) local positions lie in a crop."""
 
 
-def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None) -> tuple[Mesh, Report]:
+def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_edges: int = 0) -> tuple[Mesh, Report]:
     """The mesh without what is no surface, and what was left out.
 
     Args:
@@ -54,6 +57,7 @@ def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None) -> tu
         most: Clusters that are larger than one which is dropped; with fewer clusters, none is dropped for its rank.
         least: Triangles that a cluster must have to stay; if none has, the largest stays.
         inside: The crop; a triangle stays if its middle does.
+        hole_edges: Holes of up to so many edges are filled.
 
     Raises:
         BadInput: Nothing is left.
@@ -73,9 +77,9 @@ def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None) -> tu
     labels, sizes = clusters(mesh)
     large = _large(sizes, most, least)
     mesh, clustered = _keep(mesh, large[labels])
-    mesh = _referenced(mesh)
+    mesh, closed = close_holes(_referenced(mesh), hole_edges)
     dropped = (not_finite, degenerate, cropped, len(sizes), int(large.sum()), clustered)
-    return mesh, Report(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh))
+    return mesh, Report(*dropped, len(mesh.faces), len(mesh.vertices), *boundaries(mesh), closed)
 
 
 def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:

@@ -5,16 +5,22 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.floaters import without_floaters
 from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
+from surfkit.mesh.overlap import Depths
+from surfkit.mesh.picture import weighed
 from surfkit.mesh.tiles import Box, join
 from surfkit.scene.camera import Camera
 
@@ -22,6 +28,8 @@ TILES = ".tiles-*"
 """Name of the folder for what the views see."""
 PIXEL_BYTES = 8
 """Of a view on disk."""
+Made = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Vertices, faces and colours."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +43,11 @@ class Task:
         limit: Largest depth, local units.
         carve: Let each view clear all that it sees through.
         least_weight: From which a voxel counts.
-        scratch: Folder for what the views see, if there are tiles.
+        scratch: Folder for what the views see, if there are tiles, or views are compared.
         label: Of the progress.
+        compare: What the weights of the pixels of a view are multiplied with, by what all views see; None leaves them.
+        floaters: Parts go that are seen through so many times as often as seen; 0 keeps all.
+        stored: Whether `see` costs little, as what the views see is on disk.
     """
 
     lattice: Lattice
@@ -47,15 +58,40 @@ class Task:
     least_weight: int
     scratch: Path | None
     label: str = "fusing views"
+    compare: Callable[[int, Depths], Tensor] | None = None
+    floaters: float = 0.0
+    stored: bool = False
 
 
-def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
-    """Vertices, faces and colours of the surface, and the number of tiles.
+def fuse(task: Task, boxes: list[Box]) -> tuple[Made, dict[str, int]]:
+    """Vertices, faces and colours of the surface, and the numbers of tiles and, if they are looked for, of floaters.
 
     Args:
         task: What is to be fused.
         boxes: Of the tiles; those that turn out to need too many blocks are cut further.
     """
+    with nullcontext(task) if task.compare is None else spooled(task) as ready:
+        made, tiles = fuse_ready(ready, boxes)
+        if not task.floaters or not len(made[1]):
+            return made, {"tiles": tiles}
+        made, floaters = see_through(ready, made)
+        return made, {"tiles": tiles, "floaters": floaters}
+
+
+def see_through(task: Task, made: Made) -> tuple[Made, int]:
+    """The surface without its floaters, and their number."""
+
+    def pictures() -> Iterator[Picture]:
+        for at in range(len(task.cameras)):
+            yield task.see(at)
+            emit(Progress("looking for floaters", at + 1, len(task.cameras)))
+
+    mesh, dropped = without_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
+    return (mesh.vertices, mesh.faces, made[2]), dropped
+
+
+def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
+    """Vertices, faces and colours, and the number of tiles, of views whose weights are what they will be."""
     if len(boxes) == 1:
         whole = grid(task.lattice)
         if all(step(task, whole, at) for at in range(len(task.cameras))):
@@ -64,7 +100,7 @@ def fuse(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np
         del whole
         emit(Warned("the grid became larger than expected: starting again in tiles"))
         boxes = cut(Box(), task)
-    with spooled(task) as stored:
+    with nullcontext(task) if task.stored else spooled(task) as stored:
         return in_tiles(stored, boxes)
 
 
@@ -75,7 +111,7 @@ def step(task: Task, into: Grid, at: int) -> bool:
     return fits
 
 
-def in_tiles(task: Task, boxes: list[Box]) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], int]:
+def in_tiles(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """The surface, tile by tile."""
     views = [in_sight(camera, task) for camera in task.cameras]
     left, pieces, made = list(reversed(boxes)), [], 0
@@ -144,7 +180,8 @@ def _corner(at: np.ndarray) -> Corner:
 
 @contextmanager
 def spooled(task: Task) -> Iterator[Task]:
-    """The task with what every view sees on disk, so that it is drawn once however many tiles there are."""
+    """The task with what every view sees on disk, so that it is drawn once however often it is looked at, and compared
+    with other views if that is wanted."""
     needed = PIXEL_BYTES * sum(camera.width * camera.height for camera in task.cameras)
     with tempfile.TemporaryDirectory(dir=task.scratch, prefix=TILES.rstrip("*")) as name:
         folder = Path(name)
@@ -162,4 +199,20 @@ def spooled(task: Task) -> Iterator[Task]:
             depth, shade = np.load(folder / f"{at}.npy")
             return Picture(depth.view(np.float32), shade, task.cameras[at])
 
-        yield replace(task, see=read)
+        if task.compare is not None:
+            compare(task, folder)
+        yield replace(task, see=read, compare=None, stored=True)
+
+
+def compare(task: Task, folder: Path) -> None:
+    """Multiply the weights of the views on disk; depths stay, so the order of the views does not matter."""
+
+    def depth(at: int) -> Tensor:
+        return torch.from_numpy(np.load(folder / f"{at}.npy", mmap_mode="r")[0].view(np.float32).copy())
+
+    depths = Depths(task.cameras, depth)
+    for at in range(len(task.cameras)):
+        trust = task.compare(at, depths).numpy()
+        shade = np.load(folder / f"{at}.npy", mmap_mode="r+")[1]
+        shade[:] = weighed(np.asarray(shade), trust)
+        emit(Progress("comparing views", at + 1, len(task.cameras)))

@@ -63,7 +63,8 @@ class Picture:
 
     Attributes:
         depth: (H, W) float32 camera z, local units; 0 for none, always finite.
-        shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL`.
+        shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL`, or more where
+            it is trusted more.
         camera: Of the view.
     """
 

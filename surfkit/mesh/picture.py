@@ -15,6 +15,8 @@ from surfkit.scene.camera import Camera
 
 F = np.float32
 Which = Literal["median", "expected"]
+MOST = 255
+"""Largest weight of a pixel that its shade can hold."""
 OPAQUE = 0.5
 """Least alpha of a pixel whose expected depth counts; the median depth has the same bound of its own."""
 
@@ -68,3 +70,16 @@ def shade(depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camer
         planes = (np.fmin(np.fmax(color, F(0)), F(1)) * F(255) + F(0.5)).astype(np.uint32)
     counted = np.where((weight > 0) & (depth > 0), whole, 0).astype(np.uint32)
     return planes[0] | planes[1] << np.uint32(8) | planes[2] << np.uint32(16) | counted << np.uint32(24)
+
+
+def weighed(shade: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    """(H, W) uint32 shades whose weights are multiplied and rounded; what counts at all goes on doing so.
+
+    Args:
+        shade: (H, W) uint32, see `Picture`.
+        trust: (H, W) float32, 0 or more; where it is 0, the pixel no longer counts. No weight becomes more than `MOST`.
+    """
+    weight = (shade >> 24).astype(F)
+    whole = np.clip((weight * trust.astype(F) + F(0.5)).astype(np.uint32), 1, MOST)
+    counted = np.where((weight > 0) & (trust > 0), whole, 0).astype(np.uint32)
+    return shade & np.uint32(0xFFFFFF) | counted << np.uint32(24)

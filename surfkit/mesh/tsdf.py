@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
 from surfkit.mesh.lengths import VOXELS, Length, Lengths, check_length, resolve, told
-from surfkit.mesh.picture import Which, depth_of, picture
+from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
+from surfkit.mesh.trust import Trust
 
 LEAST_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
@@ -47,11 +50,25 @@ class TSDF(Mesher):
     least_views: float = 1.0
     """Views that must have seen a voxel, for it to count; one that looks aslant or from afar is less than one."""
 
+    floaters: float = 0.0
+    """Drop loose parts that views see through more than this many times as often as they see them; 0 keeps all. Without
+    `trust` every view is drawn once more for it."""
+
+    trust: Annotated[Trust | None, choice(Trust, optional=True)] = None
+    """How far pixels are trusted beyond their angle and size; none trusts all of them alike."""
+
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
             check_length(f"mesh.{name}", getattr(self, name))
+        if not 0 <= self.floaters <= 1000:
+            raise BadInput(f"mesh.floaters is {self.floaters:g}; it must be from 0 to 1000")
         if not 0 < self.least_views <= 1000:
             raise BadInput(f"mesh.least_views is {self.least_views:g}; it must be more than 0 and at most 1000")
+
+    @property
+    def needs_prior(self) -> bool:  # type: ignore[override] (a setting decides)
+        """See `Mesher.needs_prior`."""
+        return self.trust is not None and self.trust.needs_prior
 
     def mesh(self, subject: Subject) -> Mesh:
         """See `Mesher.mesh`."""
@@ -66,25 +83,39 @@ class TSDF(Mesher):
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)
-
-        def see(at: int) -> Picture:
-            maps = subject.draw(subject.views[at])
-            depth = depth_of(maps, self.depth)
-            depth = torch.where(depth <= lengths.limit, depth, 0.0)
-            if (keep := subject.keep(at)) is not None:
-                depth = torch.where(keep, depth, 0.0)
-            return picture(depth, maps, cameras[at], lengths.voxel)
-
         least = max(1, round(FULL * self.least_views))
         label = f"fusing views, {words(lengths, subject)}"
-        task = Task(lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label)
-        (vertices, faces, colors), tiles = fuse(task, plan(found, most_blocks))
+        compare = None if self.trust is None else self.trust.among
+        see = self._eyes(subject, lengths)
+        task = Task(
+            lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
+        )
+        (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
                 f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} "
                 "views; lower --mesh.least-views, or train for more steps"
             )
-        return Mesh(vertices, faces, colors, facts(lengths, subject) | {"tiles": tiles})
+        return Mesh(vertices, faces, colors, facts(lengths, subject) | counts)
+
+    def _eyes(self, subject: Subject, lengths: Lengths) -> Callable[[int], Picture]:
+        """What gives what the view at a position sees."""
+
+        def see(at: int) -> Picture:
+            view = subject.views[at]
+            maps = subject.draw(view)
+            depth = depth_of(maps, self.depth)
+            depth = torch.where(depth <= lengths.limit, depth, 0.0)
+            if (keep := subject.keep(at)) is not None:
+                depth = torch.where(keep, depth, 0.0)
+            if self.trust is None:
+                return picture(depth, maps, view.camera, lengths.voxel)
+            prior = subject.priors[at] if self.trust.needs_prior and subject.priors is not None else None
+            trust = self.trust.within(maps, depth, prior)
+            seen = picture(torch.where(trust > 0, depth, 0.0), maps, view.camera, lengths.voxel)
+            return replace(seen, shade=weighed(seen.shade, trust.numpy()))
+
+        return see
 
     def _lengths(self, subject: Subject) -> tuple[Lengths, Estimate]:
         """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""

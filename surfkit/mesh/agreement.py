@@ -1,0 +1,151 @@
+"""Trust by agreement: depth that other views find in the same place, as in the fusion of stereo depth maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.depth.matching import ray_map
+from surfkit.mesh.overlap import Depths, overlapping
+from surfkit.mesh.trust import Trust
+from surfkit.raster.api import Maps
+from surfkit.scene.camera import Camera
+from surfkit.scene.depth_prior import DepthPrior
+
+CONFIDENT = 0.375
+"""Confidence of a prior from which it may contradict."""
+APART = 3.0
+"""Tolerances between a depth and a confident prior from which they contradict each other."""
+
+
+@dataclass(frozen=True)
+class Agreement(Trust):
+    """Weigh pixels by how many other views see a surface in the same place, and leave out those that nobody confirms.
+
+    After Merrell et al. (2007): a depth is carried into other views, and what these see there is carried back.
+    """
+
+    neighbours: int = 8
+    """Other views that each view is compared with: those that see most of it from another angle."""
+
+    angle: float = 12.0
+    """Best angle between the rays of two views that are compared, degrees."""
+
+    tolerance: float = 0.01
+    """Depths agree that differ by less than this share."""
+
+    enough: float = 2.0
+    """Views that must agree for the full weight; fewer give a share of it."""
+
+    alone: float = 0.25
+    """Weight of pixels that no other view can confirm or contradict, as a share of the full one."""
+
+    opaque: float = 0.5
+    """Least alpha of a pixel that counts."""
+
+    spread: float = 0.0
+    """Share of the depth by which median and expected depth may lie apart for half the weight, as splats are spread
+    along the ray then; 0 does not look."""
+
+    priors: Literal["ignore", "weigh"] = "ignore"
+    """Whether stereo depth counts, where the data set has it: pixels that agree with it count for `confirmed` times as
+    much, and those that it contradicts are left out."""
+
+    confirmed: float = 2.0
+    """See `priors`; confidence of less than 1 brings it nearer to 1."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("tolerance", 0, 1), ("angle", 0, 45)):
+            if not low < getattr(self, name) < high:
+                raise BadInput(f"mesh.trust.{name} is {getattr(self, name):g}; it must be between {low} and {high}")
+        for name, low, high in (("alone", 0, 1), ("opaque", 0, 1), ("spread", 0, 1), ("confirmed", 1, 4)):
+            if not low <= getattr(self, name) <= high:
+                raise BadInput(f"mesh.trust.{name} is {getattr(self, name):g}; it must be from {low} to {high}")
+        if self.neighbours < 1 or not self.enough > 0:
+            raise BadInput(
+                f"mesh.trust.neighbours is {self.neighbours} and enough {self.enough:g}; give 1 or more and more than 0"
+            )
+
+    @property
+    def needs_prior(self) -> bool:  # type: ignore[override] (a setting decides)
+        """Whether priors count."""
+        return self.priors == "weigh"
+
+    def within(self, maps: Maps, depth: Tensor, prior: DepthPrior | None) -> Tensor:
+        """See `Trust.within`."""
+        trust = torch.ones_like(depth)
+        if maps.alpha is not None:
+            trust = (maps.alpha >= self.opaque).to(depth.dtype)
+        if self.spread and maps.median is not None and maps.depth is not None:
+            apart = (maps.expected_depth() - maps.median).abs() / depth.clamp_min(1e-20)
+            trust = trust / (1 + (apart / self.spread) ** 2)
+        if self.needs_prior and prior is not None:
+            off = (depth * prior.inverse - 1).abs()
+            known = (prior.inverse > 0) & (prior.confidence > 0)
+            raised = 1 + (self.confirmed - 1) * prior.confidence
+            trust = torch.where(known & (off < self.tolerance), trust * raised, trust)
+            wrong = known & (prior.confidence >= CONFIDENT) & (off > APART * self.tolerance)
+            trust = torch.where(wrong, 0.0, trust)
+        return trust
+
+    def among(self, at: int, depths: Depths) -> Tensor:
+        """See `Trust.among`."""
+        camera, depth = depths.cameras[at], depths.read(at)
+        agreeing, against = torch.zeros_like(depth), torch.zeros_like(depth)
+        for other in overlapping(at, depths, self.neighbours, self.angle):
+            close, apart = compare(camera, depth, depths.cameras[other], depths.read(other), self.tolerance)
+            agreeing += close
+            against += apart
+        share = agreeing / (agreeing + against).clamp_min(1e-6)
+        confirmed = (agreeing / self.enough).clamp_max(1) * share
+        unknown = (agreeing == 0) & (against == 0)
+        return torch.where(depth > 0, torch.where(unknown, self.alone, confirmed), 0.0)
+
+
+def compare(camera: Camera, depth: Tensor, there: Camera, other: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """How well another view's depth agrees with each pixel, and whether it contradicts.
+
+    The point that a pixel shows is carried into the other view. If what is seen there is as far, they agree; if it is
+    further, the other view sees through the point. If it is nearer, it hides the point, unless this view in turn sees
+    through what is nearer. Views that do not see the point, or that it is hidden from, tell nothing.
+
+    Args:
+        camera: Of the pixels.
+        depth: (H, W) their depth, camera z; 0 for none.
+        there: Camera of the other view.
+        other: (h, w) its depth.
+        tolerance: Share of the depth.
+
+    Returns:
+        (H, W) agreement from 0 to 1, and (H, W) 1 where the other view contradicts, else 0.
+    """
+    a, b = ray_map(camera, there, depth.device)
+    inverse = 1 / depth.clamp_min(1e-20)
+    x, y, z = (a[i] + inverse * b[i] for i in range(3))
+    found = _taken(other, x / z, y / z, (depth > 0) & (z > 0))
+    ratio = found / (z * depth)  # of what is seen there to where the point lies there
+    known = found > 0
+    off = ((ratio - 1) / tolerance) ** 2
+    agreement = torch.where(known, (1 - off).clamp_min(0), 0.0)
+    seen_through = known & (ratio > 1 + tolerance)
+    hidden = known & (ratio < 1 - tolerance)
+    # What hides the point lies on the line from the other view's centre to it.
+    turn = camera.world_to_camera @ torch.linalg.inv(there.world_to_camera)
+    eye = turn[:3, 3].to(depth.dtype)
+    rays = camera.rays(depth.dtype)
+    p, q, r = (eye[i] + (rays[i] * depth - eye[i]) * ratio for i in range(3))
+    beyond = _taken(depth, p / r * camera.fx + camera.cx, q / r * camera.fy + camera.cy, hidden & (r > 0))
+    looked_through = (beyond > 0) & (beyond > r * (1 + tolerance))
+    return agreement, (seen_through | looked_through).to(depth.dtype)
+
+
+def _taken(values: Tensor, x: Tensor, y: Tensor, where: Tensor) -> Tensor:
+    """The values of the pixels that positions fall on; 0 outside of the picture, and where it is not wanted."""
+    height, width = values.shape
+    inside = where & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    rows, columns = (torch.where(inside, at, 0.0).long() for at in (y, x))
+    return torch.where(inside, values[rows, columns], 0.0)

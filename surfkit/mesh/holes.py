@@ -1,0 +1,116 @@
+"""Closing small holes: rings of edges with one triangle, filled with triangles of the least area (Barequet, Sharir)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from surfkit.mesh.base import Mesh
+
+RIM = 0.25
+"""Share of the area of a connected part from which what would fill a ring shows that the ring is no hole."""
+EVEN = 0.05
+"""Of the squared sides of a triangle, that counts as its area."""
+
+
+def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
+    """The mesh with its small holes filled, and how many there were; vertices stay as they are.
+
+    Args:
+        mesh: Welded; triangles counter-clockwise seen from outside.
+        most: Edges of a hole; longer rings stay open. So does the rim of a part that is open on one side: what would
+            fill it is more than `RIM` of the part.
+    """
+    sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
+    known = np.unique(sides[:, 0] << 32 | sides[:, 1])
+    parts = _parts(mesh)
+    areas = np.bincount(parts[mesh.faces[:, 0]], _areas(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
+    made = []
+    for ring in rings(mesh):
+        if 3 <= len(ring) <= most:
+            faces = fill(mesh.vertices[ring].astype(np.float64), ring)
+            if _areas(mesh.vertices, faces).sum() < RIM * areas[parts[ring[0]]] and not _across(faces, ring, known):
+                made.append(faces)
+    if not made:
+        return mesh, 0
+    return replace(mesh, faces=np.concatenate([mesh.faces, *made]).astype(np.int32)), len(made)
+
+
+def rings(mesh: Mesh) -> list[np.ndarray]:
+    """Vertices of each closed chain of edges that have one triangle, in the order in which what fills it passes them.
+
+    Chains through a vertex where several meet are left out.
+    """
+    sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
+    names, back = sides[:, 0] << 32 | sides[:, 1], sides[:, 1] << 32 | sides[:, 0]
+    free = sides[~np.isin(names, back)]
+    _, at, counts = np.unique(free, return_inverse=True, return_counts=True)
+    once = (counts[at.reshape(-1, 2)] == 2).all(1)  # one edge comes, one goes
+    return _rings({b: a for a, b in free[once].tolist()})
+
+
+def _across(faces: np.ndarray, ring: np.ndarray, known: np.ndarray) -> bool:
+    """Whether new triangles have an edge, beside those of the ring, that the mesh has already."""
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    around = np.sort(np.stack([ring, np.roll(ring, -1)], 1), axis=1)
+    names, own = (pairs[:, 0] << 32 | pairs[:, 1] for pairs in (sides, around))
+    return bool(np.isin(np.setdiff1d(names, own), known).any())
+
+
+def _rings(follows: dict[int, int]) -> list[np.ndarray]:
+    """The closed ones of the chains, each vertex at most once."""
+    rings, left = [], dict(follows)
+    for start in follows:
+        ring = []
+        at = start
+        while (to := left.pop(at, None)) is not None:
+            ring.append(at)
+            at = to
+        if ring and at == start:
+            rings.append(np.array(ring))
+    return rings
+
+
+def _parts(mesh: Mesh) -> np.ndarray:
+    """(V,) number of the connected part of each vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = mesh.faces[:, :2].ravel(), mesh.faces[:, 1:].ravel()
+    links = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(len(mesh.vertices),) * 2)
+    return connected_components(links, directed=False)[1]
+
+
+def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) areas."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def fill(ring: np.ndarray, names: np.ndarray) -> np.ndarray:
+    """(n - 2, 3) names of the corners of the triangles that span a ring of (n, 3) positions with the least area.
+
+    A little of the squared sides is added, so that of all that lie in a plane those with short sides are taken.
+    """
+    count = len(ring)
+    best, split = np.zeros((count, count)), np.zeros((count, count), np.int64)
+    for span in range(2, count):
+        low = np.arange(count - span)
+        between = low[:, None] + np.arange(1, span)  # corners of a triangle over the chord from low to low + span
+        a, b, c = ring[low][:, None], ring[between], ring[low + span][:, None]
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=2)
+        area += EVEN * (((b - a) ** 2).sum(2) + ((c - b) ** 2).sum(2) + ((c - a) ** 2).sum(2))
+        total = area + best[low[:, None], between] + best[between, (low + span)[:, None]]
+        chosen = total.argmin(1)
+        best[low, low + span] = total[low, chosen]
+        split[low, low + span] = between[low, chosen]
+    faces, left = [], [(0, count - 1)]
+    while left:
+        low, high = left.pop()
+        if high - low < 2:
+            continue
+        middle = int(split[low, high])
+        faces.append((low, middle, high))
+        left += [(low, middle), (middle, high)]
+    return names[np.array(faces)]

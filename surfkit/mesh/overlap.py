@@ -1,0 +1,104 @@
+"""Which views see what a view sees, from another direction: what its depth can be compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from torch import Tensor
+
+from surfkit.scene.camera import Camera
+
+PROBES = 12
+"""Pixels along each side of a view whose points are looked for in others."""
+NARROW, WIDE = 1 / 3, 1.5
+"""How fast a view loses worth below and above the best angle, as shares of it."""
+WIDEST = 45.0
+"""Degrees between rays from which no view is asked."""
+CANDIDATES = 128
+"""Of how many views near by the probes are looked at."""
+LEAST = 0.01
+"""A view that is worth less than this share of the probes is not asked."""
+
+
+@dataclass(frozen=True)
+class Depths:
+    """The depth maps of all views, read one at a time.
+
+    Attributes:
+        cameras: Of the views.
+        read: (H, W) float32 camera z of the view at a position, local units; 0 where nothing is to be fused.
+    """
+
+    cameras: Sequence[Camera]
+    read: Callable[[int], Tensor]
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """(V, 3) float64 positions of the cameras."""
+        return np.stack([camera.centre.numpy() for camera in self.cameras])
+
+
+def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
+    """Positions of up to `count` views that see much of what a view sees, best first.
+
+    A view is worth, for each point of the first that lies in its picture, exp(-(a - angle)^2 / 2 s^2), where a is the
+    angle between both rays; less where views that are chosen already see the point, so that all points get their share.
+
+    Args:
+        at: Position of the view.
+        depths: Of all views.
+        count: Of views.
+        angle: Between rays, degrees.
+    """
+    points, eye = probes(depths.cameras[at], depths.read(at)), depths.centres[at]
+    if not len(points):
+        return []
+    near = _near(at, depths.centres, float(np.quantile(np.linalg.norm(points - eye, axis=1), 0.9)))
+    worth = np.array([_worth(points, eye, depths.cameras[other], angle) for other in near])
+    covered, chosen = np.zeros(len(points)), []
+    while len(chosen) < min(count, len(near)):
+        gains = (worth / (1 + covered)).sum(1)
+        best = int(gains.argmax())
+        if gains[best] <= LEAST * len(points):
+            break
+        chosen.append(near[best])
+        covered += worth[best]
+        worth[best] = 0
+    return chosen
+
+
+def probes(camera: Camera, depth: Tensor) -> np.ndarray:
+    """(P, 3) float64 points of the world that pixels spread over a view show."""
+    rows = np.linspace(0, camera.height - 1, min(PROBES, camera.height)).round().astype(int)
+    columns = np.linspace(0, camera.width - 1, min(PROBES, camera.width)).round().astype(int)
+    y, x = (grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij"))
+    z = depth.numpy()[y, x].astype(np.float64)
+    x, y, z = x[z > 0], y[z > 0], z[z > 0]
+    local = np.stack([(x + 0.5 - camera.cx) / camera.fx * z, (y + 0.5 - camera.cy) / camera.fy * z, z], 1)
+    pose = camera.world_to_camera.numpy()
+    return (local - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _near(at: int, centres: np.ndarray, distance: float) -> list[int]:
+    """Other views that stand near enough to see what lies at a distance at less than `WIDEST`, evenly thinned."""
+    apart = np.linalg.norm(centres - centres[at], axis=1)
+    order = np.argsort(apart, kind="stable")
+    found = [int(i) for i in order[apart[order] <= 2 * np.tan(np.radians(WIDEST / 2)) * distance] if i != at]
+    return found[:: -(-len(found) // CANDIDATES)] if found else []
+
+
+def _worth(points: np.ndarray, eye: np.ndarray, other: Camera, angle: float) -> np.ndarray:
+    """(P,) worth of a view for each point."""
+    pose = other.world_to_camera.numpy()
+    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = other.fx * x / z + other.cx, other.fy * y / z + other.cy
+        inside = (z > 0) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height)
+    rays = [points - eye, points - other.centre.numpy()]
+    one, two = (ray / np.linalg.norm(ray, axis=1, keepdims=True).clip(1e-300) for ray in rays)
+    between = np.degrees(np.arccos((one * two).sum(1).clip(-1, 1)))
+    spread = angle * np.where(between < angle, NARROW, WIDE)
+    return np.where(inside & (between < WIDEST), np.exp(-((between - angle) ** 2) / (2 * spread**2)), 0)

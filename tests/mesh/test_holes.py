@@ -1,0 +1,72 @@
+"""Small holes are filled, rims stay open."""
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.clean import clean
+from surfkit.mesh.holes import close_holes, fill
+
+
+def ball(without=()):
+    """A sphere of radius 1 without the triangles around some of its vertices."""
+    solid = trimesh.creation.icosphere(3)
+    keep = ~np.isin(solid.faces, without).any(1)
+    return Mesh(solid.vertices.astype(np.float32), solid.faces[keep].astype(np.int32))
+
+
+def sheet(side, hole=()):
+    """A square of `side` cells, without some of its cells."""
+    x, y = np.meshgrid(np.arange(side + 1), np.arange(side + 1), indexing="ij")
+    at = np.arange((side + 1) ** 2).reshape(side + 1, -1)
+    cells = [(i, j) for i in range(side) for j in range(side) if (i, j) not in hole]
+    faces = [t for i, j in cells for t in ([at[i, j], at[i + 1, j], at[i + 1, j + 1]], [at[i, j], at[i + 1, j + 1], at[i, j + 1]])]  # fmt: skip  # noqa: E501
+    return Mesh(np.stack([x, y, 0 * x], 2).reshape(-1, 3).astype(np.float32), np.array(faces, np.int32))
+
+
+def area(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).area
+
+
+def test_a_ball_with_holes_becomes_closed_and_faces_outwards():
+    whole, holed = ball(), ball(without=(100, 300, 500))
+    closed, count = close_holes(holed, 6)
+    solid = trimesh.Trimesh(closed.vertices, closed.faces, process=False)
+    assert count == 3 and solid.is_watertight and solid.is_winding_consistent
+    full = trimesh.Trimesh(whole.vertices, whole.faces, process=False).volume
+    assert 0.99 * full < solid.volume < full
+    assert close_holes(holed, 4) == (holed, 0), "longer rings stay open"
+
+
+def test_the_rim_of_open_ground_stays_and_the_hole_in_it_is_filled():
+    holed = sheet(8, hole=[(3, 3), (3, 4), (4, 3)])
+    closed, count = close_holes(holed, 1000)
+    assert count == 1 and np.isclose(area(closed), 64) and np.isclose(area(holed), 61)
+    up = np.cross(*(closed.vertices[closed.faces[:, i]] - closed.vertices[closed.faces[:, 0]] for i in (1, 2)))
+    assert (up[:, 2] > 0).all(), "no triangle is turned over, and none without area"
+    assert close_holes(sheet(2), 1000)[1] == 0, "a loose patch is no hole"
+
+
+def test_rings_that_touch_are_left():
+    holed = sheet(8, hole=[(3, 3), (4, 4)])  # they share a vertex
+    assert close_holes(holed, 100) == (holed, 0)
+
+
+def test_a_bent_ring_is_spanned_by_the_least_area():
+    """A square frame folded along its diagonal: the two triangles beside the fold, not those across it."""
+    ring = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 2], [0, 1, 0]], float)
+    faces = fill(ring, np.array([10, 11, 12, 13]))
+    areas = {}
+    for split in ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]]):
+        a, b, c = ring[np.array(split)].transpose(1, 0, 2)
+        areas[tuple(sorted(tuple(sorted(f)) for f in split))] = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert tuple(sorted(tuple(sorted(f - 10)) for f in faces)) == min(areas, key=areas.get)
+
+
+def test_cleaning_says_how_many():
+    holed = replace(ball(without=(100, 300)), colors=None)
+    mesh, report = clean(holed, 50, 50, hole_edges=10)
+    assert report.holes_closed == 2 and report.boundaries == 0 and len(mesh.faces) == report.triangles
+    assert clean(holed, 50, 50)[1].holes_closed == 0 and clean(holed, 50, 50)[1].boundaries == 2
