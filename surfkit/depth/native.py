@@ -141,7 +141,7 @@ def require_native() -> None:
     if module() is None:
         raise BadInput(
             "patch-match needs the compiled part of surfkit, and no C++ compiler was found when it was installed: install "
-            "GCC or Clang, then surfkit again, or take estimator:plane-sweep"
+            "GCC or Clang and then surfkit again, or use plane-sweep in its place"
         )
 
 

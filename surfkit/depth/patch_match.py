@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import ray_map
@@ -26,15 +28,17 @@ KEPT = 64
 """Pictures and maps kept in memory."""
 JITTER_PX = (2.0, 1.0, 0.5, 0.25, 0.12)
 """Parallax by which planes are changed at random, in one pass after the other."""
+LAST_PASS = 2
+"""As many changes as in this pass are tried when depth maps are compared."""
 
 
 @dataclass(frozen=True)
 class PatchMatch(DepthEstimator):
-    """PatchMatch stereo: slanted planes that neighbours hand on (Bleyer et al. 2011; checkerboard of Galliani et al. 2015).
+    """PatchMatch stereo (Bleyer et al. 2011): a slanted plane for every pixel, which pixels try from one another.
 
-    The planes begin with a plane sweep of small pictures, and are improved from coarse to fine by photometric consistency,
-    in the views that match best at each pixel; then by the reprojection error in the depth maps of other views too (Xu and
-    Tao 2019). The time grows with the number of pixels.
+    Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency, in
+    the views that match best at each pixel; then also by the reprojection error in the depth maps of other views (Xu and
+    Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit.
     """
 
     aligned: ClassVar[bool] = True
@@ -123,13 +127,27 @@ class Map:
     matched: Tensor
     parallax: float
 
+    def packed(self) -> np.ndarray:
+        """(H, W, 5) float32, for a file."""
+        flat = np.full(self.matched.shape, self.parallax, np.float32)
+        return np.concatenate([self.value, self.matched.numpy()[..., None], flat[..., None]], 2)
+
+    @classmethod
+    def unpacked(cls, numbers: np.ndarray) -> Map:
+        """From what is packed."""
+        value, matched = np.ascontiguousarray(numbers[..., :3]), torch.from_numpy(numbers[..., 3].copy())
+        return cls(value, matched, float(numbers[0, 0, 4]))
+
     @property
     def inverse(self) -> Tensor:
         """(H, W) inverse depth."""
         return torch.from_numpy(np.ascontiguousarray(self.value[..., 0]))
 
     def normals(self, camera: Camera) -> Tensor:
-        """(3, H, W) unit normals in the camera's axes, towards it: a plane is n . X = 1, and n . ray its inverse depth."""
+        """(3, H, W) unit normals in the camera's axes, towards it.
+
+        A plane is n . X = 1, so that n . ray is its inverse depth.
+        """
         w, gx, gy = torch.from_numpy(self.value).unbind(-1)
         rays = camera.rays()
         nx, ny = gx * camera.fx, gy * camera.fy
@@ -138,121 +156,108 @@ class Map:
 
 
 class Work:
-    """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work."""
+    """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work.
+
+    `photometric` and `consistent` give the map of the view at a position, or None where none can be made: by photometric
+    consistency alone, and by geometric consistency too.
+    """
 
     def __init__(self, settings: PatchMatch, given: Material, pairs: list[list[int]]) -> None:
         self.settings, self.given, self.pairs = settings, given, pairs
-        self.grey = lru_cache(KEPT * 3)(self._grey)
-        self.matched = lru_cache(KEPT)(self._matched)
-        self.consistent = lru_cache(KEPT)(self._consistent)
         self.sweep = PlaneSweep(longest=settings.coarsest)
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
+        self.grey = lru_cache(3 * KEPT)(self.read)
+        self.photometric = lru_cache(KEPT)(lambda at: self.kept("matching photographs", at, self.match))
+        reconciled = lru_cache(KEPT)(lambda at: self.kept("comparing depth maps", at, self.reconcile))
+        self.consistent = reconciled if settings.consistency else self.photometric
 
     def camera(self, at: int, level: int) -> Camera:
-        """Of a photograph at half the size, `level` times."""
+        """Of a photograph whose sides are halved `level` times."""
         whole = self.given.views[at].camera.fitted(self.settings.longest)
         return whole.resized(max(1, round(whole.width / 2**level)), max(1, round(whole.height / 2**level)))
 
     def levels(self, at: int) -> int:
-        """How often a photograph is halved before it is about as small as those the planes begin with."""
+        """How often a photograph is halved before the planes begin in it: to about twice the size of the sweep."""
         camera = self.camera(at, 0)
-        return max(0, round(np.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
+        return max(0, round(math.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
 
-    def _grey(self, at: int, level: int) -> Grey:
+    def read(self, at: int, level: int) -> Grey:
+        """A photograph at a level."""
         camera = self.camera(at, level)
         rgb = read_photo(self.given.views[at].path, (camera.width, camera.height)).to(torch.float32)
         return Grey(camera, rgb.mean(0).round().to(torch.uint8).numpy())
 
-    def _matched(self, at: int) -> Map | None:
-        """By photometric consistency alone."""
-        return self.kept(f"{at:06d}.npy", lambda: self.match(at))
-
-    def _consistent(self, at: int) -> Map | None:
-        """By geometric consistency too."""
-        if not self.settings.consistency:
-            return self.matched(at)
-        return self.kept(f"{at:06d}-consistent.npy", lambda: self.reconcile(at))
-
-    def kept(self, name: str, make: Callable[[], Map | None]) -> Map | None:
+    def kept(self, what: str, at: int, make: Callable[[int], Map | None]) -> Map | None:
         """A map from the folder for work, where it is put if it is not there."""
-        path = self.given.work / name
+        path = self.given.work / what.replace(" ", "-") / f"{at:06d}.npy"
         if not path.exists():
-            made = make()
-            numbers = np.zeros(0, np.float32)
-            if made is not None:
-                flat = np.full((*made.matched.shape, 1), made.parallax, np.float32)
-                numbers = np.concatenate([made.value, made.matched.numpy()[..., None], flat], 2)
-            save_array(path, numbers)
+            made = make(at)
+            save_array(path, np.zeros(0, np.float32) if made is None else made.packed())
+            emit(Progress(what, len(list(path.parent.glob("*.npy"))), len(self.given.views)))
         numbers = np.load(path)
-        if not len(numbers):
-            return None
-        return Map(
-            np.ascontiguousarray(numbers[..., :3]), torch.from_numpy(numbers[..., 3].copy()), float(numbers[0, 0, 4])
-        )
+        return Map.unpacked(numbers) if len(numbers) else None
 
     def match(self, at: int) -> Map | None:
-        """Planes from coarse to fine."""
+        """By photometric consistency, from coarse to fine; None without neighbours or sparse points."""
         settings, others = self.settings, self.pairs[at]
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         begun = self.sweep.sweep(self.given, at, self.small(at), [self.small(other) for other in others])
         if span is None or begun is None:
             return None
-        planes = Planes.at(begun[0].cpu().numpy(), len(others))
+        planes, parallax = Planes.at(begun[0].cpu().numpy(), len(others)), 0.0
         for level in range(self.levels(at), -1, -1):
-            camera = self.camera(at, level)
-            planes = planes.resized(camera.height, camera.width)
-            parallax = self.parallax(at, level, planes)
+            here, there = self.grey(at, level), [self.grey(o, min(level, self.levels(o))) for o in others]
+            planes = planes.resized(here.camera.height, here.camera.width)
+            parallax = parallax_of(here, there, planes)
             for index in range(settings.passes):
                 terms = self.terms(span, parallax, index)
-                here, there = self.grey(at, level), [self.grey(other, self.level(other, level)) for other in others]
                 improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
         return self.map(planes, parallax)
 
-    def level(self, at: int, level: int) -> int:
-        return min(level, self.levels(at))
-
     def reconcile(self, at: int) -> Map | None:
-        """One more pass, that also looks at the depth maps of the others."""
-        found = self.matched(at)
+        """One more pass, which looks at the depth maps of the others too."""
+        found = self.photometric(at)
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
-        if found is None or span is None:
-            return None
-        others = [(near, other) for near in self.pairs[at] if (other := self.matched(near)) is not None]
-        if not others:
+        others = [(near, other) for near in self.pairs[at] if (other := self.photometric(near)) is not None]
+        if found is None or span is None or not others:
             return found
-        planes = Planes.at(np.zeros(found.matched.shape, np.float32), len(others))
+        planes = Planes.at(found.value[..., 0], len(others))
         planes.value[:] = found.value
         known = [other.inverse.numpy() for _, other in others]
-        terms = self.terms(span, found.parallax, 2, self.settings.consistency)
-        improve(self.grey(at, 0), [self.grey(near, 0) for near, _ in others], planes, terms, at * 31 + 30, known)
+        terms = self.terms(span, found.parallax, LAST_PASS, self.settings.consistency)
+        there = [self.grey(near, 0) for near, _ in others]
+        improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30, known=known)
         return self.map(planes, found.parallax)
 
     def terms(self, span: tuple[float, float], parallax: float, index: int, consistency: float = 0.0) -> Terms:
-        s = self.settings
+        """Of a pass; the views that count are chosen anew in the first one."""
+        settings = self.settings
         return Terms(
             low=span[0],
             high=span[1],
             parallax=parallax,
             jitter_px=JITTER_PX[index],
-            smoothness=s.smoothness,
+            smoothness=settings.smoothness,
             consistency=consistency,
-            spread=255 * s.spread,
-            best=s.best,
-            window=s.window,
-            survey=index in (0, 2),
+            spread=255 * settings.spread,
+            best=settings.best,
+            window=settings.window,
+            survey=index == 0 or consistency > 0,
         )
 
     def map(self, planes: Planes, parallax: float) -> Map:
-        best = np.sort(planes.each, 2)[..., : self.settings.best].mean(2)
-        return Map(planes.value, torch.from_numpy(1 - best.astype(np.float32) / 255), parallax)
+        """The planes, and how well the best views match."""
+        best = np.sort(planes.each, 2)[..., : self.settings.best].mean(2, dtype=np.float32)
+        return Map(planes.value, torch.from_numpy(1 - best / 255), parallax)
 
-    def parallax(self, at: int, level: int, planes: Planes) -> float:
-        """Pixels by which the other photographs move, a unit of inverse depth, about the median of the planes."""
-        here, middle = self.camera(at, level), float(np.median(planes.value[..., 0]))
-        moves = []
-        for other in self.pairs[at]:
-            a, b = ray_map(here, self.camera(other, level), torch.device("cpu"))
-            ends = [a[:, ::16, ::16] + c * middle * b[:, None, None] for c in (0.98, 1.02)]
-            x, y = (ends[1][i] / ends[1][2] - ends[0][i] / ends[0][2] for i in range(2))
-            moves.append(float(torch.hypot(x, y).median()) / (0.04 * middle))
-        return float(np.mean(moves))
+
+def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:
+    """Pixels by which other pictures move, a unit of inverse depth, about the median of the planes; the mean of all."""
+    middle, moves = float(np.median(planes.value[..., 0])), []
+    low, high = 0.98 * middle, 1.02 * middle
+    for other in others:
+        a, b = (part.numpy() for part in ray_map(here.camera, other.camera, torch.device("cpu")))
+        near, far = (a[:, ::16, ::16] + c * b[:, None, None] for c in (low, high))
+        shift = near[:2] / near[2] - far[:2] / far[2]
+        moves.append(float(np.median(np.hypot(*shift))) / (high - low))
+    return float(np.mean(moves))

@@ -78,8 +78,8 @@ class Loss(Component):
 
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
     priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
-    may still be without one, and a data set without normals. A second view is only chosen and rendered in steps in which
-    a term with a weight has `needs_neighbour`, once for all of them.
+    may still be without one, and a data set without normals. A second view is only chosen and rendered in steps in
+    which a term with a weight has `needs_neighbour`, once for all of them.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)

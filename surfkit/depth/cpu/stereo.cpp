@@ -20,7 +20,7 @@ constexpr float kNoise = 1.0f;       // variance of grey values below which a wi
 constexpr float kNothing = 2.0f;     // cost of a plane that a view does not show; more than that of any match
 constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
 constexpr float kMostError = 3.0f;   // pixels of reprojection
-constexpr float kMostBend = 4.0f;    // pixels of parallax between neighbours; more is an edge
+constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
 constexpr float kSame = 0.06f;       // pixels of parallax by which planes differ that need not be tried
 
 struct Window {
@@ -151,6 +151,7 @@ struct Pixel {
     int count = 0;         // of the chosen
     float around[4];       // inverse depths of the four neighbours
     float offset[4][2];
+    float alike[4];        // how far their grey values are those of this pixel
     int neighbours = 0;
     Plane plane;
     float cost;
@@ -175,14 +176,14 @@ struct Pixel {
         return p.w * p.w > kOblique * kOblique * lengths;
     }
 
-    // How much a plane differs from what lies around: edges cost no more than kMostBend.
+    // How much a plane differs from what lies around: less where the picture changes, and no more than at an edge.
     float roughness(const Plane& p) const {
         float sum = 0;
         for (int i = 0; i < neighbours; i++) {
             const float there = p.w + p.gx * offset[i][0] + p.gy * offset[i][1];
-            sum += std::min(kMostBend, std::fabs(there - around[i]) * job.parallax);
+            sum += alike[i] * std::min(kMostBend, std::fabs(there - around[i]) * job.parallax);
         }
-        return neighbours ? job.smoothness * sum / (float)neighbours : 0.0f;
+        return job.smoothness * sum / 4;
     }
 
     float seen(int view, const Plane& p) const {
@@ -193,11 +194,14 @@ struct Pixel {
     }
 
     void gather_around() {
+        const int stride = job.width + 2 * kRadius;
+        const float* middle = job.image + (int64_t)(y + kRadius) * stride + x + kRadius;
         static const int steps[4][2] = {{-1, 0}, {1, 0}, {0, -1}, {0, 1}};
         for (const auto& step : steps) {
             const int px = x + step[0], py = y + step[1];
             if (px < 0 || py < 0 || px >= job.width || py >= job.height) continue;
             around[neighbours] = at(px, py).w;
+            alike[neighbours] = std::exp(-std::fabs(middle[step[1] * stride + step[0]] - *middle) / job.spread);
             offset[neighbours][0] = (float)step[0];
             offset[neighbours++][1] = (float)step[1];
         }

@@ -1,0 +1,33 @@
+"""Recipes of our own for the most accurate surface: splats that begin at stereo depth, and stay with it."""
+
+from __future__ import annotations
+
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.losses.depth import DepthRegression
+from surfkit.losses.normal_prior import NormalPrior
+from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.surface import NormalConsistency
+from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.tsdf import TSDF
+from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.recipe import Recipe
+from surfkit.start.stereo import StereoStart
+from surfkit.train.stage import Stage
+
+SURFACE = Recipe(
+    about="The most accurate surface: 2DGS that begins at stereo depth, is held to it, and is fused where views agree",
+    primitive=Surfel2D(),
+    depth=PatchMatch(),
+    start=StereoStart(),
+    pretrain=Stage(
+        losses={
+            "l1": L1(),
+            "ssim": SSIM(),
+            "normal": NormalConsistency(weight=0.05, start=3_000, depth="median"),
+            "depth": DepthRegression(start=10.0, end=10.0),
+            "prior": NormalPrior(start=0.05, end=0.05),
+        },
+        densify=None,
+    ),
+    mesh=TSDF(least_views=0.25, trust=Agreement()),
+)

@@ -1,0 +1,186 @@
+"""PatchMatch on a scene of which every depth is known, and its kernel against plain loops in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from needs import needs_native
+
+from surfkit.core.check import BadInput
+from surfkit.depth.base import Material
+from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.scene.camera import Camera
+from surfkit.scene.data import Data
+from surfkit.scene.read import observations, read
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+pytestmark = needs_native
+CPU = torch.device("cpu")
+STILL = Terms(0.1, 10, 1e-9, 0, 0, 0, 30, 1, 5)
+"""No plane is worth trying: they differ by too few pixels."""
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    """An aerial grid over the box and the ball: scene, observations and truth."""
+    folder = tmp_path_factory.mktemp("farm")
+    truth = photograph(Flight(kind="grid", views=20, width=120, height=90, points=600, test_every=0))
+    write_colmap(folder, truth, tracks=True)
+    data = Data(folder, test_every=0)
+    scene = read(data)
+    return scene, observations(data, scene), truth
+
+
+@pytest.fixture(scope="module")
+def estimates(farm, tmp_path_factory):
+    """Of two views."""
+    scene, tracks, _ = farm
+    given = Material(scene.train, tracks, CPU, tmp_path_factory.mktemp("work"))
+    return {estimate.at: estimate for estimate in PatchMatch(coarsest=60).estimate(given, [7, 12])}
+
+
+def test_depth_and_normals_are_those_of_the_scene_where_they_are_trusted(farm, estimates):
+    scene, _, truth = farm
+    for at, estimate in estimates.items():
+        exact = truth.exact[scene.train[at].name]
+        depth = exact.depth.float()
+        trusted = (estimate.confidence > 0.5) & (depth > 0)
+        error = (1 / (estimate.inverse * depth) - 1).abs()[trusted]
+        assert trusted.float().mean() > 0.35
+        assert error.median() < 0.004 and (error < 0.02).float().mean() > 0.93
+        cosine = (estimate.normal * exact.normal.float()).sum(0)[trusted]
+        assert cosine.median() > 0.985 and (cosine > 0.8).float().mean() > 0.85
+        torch.testing.assert_close(estimate.normal.norm(dim=0), torch.ones_like(depth))
+
+
+def test_what_is_not_trusted_is_worse(farm, estimates):
+    scene, _, truth = farm
+    for at, estimate in estimates.items():
+        depth = truth.exact[scene.train[at].name].depth.float()
+        error = (1 / (estimate.inverse * depth) - 1).abs()
+        doubted, trusted = ((estimate.confidence <= 0.5) & (depth > 0), (estimate.confidence > 0.5) & (depth > 0))
+        assert (error[doubted] > 0.02).float().mean() > 3 * (error[trusted] > 0.02).float().mean() > 0
+
+
+def two_pictures(seed: int) -> tuple[Grey, Grey]:
+    """Of noise, from two places, with lenses of their own."""
+    draw = np.random.default_rng(seed)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.linalg.qr(torch.eye(3, dtype=torch.float64) + 0.05 * torch.from_numpy(draw.normal(size=(3, 3))))[0]
+    pose[:3, :3] *= torch.sign(torch.diagonal(pose[:3, :3]))[:, None]
+    pose[:3, 3] = torch.tensor([0.4, -0.2, 0.1])
+    cameras = (
+        Camera(torch.eye(4, dtype=torch.float64), 30.0, 32.0, 15.5, 11.0, 32, 24),
+        Camera(pose, 34.0, 33.0, 18.0, 15.0, 38, 28),
+    )
+    return tuple(Grey(c, draw.integers(0, 256, (c.height, c.width)).astype(np.uint8)) for c in cameras)
+
+
+def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms: Terms) -> float:
+    """1 - the weighted correlation of a window with its picture through a plane, by loops."""
+    numbers = np.array(way(here.camera, there.camera))
+    turn, shift = numbers[:9].reshape(3, 3), numbers[9:]
+    height, width = here.value.shape
+    middle = float(here.value[y, x])
+    weights, ours, theirs = [], [], []
+    for dx, dy, near in pattern(terms.window).T.astype(float):
+        if near == 0:
+            continue
+        value = float(here.value[int(np.clip(y + dy, 0, height - 1)), int(np.clip(x + dx, 0, width - 1))])
+        at = turn @ [x + dx, y + dy, 1] + shift * (plane[0] + plane[1] * dx + plane[2] * dy)
+        u = np.clip(at[0] / at[2], 0, there.value.shape[1] - 1)
+        v = np.clip(at[1] / at[2], 0, there.value.shape[0] - 1)
+        left, above = int(u), int(v)
+        right, below = min(left + 1, there.value.shape[1] - 1), min(above + 1, there.value.shape[0] - 1)
+        upper = there.value[above, left] * (1 - (u - left)) + there.value[above, right] * (u - left)
+        under = there.value[below, left] * (1 - (u - left)) + there.value[below, right] * (u - left)
+        weights.append(near * np.exp(-abs(value - middle) / terms.spread))
+        ours.append(value)
+        theirs.append(upper * (1 - (v - above)) + under * (v - above))
+    w, a, b = np.array(weights) / sum(weights), np.array(ours), np.array(theirs)
+    a, b = a - w @ a, b - w @ b
+    return float(np.clip(1 - (w * a) @ b / np.sqrt((w @ a**2 + 1) * (w @ b**2 + 1)), 0, 1))
+
+
+def test_the_kernel_is_the_weighted_correlation_of_windows():
+    here, there = two_pictures(0)
+    planes = Planes.at(np.full((24, 32), 0.5, np.float32), 1)
+    planes.value[..., 1], planes.value[..., 2] = 0.004, -0.006
+    improve(here, [there], planes, STILL, seed=0)
+    for x, y in ((16, 12), (10, 8), (20, 15), (1, 1)):
+        wanted = slow_cost(here, there, x, y, planes.value[y, x].astype(float), STILL)
+        assert planes.cost[y, x] == pytest.approx(wanted, abs=2e-3)
+    assert np.ptp(planes.cost[4:20, 4:28]) > 0.3
+
+
+def test_the_reprojection_error_counts_up_to_its_limit():
+    here, there = two_pictures(1)
+    plain, with_maps, with_wrong = (Planes.at(np.full((24, 32), 0.5, np.float32), 1) for _ in range(3))
+    improve(here, [there], plain, STILL, seed=0)
+    numbers = np.array(way(here.camera, there.camera))
+    z = (numbers[:9].reshape(3, 3) @ [16, 12, 1] + 0.5 * numbers[9:])[2]
+    exact = np.full(there.value.shape, 0.5 / z, np.float32)  # the depth there of this pixel
+    terms = replace(STILL, consistency=0.1)
+    improve(here, [there], with_maps, terms, seed=0, known=[exact])
+    improve(here, [there], with_wrong, terms, seed=0, known=[5 * exact])
+    assert 0 <= with_maps.cost[12, 16] - plain.cost[12, 16] < 0.1  # less than a pixel: it is rounded to one there
+    assert with_wrong.cost[12, 16] - plain.cost[12, 16] == pytest.approx(0.3, abs=1e-5)
+
+
+def test_the_number_of_threads_changes_nothing(farm, tmp_path):
+    scene, tracks, _ = farm
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        given = Material(scene.train, tracks, CPU, tmp_path / str(threads))
+        (estimate,) = PatchMatch(coarsest=60, passes=1, neighbours=3).estimate(given, [3])
+        found.append(estimate)
+    for name in ("inverse", "confidence", "normal"):
+        assert torch.equal(getattr(found[0], name), getattr(found[1], name))
+
+
+def test_planes_go_on_at_another_size():
+    planes = Planes.at(np.zeros((6, 8), np.float32), 2)
+    y, x = np.indices((6, 8))
+    planes.value[:] = np.stack([1 + 0.1 * x + 0.2 * y, np.full((6, 8), 0.1), np.full((6, 8), 0.2)], 2)
+    larger = planes.resized(12, 16)
+    y, x = np.indices((12, 16))
+    wanted = 1 + 0.1 * ((x + 0.5) / 2 - 0.5) + 0.2 * ((y + 0.5) / 2 - 0.5)
+    np.testing.assert_allclose(larger.value[..., 0], wanted, rtol=1e-5)
+    np.testing.assert_allclose(larger.value[..., 1:], np.broadcast_to([0.05, 0.1], (12, 16, 2)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 40), (40, 1), (3, 3)])
+def test_pictures_of_a_few_pixels_are_no_trouble(shape):
+    camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
+    grey = Grey(camera, np.full(shape, 128, np.uint8))  # and without texture
+    planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
+    improve(grey, [grey, grey], planes, Terms(0.1, 2, 10, 1, 0.01, 0, 30, 1, 7), seed=1)
+    assert np.isfinite(planes.value).all() and np.isfinite(planes.cost).all()
+
+
+def test_views_without_points_have_no_depth(farm, tmp_path):
+    scene, tracks, _ = farm
+    name = scene.train[2].name
+    seen = {n: replace(s, points=s.points[:5], at=s.at[:5]) if n == name else s for n, s in tracks.seen.items()}
+    given = Material(scene.train, replace(tracks, seen=seen), CPU, tmp_path)
+    (estimate,) = PatchMatch(longest=40, coarsest=32, neighbours=2, best=1).estimate(given, [2])
+    assert estimate.inverse is None and estimate.confidence is None
+
+
+def test_settings_that_make_no_sense_are_refused():
+    for setting in (
+        {"window": 4},
+        {"window": 19},
+        {"neighbours": 17},
+        {"best": 9},
+        {"passes": 0},
+        {"spread": 0},
+        {"tolerance_px": 0},
+        {"edge": 1},
+        {"longest": 8},
+    ):
+        with pytest.raises(BadInput):
+            PatchMatch(**setting)
