@@ -51,11 +51,12 @@ def rings(mesh: Mesh) -> list[np.ndarray]:
 
 
 def _across(faces: np.ndarray, ring: np.ndarray, known: np.ndarray) -> bool:
-    """Whether new triangles have an edge, beside those of the ring, that the mesh has already."""
+    """Whether new triangles have an edge, beside those of the ring, that is among the sorted edges of the mesh."""
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     around = np.sort(np.stack([ring, np.roll(ring, -1)], 1), axis=1)
     names, own = (pairs[:, 0] << 32 | pairs[:, 1] for pairs in (sides, around))
-    return bool(np.isin(np.setdiff1d(names, own), known).any())
+    fresh = np.setdiff1d(names, own)
+    return bool((known[np.searchsorted(known, fresh).clip(max=len(known) - 1)] == fresh).any())
 
 
 def _rings(follows: dict[int, int]) -> list[np.ndarray]:

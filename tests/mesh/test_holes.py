@@ -70,3 +70,14 @@ def test_cleaning_says_how_many():
     mesh, report = clean(holed, 50, 50, hole_edges=10)
     assert report.holes_closed == 2 and report.boundaries == 0 and len(mesh.faces) == report.triangles
     assert clean(holed, 50, 50)[1].holes_closed == 0 and clean(holed, 50, 50)[1].boundaries == 2
+
+
+def test_no_edge_gets_a_third_triangle():
+    """A square hole both of whose diagonals are edges of the mesh already."""
+    ring = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    outer = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], np.float32)
+    around = [t for i in range(4) for j in [(i + 1) % 4] for t in ([4 + i, 4 + j, j], [4 + i, j, i])]
+    handles = [[0, 8, 2], [2, 8, 0], [1, 9, 3], [3, 9, 1]]  # both diagonals are edges of two triangles already
+    vertices = np.concatenate([ring, outer, np.array([[0.5, 0.5, 5], [0.5, 0.5, -5]], np.float32)])
+    holed, blocked = (Mesh(vertices, np.array(faces, np.int32)) for faces in (around, around + handles))
+    assert close_holes(holed, 4)[1] == 1 and close_holes(blocked, 4) == (blocked, 0)
