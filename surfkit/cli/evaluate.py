@@ -115,11 +115,12 @@ class Evaluate:
             scene.frame if scene else None,
             seams,
         )
-        metrics = note_metrics(out / "metrics.json", {"geometry": found})
+        metrics, images = note_metrics(out / "metrics.json", {"geometry": found}), {}
         if zones != Zones() and scene.held_out:
             images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
-            metrics = note_metrics(out / "metrics.json", {"images": metrics.get("images", {}) | images})
-        show_geometry(out, metrics)
+            before = metrics.get("images")
+            note_metrics(out / "metrics.json", {"images": (before if isinstance(before, dict) else {}) | images})
+        show_geometry(out, found, images)
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""

@@ -52,10 +52,15 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
         print(f"... and {len(pictures) - 8} more pictures in {this.pictures}")
 
 
-def show_geometry(out: Path, metrics: dict[str, Any]) -> None:
-    """Print tables of how close a surface is to the truth, in all and by class, and the paths of what was written."""
-    found = metrics["geometry"]
-    print_table(("geometry", "value"), [*geometry_rows(found), *zone_rows(metrics.get("images", {}))])
+def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:
+    """Print tables of how close a surface is to the truth, in all and by class, and the paths of what was written.
+
+    Args:
+        out: Folder of metrics.json.
+        found: What it says of the geometry.
+        images: Figures of parts of held-out photographs that were measured with it.
+    """
+    print_table(("geometry", "value"), [*geometry_rows(found), *zone_rows(images)])
     print()
     if "classes" in found:
         print_table(("class", "P", "R", "F1", "truth"), class_rows(found["classes"]))

@@ -15,12 +15,15 @@ from surfkit.evaluate.scores import nearest_rows, surface_gap, tree
 from surfkit.evaluate.seams import Seams
 from surfkit.evaluate.sightings import Sightings, sightings
 from surfkit.evaluate.terrain import Terrain, terrain
+from surfkit.evaluate.thinning import thin
 from surfkit.evaluate.transform import apply, scale_of
 from surfkit.evaluate.upright import Up, upward
 from surfkit.scene.scene import Frame, View
 
 REACH = 5.0
 """Multiples of tau within which a point of the reconstruction has the class of the nearest point of the truth."""
+FOR_VIEWS = 400_000
+"""Points of the truth that views are counted for, about; larger clouds are thinned to that, and the nearest counts."""
 UPRIGHT = 0.5
 """Cosine between up and a normal, above which a surface is a roof or ground: up to 60 degrees steep."""
 NONE = -1
@@ -104,10 +107,7 @@ def classify(
     surface, ground = _surfaces(outcome, up, partner, far, np.random.default_rng(settings.seed))
     groups = [surface]
     if frame is not None and len(views):
-        places = apply(back, draw.truth), apply(back, draw.reconstruction[far])
-        few = draw.truth[:: max(1, len(draw.truth) // 100_000)]
-        gap = surface_gap(tree(draw.truth), few) / scale_of(draw.alignment.matrix)
-        groups += _by_views(sightings(places, views, frame, gap), partner, far)
+        groups += _by_views(draw, (views, frame), partner, far, tau)
     if frame is not None and seams is not None:
         groups.append(_by_seams(draw, back, frame, seams))
     return Classes(tuple(groups), up, ground, seams)
@@ -145,7 +145,19 @@ def _named(points: np.ndarray, level: np.ndarray, ground: Terrain | None) -> np.
     return np.where(~level, facade, np.where(high, roof, low)).astype(np.int8)
 
 
-def _by_views(found: tuple[Sightings, Sightings], partner: np.ndarray, far: np.ndarray) -> list[Group]:
+def _by_views(
+    draw: Draw, scene: tuple[Sequence[View], Frame], partner: np.ndarray, far: np.ndarray, tau: float
+) -> list[Group]:
+    back, fewer = np.linalg.inv(draw.alignment.matrix), draw.truth
+    if len(fewer) > FOR_VIEWS:
+        fewer = thin([fewer], tau / 2 * np.sqrt(len(fewer) / FOR_VIEWS), fewer[0])
+    there = tree(fewer)
+    gap = surface_gap(there, fewer[:: max(1, len(fewer) // 100_000)]) / scale_of(draw.alignment.matrix)
+    own_places = apply(back, draw.reconstruction[far])
+    coarse, own_found = sightings((apply(back, fewer), own_places), *scene, gap)
+    rows = nearest_rows(there, draw.truth)
+    found = Sightings(coarse.seen[rows], coarse.edges[rows]), own_found
+
     def by_number(of: Sightings) -> np.ndarray:
         return (np.searchsorted(SEEN_FROM, of.seen, "right") - 1).astype(np.int8)
 

@@ -57,14 +57,13 @@ def measure_parts(
                 into["counted"] += count
                 into["psnr"] += count * psnr(render, target, mask)
                 into["ssim"] += count * similarity(render, target, mask)
-    return {
-        name: {
-            "psnr": one["psnr"] / one["counted"] if one["counted"] else None,
-            "ssim": one["ssim"] / one["counted"] if one["counted"] else None,
-            "share": one["pixels"] / max(1, total),
-        }
-        for name, one in sums.items()
-    }
+    return {name: _means(one, total) for name, one in sums.items()}
+
+
+def _means(sums: dict[str, float], total: int) -> dict[str, float | None]:
+    counted = sums["counted"]
+    figures = {name: sums[name] / counted if counted else None for name in ("psnr", "ssim")}
+    return {**figures, "share": sums["pixels"] / max(1, total)}
 
 
 def by_views(least: tuple[int, ...]) -> Callable[[Sight], Masks]:

@@ -27,7 +27,7 @@ from surfkit.scene.synthetic import Flight, photograph
 
 from .test_crop_volume import exact_visible, synthetic_points
 
-TAU = 0.25
+TAU = 0.5
 HOUSES = [((-12, -10), (-4, -3), 5.0), ((3, -8), (9, 6), 8.0), ((-10, 4), (-5, 12), 3.0)]
 """Lower and upper corner, and height."""
 STILL = Comparison(crop="none", align="none", draws=1, tau=TAU)
@@ -101,7 +101,7 @@ def test_roofs_facades_and_ground_are_what_they_were_built_as(slope):
     truth = outcome.draws[0].truth
     exact = exact_class(truth, slope)
     known = exact >= 0
-    assert [(exact == kind).sum() > 1_000 for kind in range(3)] == [True] * 3
+    assert [(exact == kind).sum() > 300 for kind in range(3)] == [True] * 3
     assert (classes.groups[0].truth == exact)[known].mean() > 0.995
     assert classes.up.source == "z, as no cameras are known" and len(classes.groups) == 1
 
