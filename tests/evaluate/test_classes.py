@@ -15,7 +15,7 @@ from surfkit.evaluate.comparison import Comparison, compare
 from surfkit.evaluate.measurement import Side
 from surfkit.evaluate.normals import normals_at
 from surfkit.evaluate.seams import Seams
-from surfkit.evaluate.sightings import near_edges
+from surfkit.evaluate.sightings import near_edges, sightings
 from surfkit.evaluate.surface import Surface, read_surface
 from surfkit.evaluate.terrain import terrain
 from surfkit.evaluate.transform import apply
@@ -25,7 +25,7 @@ from surfkit.scene.ply import read_vertices
 from surfkit.scene.scene import Frame, View
 from surfkit.scene.synthetic import Flight, photograph
 
-from .test_crop_volume import exact_visible, synthetic_points
+from .test_crop_volume import exact_visible, overhead, synthetic_points
 
 TAU = 0.5
 HOUSES = [((-12, -10), (-4, -3), 5.0), ((3, -8), (9, 6), 8.0), ((-10, 4), (-5, 12), 3.0)]
@@ -109,7 +109,8 @@ def test_roofs_facades_and_ground_are_what_they_were_built_as(slope):
 def test_only_the_class_falls_that_is_wrong():
     wrong = compare(mesh(town(widened=4 * TAU)), mesh(town()), STILL)
     found = class_figures(classify(wrong, STILL), wrong.draws[0], TAU)["surface"]
-    assert found["roof"]["f1"] > 0.97 and found["ground"]["f1"] > 0.95 and found["facade"]["f1"] < 0.12
+    # what stands out at the foot of a wall is wrong, and next to the ground
+    assert found["roof"]["f1"] > 0.97 and found["ground"]["f1"] > 0.9 and found["facade"]["f1"] < 0.12
     whole = compare(mesh(town()), mesh(town()), STILL)
     found = class_figures(classify(whole, STILL), whole.draws[0], TAU)["surface"]
     assert min(one["f1"] for one in found.values()) == 1
@@ -188,7 +189,7 @@ def test_classes_by_views_are_those_of_exact_rays():
     cloud = Surface("points", points)
     settings = Comparison(crop="none", align="none", draws=1, tau=0.2)
     outcome = compare(cloud, cloud, settings)
-    views, edges = classify(outcome, settings, scene.train, scene.frame).groups[1:]
+    views = classify(outcome, settings, scene.train, scene.frame).groups[1]
     truth = outcome.draws[0].truth
     counts = np.zeros(len(truth), int)
     for view in scene.train:
@@ -204,9 +205,21 @@ def test_classes_by_views_are_those_of_exact_rays():
     ground = truth[:, 2] == 0
     assert (views.truth == exact)[ground].mean() > 0.9
     assert np.abs(views.truth - exact)[ground].max() <= 2
-    middle = ground & (np.linalg.norm(truth[:, :2] - [0, -9], axis=1) < 2)
-    rim = (np.abs(truth[:, 2] - 3) < 1e-9) & (truth[:, 0] > -1.8)
-    assert (edges.truth[middle] == 1).all() and (edges.truth[rim] == 0).mean() > 0.9
+
+
+def test_the_rim_of_a_plate_is_near_an_edge_and_its_middle_is_not():
+    x, y = (line.ravel() for line in np.meshgrid(np.arange(-5, 5, 0.05), np.arange(-5, 5, 0.05)))
+    plate = (np.abs(x) < 2) & (np.abs(y) < 2)
+    cloud = np.concatenate([np.stack([x, y, 0 * x], 1), np.stack([x, y, 0 * x + 4], 1)[plate]])
+    under = cloud[: len(x)][(np.abs(cloud[: len(x), :2]) < 1).all(1)]
+    views = [overhead(at, 0, 20) for at in (-1, 0, 1)]
+    found, below = sightings((cloud, under - [0, 0, 0.5]), views, FRAME, 0.05)
+    top = cloud[:, 2] == 4
+    inwards = 2 - np.abs(cloud[:, :2]).max(1)
+    assert (found.seen[top] == 3).mean() > 0.99 and not below.seen.any()  # the plate hides what is below it
+    assert (found.edges[top & (inwards < 0.08)] == 3).mean() > 0.95 and not found.edges[top & (inwards > 0.4)].any()
+    far = ~top & (np.abs(cloud[:, 0]) > 3)
+    assert found.seen[far].any() and not found.edges[far].any()
 
 
 def test_an_edge_is_a_step_and_not_a_slope_or_a_hole():
@@ -215,7 +228,7 @@ def test_an_edge_is_a_step_and_not_a_slope_or_a_hole():
     assert not near_edges(depth, 0.01).any()
     depth[:, 40:] += 2
     near = near_edges(depth, 0.01)
-    assert near[:, 36:44].all() and not near[:, :36].any() and not near[:, 44:].any()
+    assert near[:, 35:45].all() and not near[:, :35].any() and not near[:, 45:].any()
     assert not near_edges(depth, 0.3).any()  # points so far apart make no such step
 
 
@@ -270,4 +283,4 @@ def test_a_picture_of_each_class(tmp_path):
             pixels = np.asarray(picture.convert("RGB")).astype(int)
         return (pixels[..., 0] > pixels[..., 2] + 40).sum(), (pixels[..., 2] > pixels[..., 0] + 20).sum()
 
-    assert wrong("facade")[0] > 500 and wrong("roof")[0] < 0.02 * wrong("roof")[1]
+    assert wrong("facade")[0] > 500 and wrong("roof")[0] < 0.06 * wrong("roof")[1]
