@@ -23,7 +23,7 @@ FLOORS = (
     "tuning board",
     "refining foresight merging",
     "blocks",
-    "surface",
+    "surface zones",
     "preparing",
     "pipeline",
     "report doctor",

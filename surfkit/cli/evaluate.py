@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -13,8 +13,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.evaluate.comparison import Comparison
 from surfkit.evaluate.geometry import measure_geometry
+from surfkit.evaluate.surface import Surface, read_surface
 from surfkit.folder import Run, note_metrics, refuse_no_run
 from surfkit.notes import noted
+from surfkit.optimise import drawing
 from surfkit.pipeline import drawer, evaluate, load_run, opened
 from surfkit.raster.select import Device
 from surfkit.scene.data import Data
@@ -22,6 +24,7 @@ from surfkit.scene.read import read
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
+from surfkit.zones import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class Evaluate:
 
     Without --gt: PSNR, SSIM and LPIPS; writes metrics.json and the pictures anew. With --gt: precision, recall, F1 and
     chamfer distances of RUN/mesh.ply, or of any mesh or cloud of points that is named instead of a run, into
-    metrics.json; the crop volume, error clouds and pictures into the folder geometry/ beside it.
+    metrics.json, in all and by classes of places; the crop volume, error clouds and pictures into the folder geometry/
+    beside it. --seen and --seams measure parts of the photographs, and --seams those of the geometry.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
@@ -45,6 +49,15 @@ class Evaluate:
     out: Path | None = None
     """Folder for metrics.json and geometry/; the run folder, or for a file FILE-geometry beside it."""
 
+    seen: tuple[int, ...] = ()
+    """Also PSNR and SSIM over the pixels whose place at least so many training views see, such as 3, or 3 5 10. With a
+    mesh as --gt, that is the place on it, and it alone hides; else the depth that the model renders, which must agree
+    in a training view within 1 %."""
+
+    seams: Distance | None = None
+    """Of a run in blocks: also PSNR, and with --gt precision, recall and F1, within so many metres of the borders of
+    blocks, and elsewhere. `auto` for 2 % of the width of the scene."""
+
     geometry: Annotated[Comparison, tyro.conf.arg(name="")] = Comparison()
     """How the geometry is compared."""
 
@@ -57,9 +70,10 @@ class Evaluate:
 
     def run(self) -> None:
         """Measure, and show what came out."""
+        zones = Zones(self.seen, self.seams)
         with noted(), bars():
             if self.gt is not None:
-                return self._geometry(self.gt)
+                return self._geometry(self.gt, zones)
             if (self.views, self.out, self.geometry) != (None, None, Comparison()):
                 raise BadInput("--views, --out and the options of the comparison are for geometry: give --gt, too")
             if self.target.is_file():
@@ -67,31 +81,55 @@ class Evaluate:
             refuse_no_run(self.target)
             with held(self.target), in_one_line(self.target):
                 this, state, scene = load_run(self.target)
+                zones.refuse_too_many(scene)
+                seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
                 rasterizer, _ = drawer(self.device)
-                show(this, evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights))
+                metrics = evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights)
+                if zones != Zones():
+                    draw = drawing(this, state, rasterizer)
+                    found = measure_zones(scene, draw, zones, rendered_depths(draw), seams)
+                    metrics = note_metrics(this.metrics, {"images": metrics["images"] | found})
+                show(this, metrics)
 
-    def _geometry(self, truth: Path) -> None:
-        if self.lpips_weights != "auto" or self.device != "auto":
+    def _geometry(self, truth: Path, zones: Zones) -> None:
+        if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):
             raise BadInput("--lpips-weights and --device are for photographs: leave them out, or --gt")
         this = opened(self.target) if self.target.is_dir() else None
-        if this is not None and not this.mesh.exists():
-            raise BadInput(f"{self.target}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")
-        if this is not None and not this.mesh_record.exists():
-            raise BadInput(
-                f"{this.mesh}: without {this.mesh_record.name} it is of an earlier model, or half made; make it with "
-                "surfkit mesh, or name the file"
-            )
+        if this is None and zones != Zones():
+            raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
+        if this is not None:
+            refuse_no_mesh(this)
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if this is None else this.out)
         scene = self._scene(this)
+        if scene is not None:
+            zones.refuse_too_many(scene)
+        surface = read_surface(truth) if self.seen else None
+        if surface is not None and surface.faces is None:
+            raise BadInput(f"{truth}: a cloud of points; --seen needs a mesh, or leave --gt out to use rendered depth")
+        seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
         found = measure_geometry(
             (self.target if this is None else this.mesh, truth),
             self.geometry,
             out / "geometry",
             scene.train if scene else (),
             scene.frame if scene else None,
+            seams,
         )
-        note_metrics(out / "metrics.json", {"geometry": found})
-        show_geometry(out, found)
+        metrics, images = note_metrics(out / "metrics.json", {"geometry": found}), {}
+        if zones != Zones() and scene.held_out:
+            images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
+            before = metrics.get("images")
+            note_metrics(out / "metrics.json", {"images": (before if isinstance(before, dict) else {}) | images})
+        show_geometry(out, found, images)
+
+    def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
+        """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
+        with held(self.target), in_one_line(self.target):
+            this, state, scene = load_run(self.target)
+            draw = drawing(this, state, drawer(self.device)[0])
+            depths = rendered_depths(draw) if truth is None else true_depths(truth, scene.frame, matrix)
+            seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
+            return measure_zones(scene, draw, zones, depths, seams)
 
     def _scene(self, this: Run | None) -> Scene | None:
         """The scene whose views make the crop volume; None where nobody names one."""
@@ -102,6 +140,17 @@ class Evaluate:
         if self.views is None:
             return None
         return read(opened(self.views).data if (self.views / "run.json").exists() else Data(self.views))
+
+
+def refuse_no_mesh(this: Run) -> None:
+    """BadInput if a run has no mesh of its model."""
+    if not this.mesh.exists():
+        raise BadInput(f"{this.out}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")
+    if not this.mesh_record.exists():
+        raise BadInput(
+            f"{this.mesh}: without {this.mesh_record.name} it is of an earlier model, or half made; make it with "
+            "surfkit mesh, or name the file"
+        )
 
 
 COMMAND = Evaluate

@@ -26,6 +26,7 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
         rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
     if lacking := images.get("lpips_not_measured"):
         rows.append(("LPIPS", f"not measured: {lacking}"))
+    rows += zone_rows(images)
     rows += [
         ("points", f"{metrics['points']:,}"),
         ("steps", f"{metrics['steps']:,}"),
@@ -53,10 +54,19 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
         print(f"... and {len(pictures) - 8} more pictures in {this.pictures}")
 
 
-def show_geometry(out: Path, found: dict[str, Any]) -> None:
-    """Print tables of how close a surface is to the truth, and the paths of what was written."""
-    print_table(("geometry", "value"), geometry_rows(found))
+def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:
+    """Print tables of how close a surface is to the truth, in all and by class, and the paths of what was written.
+
+    Args:
+        out: Folder of metrics.json.
+        found: What it says of the geometry.
+        images: Figures of parts of held-out photographs that were measured with it.
+    """
+    print_table(("geometry", "value"), [*geometry_rows(found), *zone_rows(images)])
     print()
+    if "classes" in found:
+        print_table(("class", "P", "R", "F1", "truth"), class_rows(found["classes"]))
+        print()
     ways = found["alignments"]
     rows = [
         (
@@ -76,6 +86,31 @@ def show_geometry(out: Path, found: dict[str, Any]) -> None:
     print()
     written = [out / "metrics.json", *sorted(path for path in (out / "geometry").iterdir() if path.is_file())]
     print_table(("written",), [(str(path),) for path in written])
+
+
+def zone_rows(images: dict[str, Any]) -> list[tuple[str, str]]:
+    """What metrics.json says of parts of the held-out photographs."""
+    seen, seams = images.get("seen"), images.get("seams")
+    parts = [(f"PSNR seen by {number}+", one) for number, one in (seen["by_views"] if seen else {}).items()]
+    for name in ("near", "elsewhere") if seams else ():
+        where = f"within {seams['distance']} of block borders" if name == "near" else "elsewhere"
+        parts += [(f"PSNR {where}", seams[name])] if name in seams else []
+    return [
+        (label, ("-" if one["psnr"] is None else f"{one['psnr']:.2f} dB") + f" over {one['share']:.1%} of the pixels")
+        for label, one in parts
+    ]
+
+
+def class_rows(classes: dict[str, Any]) -> list[tuple[str, ...]]:
+    """What metrics.json says of the classes of the geometry, and the share of the truth that each is."""
+    rows = []
+    for group in ("surface", "views", "edges", "seams"):
+        found = classes.get(group, {})
+        total = max(1, sum(one["points"]["truth"] for one in found.values()))
+        for name, one in found.items():
+            figures = ("-" if one[key] is None else f"{one[key]:.3f}" for key in ("precision", "recall", "f1"))
+            rows.append((f"{group}: {name}", *figures, f"{one['points']['truth'] / total:.1%}"))
+    return rows
 
 
 def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:

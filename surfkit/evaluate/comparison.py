@@ -66,8 +66,13 @@ class Comparison:
     radius: float | None = None
     """Of the alpha shape around the visible ground, in units of the truth; 2 % of the diagonal if left out."""
 
-    up: Axis = "z"
-    """Axis of the truth's frame that stands on the ground."""
+    up: Axis | None = None
+    """Axis of the truth's frame that stands on the ground. Left out, z for the crop volume and the plan; for the
+    classes, z of a georeferenced frame, else the direction in which the cameras are held level."""
+
+    classes: bool = True
+    """Also tell precision, recall and F1 apart: roofs, facades, ground; places that 0-1, 2, 3-5, 6 or more training
+    views see; near edges of the depth and away from them; near borders of blocks (--seams)."""
 
     far: float | None = None
     """Distances above this do not count in the chamfer distance of DTU; 20 times --tau if left out."""
@@ -103,6 +108,7 @@ class Outcome:
         crop: Volume, or None for all of space.
         seen: Points of the truth that enough views see; None where the crop volume was given.
         voxel: By which the truth was thinned first, or None.
+        sides: The reconstruction and the truth, which the points were drawn from.
     """
 
     draws: tuple[Draw, ...]
@@ -112,6 +118,7 @@ class Outcome:
     crop: Crop | None
     seen: int | None
     voxel: float | None
+    sides: tuple[Side, Side]
 
 
 def compare(
@@ -151,7 +158,7 @@ def compare(
         emit(Progress("measuring", number + 1, settings.draws))
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
-    return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel)
+    return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs))
 
 
 def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
@@ -197,7 +204,7 @@ def volume(
             "--crop auto needs the photographs: name a run folder, give --views with a run folder or a data set, or "
             "give --crop a file of Tanks and Temples, or --crop none"
         )
-    wanted = Enough(settings.visible, settings.up, settings.radius, tau)
+    wanted = Enough(settings.visible, settings.up or "z", settings.radius, tau)
     return visible_crop(truth, views, frame, matrix, wanted)
 
 

@@ -11,10 +11,13 @@ import numpy as np
 
 from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.chart import write_chart
+from surfkit.evaluate.class_pictures import write_classes
+from surfkit.evaluate.classes import class_figures, classify
 from surfkit.evaluate.comparison import Comparison, Outcome, compare
 from surfkit.evaluate.errors import LONGEST_PX, coloured, seen_by, write_cloud, write_plan, write_row
 from surfkit.evaluate.measurement import Draw
 from surfkit.evaluate.scores import chamfer, curve, shares
+from surfkit.evaluate.seams import Seams
 from surfkit.evaluate.surface import read_surface
 from surfkit.evaluate.transform import apply, scale_of, write_transform
 from surfkit.scene.crop import write_crop
@@ -30,16 +33,23 @@ NAMES = ("precision", "recall", "f1")
 
 
 def measure_geometry(
-    files: tuple[Path, Path], settings: Comparison, out: Path, views: Sequence[View] = (), frame: Frame | None = None
+    files: tuple[Path, Path],
+    settings: Comparison,
+    out: Path,
+    views: Sequence[View] = (),
+    frame: Frame | None = None,
+    seams: Seams | None = None,
 ) -> dict[str, Any]:
     """Compare a mesh or cloud with the truth, write what there is to look at into a folder, and return the figures.
 
     Args:
         files: The reconstruction and the truth.
         settings: How.
-        out: Gets crop.json, transform.txt, precision.ply, recall.ply, curve.png, plan.png and pictures of a few views.
+        out: Gets crop.json, transform.txt, precision.ply, recall.ply, curve.png, plan.png and pictures of a few views
+            and of each class.
         views: Training views; without any, the crop volume must be given.
         frame: Of the views.
+        seams: Borders of blocks, to tell the places near them apart.
 
     Raises:
         BadInput: A file that cannot be used, or two that do not belong together.
@@ -50,6 +60,10 @@ def measure_geometry(
     write_files(out, outcome, settings)
     if frame is not None:
         write_views(out, outcome, views, frame)
+    if settings.classes:
+        classes = classify(outcome, settings, views, frame, seams)
+        found["classes"] = class_figures(classes, outcome.draws[0], outcome.tau)
+        write_classes(out, outcome, classes, views, frame)
     return found
 
 
@@ -110,7 +124,7 @@ def write_files(out: Path, outcome: Outcome, settings: Comparison) -> None:
     precision, recall, f1 = shares(draw.distances, tau)
     title = f"precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f} at tau = {tau:.3g}"
     write_chart(out / "curve.png", taus, curve(draw.distances, taus), tau, title)
-    write_plan(out / "plan.png", _parts(draw, tau), outcome.crop, settings.up, tau)
+    write_plan(out / "plan.png", _parts(draw, tau), outcome.crop, settings.up or "z", tau)
     for name in ("precision.ply", "recall.ply", "curve.png", "plan.png"):
         emit(FileWritten(out / name, "geometry"))
 

@@ -21,6 +21,11 @@ def sample_surface(mesh: Surface, count: int, draw: np.random.Generator) -> np.n
     Raises:
         BadInput: The faces have no area.
     """
+    return sample_faces(mesh, count, draw)[0]
+
+
+def sample_faces(mesh: Surface, count: int, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The points of `sample_surface`, and (count,) the face that each lies on."""
     ends = np.cumsum(face_areas(mesh))
     if not ends[-1] > 0:
         raise BadInput(f"{mesh.path}: its faces have no area, so there is no surface to measure; make the mesh again")
@@ -37,7 +42,7 @@ def sample_surface(mesh: Surface, count: int, draw: np.random.Generator) -> np.n
         corners = mesh.vertices(mesh.faces[face[part]].ravel()).reshape(-1, 3, 3)
         sides = corners[:, 1:] - corners[:, :1]
         points[part] = corners[:, 0] + (spot[:, :, None] * sides).sum(1)
-    return points
+    return points, face
 
 
 def face_areas(mesh: Surface) -> np.ndarray:

@@ -38,6 +38,12 @@ def nearest(there: object, points: np.ndarray) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty(0)
 
 
+def nearest_rows(there: object, points: np.ndarray) -> np.ndarray:
+    """(n,) rows, in the tree, of the point nearest to each of (n, 3) points."""
+    parts = [there.query(points[start : start + BLOCK], workers=WORKERS)[1] for start in range(0, len(points), BLOCK)]
+    return np.concatenate(parts) if parts else np.empty(0, np.int64)
+
+
 def spacing(there: object, points: np.ndarray) -> float:
     """Mean distance of points to their nearest neighbour other than themselves, in the tree of all of them."""
     return float(there.query(points, k=2, workers=WORKERS)[0][:, 1].mean())

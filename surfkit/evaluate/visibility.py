@@ -51,11 +51,31 @@ def visible(points: np.ndarray, camera: Camera, pose: np.ndarray, gap: float) ->
         pose: (4, 4) world_to_camera in the frame and units of the points.
         gap: Between points of a surface.
     """
-    at, x, y, z = pictured(points, camera, pose)
-    focal = max(camera.fx, camera.fy)
-    side = sides(COVER * gap * focal / z)
-    depth, _ = nearest_rows(x, y, z, side, (camera.height, camera.width))
-    return at, z <= depth[y, x] + BEHIND * np.maximum(COVER * gap, z / focal)
+    depth, spots = cloud_depth(points, camera, pose, gap)
+    return spots[0], not_hidden(depth, spots, gap, camera)
+
+
+def cloud_depth(
+    points: np.ndarray, camera: Camera, pose: np.ndarray, gap: float
+) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """(H, W) depth of the nearest point at each pixel, inf where there is none, and what `pictured` says of them."""
+    spots = pictured(points, camera, pose)
+    _, x, y, z = spots
+    side = sides(COVER * gap * max(camera.fx, camera.fy) / z)
+    return nearest_rows(x, y, z, side, (camera.height, camera.width))[0], spots
+
+
+def not_hidden(depth: np.ndarray, spots: tuple[np.ndarray, ...], gap: float, camera: Camera) -> np.ndarray:
+    """(k,) bool: which points in the picture lie no further behind a depth map than a slanted surface would.
+
+    Args:
+        depth: (H, W) of `cloud_depth`, of these points or of others.
+        spots: Of `pictured`.
+        gap: Between the points that the map was made of.
+        camera: Of the map.
+    """
+    _, x, y, z = spots
+    return z <= depth[y, x] + BEHIND * np.maximum(COVER * gap, z / max(camera.fx, camera.fy))
 
 
 def sides(cover_px: np.ndarray) -> np.ndarray:

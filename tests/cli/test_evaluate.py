@@ -6,9 +6,14 @@ import shutil
 import numpy as np
 import pytest
 import torch
+import trimesh
 
+from surfkit.blocks import Record
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
+from surfkit.core.codec import write_json
+from surfkit.partition.base import Cells, Ground
+from surfkit.partition.plan import Block, Plan
 from surfkit.pipeline import run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.ply import write_points
@@ -40,6 +45,8 @@ def test_geometry_goes_beside_the_other_figures(folder, capsys):
     metrics = json.loads((folder / "run" / "metrics.json").read_text())
     geometry = metrics.pop("geometry")
     assert status == 0 and metrics == before and geometry["f1"] == 1 and geometry["crop"]["from"] == "auto"
+    assert geometry["classes"]["surface"]["ground"]["f1"] == 1 and geometry["classes"]["up_from"] == "cameras"
+    assert "surface: ground" in said and "views: 3-5" in said and "class-surface-ground.png" in said
     assert "F1" in said and "similarity" in said and str(folder / "run" / "geometry" / "plan.png") in said
     assert spoken(capsys, folder / "run", "--lpips-weights", "none")[0] == 0  # the pictures once more
     after = json.loads((folder / "run" / "metrics.json").read_text())
@@ -82,6 +89,13 @@ def test_a_file_needs_no_run(folder, capsys, tmp_path, views):
         (["{f}/run", "--gt", "{f}/truth.ply", "--tau", "0"], "--tau 0: it is a length"),
         (["{f}/run", "--gt", "{f}/truth.ply", "--crop", "{f}/data"], "cannot be read"),
         (["{f}/run", "--lpips-weights", "{f}"], "neither vgg16.ckpt"),
+        (["{f}/run", "--seen", "0"], "--seen 0: it is a number of training views"),
+        (["{f}/run", "--seen", "3", "99"], "--seen 99: there are 10 training views"),
+        (["{f}/run", "--seams", "auto"], "plan.json: the run is not one in blocks"),
+        (["{f}/run", "--seams", "-1"], "--seams -1: it is a length"),
+        (["{f}/run", "--gt", "{f}/truth.ply", "--seams", "auto"], "plan.json: the run is not one in blocks"),
+        (["{f}/run", "--gt", "{f}/truth.ply", "--seen", "3"], "a cloud of points; --seen needs a mesh"),
+        (["{f}/truth.ply", "--gt", "{f}/truth.ply", "--views", "{f}/data", "--seen", "3"], "--seen and --seams need"),
     ],
 )
 def test_mistakes_are_one_line(folder, capsys, words, message):
@@ -114,3 +128,51 @@ def test_another_unit_is_told(folder, capsys, tmp_path):
     status, _, error = spoken(capsys, *words)
     assert status == 2 and "another unit?" in error and "--transform" in error
     assert not list(tmp_path.glob("small-geometry/*"))
+
+
+@pytest.fixture
+def in_blocks(folder, tmp_path):
+    """The run, as if it had been made in two blocks that meet at x = 0 of the local frame."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    ground = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    cells = Cells(ground, ((None, None, 0.0, None), (0.0, None, None, None)), (0, 1))
+    blocks = tuple(Block(index, (), 0, 0, 0.5) for index in (0, 1))
+    (tmp_path / "run" / "blocks").mkdir()
+    write_json(tmp_path / "run" / "blocks" / "plan.json", Record(2, Plan(cells, blocks)))
+    return tmp_path / "run"
+
+
+def square(path, half=9.0):
+    """The ground as a mesh of two triangles."""
+    corners = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False).export(path)
+    return path
+
+
+def test_pixels_that_enough_views_see(folder, capsys, tmp_path):
+    shutil.copytree(folder / "run", tmp_path / "run")
+    status, said, _ = spoken(capsys, tmp_path / "run", "--seen", 3, 8, "--lpips-weights", "none")
+    images = json.loads((tmp_path / "run" / "metrics.json").read_text())["images"]
+    assert status == 0 and "PSNR seen by 8+" in said and images["psnr"] > 0
+    assert images["seen"]["depth"] == "rendered depth" and list(images["seen"]["by_views"]) == ["3", "8"]
+    options = ("--gt", square(tmp_path / "truth.ply"), "--tau", 0.3, "--draws", 1, "--visible", 0.4)
+    status, said, _ = spoken(capsys, tmp_path / "run", "--seen", 3, 8, *options)
+    after = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    seen = after["images"]["seen"]
+    assert status == 0 and seen["depth"] == "truth" and after["images"]["psnr"] == images["psnr"]
+    assert 0.2 < seen["by_views"]["8"]["share"] < seen["by_views"]["3"]["share"] < 1
+    assert after["geometry"]["f1"] > 0.9 and "class" in said and "PSNR seen by 3+" in said
+
+
+def test_borders_of_blocks(in_blocks, folder, capsys):
+    status, said, _ = spoken(capsys, in_blocks, "--seams", "auto", "--lpips-weights", "none")
+    seams = json.loads((in_blocks / "metrics.json").read_text())["images"]["seams"]
+    assert status == 0 and "of block borders" in said and seams["distance"].endswith("units")
+    words = ("--gt", folder / "truth.ply", "--draws", 1, "--visible", 0.4)
+    status, said, _ = spoken(capsys, in_blocks, "--seams", "auto", *words)
+    found = json.loads((in_blocks / "metrics.json").read_text())["geometry"]["classes"]["seams"]
+    assert status == 0 and "seams: near" in said and found["near"]["f1"] == found["elsewhere"]["f1"] == 1
+    counts = [found[name]["points"]["truth"] for name in ("near", "elsewhere")]
+    assert 0.01 < counts[0] / sum(counts) < 0.25
+    status, _, error = spoken(capsys, in_blocks, "--seams", 2)
+    assert status == 2 and "does not say how long its unit is; give --seams auto" in error

@@ -206,7 +206,10 @@ def test_everything_is_written(tmp_path):
     assert found["alignments"]["rigid"]["scale"] == pytest.approx(1) and found["alignments"]["rigid"]["residual"] > 0
     assert found["curve"]["precision"][4] == pytest.approx(found["draws"][0]["precision"])
     names = {"crop.json", "transform.txt", "precision.ply", "recall.ply", "curve.png", "plan.png"}
-    assert {path.name for path in out.iterdir()} == names | {f"view{i}.png" for i in range(3)}
+    names |= {f"view{i}.png" for i in range(3)} | {"class-surface-ground.png", "class-edges-away.png"}
+    names |= {f"class-views-{name.replace(' ', '-')}.png" for name, one in found["classes"]["views"].items()
+              if any(one["points"].values())}  # fmt: skip
+    assert {path.name for path in out.iterdir()} == names
     rows, _ = read_vertices(out / "recall.ply")
     missing = rows["red"] > rows["blue"]
     assert missing.mean() == pytest.approx(1 - found["draws"][0]["recall"], abs=1e-6)
@@ -215,5 +218,6 @@ def test_everything_is_written(tmp_path):
         with Image.open(out / name) as picture:
             assert len(picture.getcolors(1 << 20)) > 20, name
     assert read_surface(out / "precision.ply").vertices().shape[1] == 3
-    again = measure_geometry(files, Comparison(draws=2, align="rigid", crop=str(out / "crop.json")), tmp_path / "again")
-    assert again["f1"] == found["f1"]
+    settings = Comparison(draws=2, align="rigid", crop=str(out / "crop.json"), classes=False)
+    again = measure_geometry(files, settings, tmp_path / "again")
+    assert again["f1"] == found["f1"] and "classes" not in again and not list((tmp_path / "again").glob("class-*"))

@@ -1,0 +1,37 @@
+"""Depth maps of meshes against rays, also of triangles that reach behind the camera."""
+
+import numpy as np
+import torch
+import trimesh
+
+from surfkit.mesh.depths import mesh_depth
+from surfkit.scene.camera import Camera
+
+from .shapes import look_at, seen, sphere
+
+
+def test_depth_of_a_ball():
+    camera = look_at((1.2, -1.0, 0.8))
+    ball = trimesh.creation.icosphere(5, radius=0.5)
+    depth, (truth, _) = mesh_depth(np.asarray(ball.vertices), ball.faces, camera), seen(camera, sphere)
+    both = (depth > 0) & (truth > 0)
+    assert ((depth > 0) != (truth > 0)).mean() < 0.01 and np.abs(depth - truth)[both].max() < 0.02
+
+
+def test_a_ground_of_two_triangles_under_a_camera_that_stands_on_it():
+    """Every triangle reaches behind the camera; the depth below the horizon is that of the plane."""
+    corners = np.array([[-50, 0, -50], [50, 0, -40], [45, 0, 60], [-55, 0, 50]], float) + [0, 1.5, 0]  # y is down
+    camera = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 48.0, 36.0, 96, 72)
+    rows = np.arange(72) + 0.5
+    for faces in ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]], [[2, 1, 0], [3, 2, 0]]):
+        depth = mesh_depth(corners, np.array(faces), camera)
+        expected = 1.5 * 60 / (rows - 36)
+        below = (rows > 36) & (expected < 30)
+        assert below.sum() > 25 and not depth[rows < 36].any()
+        assert np.allclose(depth[below], np.where(below, expected, 0)[below][:, None], rtol=1e-4)
+
+
+def test_what_lies_behind_is_not_drawn():
+    corners = np.array([[-1, -1, -2], [1, -1, -2], [0, 1, -2]], float)
+    camera = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 48.0, 36.0, 96, 72)
+    assert not mesh_depth(corners, np.array([[0, 1, 2]]), camera).any()
