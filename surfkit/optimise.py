@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
@@ -60,6 +61,8 @@ class Job:
         meter: Sees what memory is taken by.
         start: The points to begin with; the sparse ones of the scene if None.
         before: The model that it goes on from, if its times count too.
+        frozen: Points that are drawn beside them and stay as they are; none if None.
+        owns: As for `Trainer`.
     """
 
     this: Run
@@ -70,6 +73,8 @@ class Job:
     meter: Meter
     start: Callable[[], Columns] | None = None
     before: StageState | None = None
+    frozen: Callable[[], Columns] | None = None
+    owns: Callable[[Tensor], Tensor] | None = None
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -102,13 +107,13 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     this, given = job.this, job.given
     stage, primitive = this.stage, this.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
-    trainer = Trainer(stage, primitive, job.scene.train, *sources)
+    trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
     along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(this.recipe.seed)
         params = job.start() if job.start else primitive.init(job.scene.cloud, generator)
-        fresh = trainer.begin(Points.fresh(params), generator)
+        fresh = trainer.begin(Points.fresh(params), generator, job.frozen() if job.frozen else None)
         if job.before is not None:
             for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
                 setattr(fresh, name, getattr(job.before, name))
