@@ -207,6 +207,7 @@ class Found:
     memory: int
     least: int
     disk: int
+    seconds: float
 
 
 def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: F811
@@ -220,7 +221,7 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         site = tuning.Site(place, scene, select("cpu")[0], EVERY, Store())
         block = plan.blocks[0]
         told = need(site, [block], coarse, [])
-        found[context] = Found(memory_of(site, block), told.least_bytes, told.disk_bytes)
+        found[context] = Found(memory_of(site, block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.points, block.begins
         wanted = {
             "densified": Begun(both, 0, False),
@@ -235,6 +236,10 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
     assert found["densified"].memory - found["tuned"].memory == 2 * around * foresight.POINT_BYTES
     less = foresight.POINT_BYTES - foresight.FROZEN_BYTES
     assert found["tuned"].memory - found["frozen"].memory == around * less
+    pace = coarse.seconds / coarse.index
+    assert found["densified"].seconds == found["tuned"].seconds == pytest.approx(STEPS * pace)
+    shorter = STEPS * pace * (1 - 0.25 * around / plan.blocks[0].begins)
+    assert found["frozen"].seconds == pytest.approx(shorter)
     assert found["densified"].disk > found["tuned"].disk > found["frozen"].disk
     assert found["densified"].least == found["tuned"].least > found["frozen"].least
     there = block_state(runs["frozen"], 0)
