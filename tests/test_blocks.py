@@ -402,7 +402,8 @@ def test_an_inline_executor_is_the_default(recipe):
 
 
 @pytest.mark.parametrize(
-    "word", [["--tune.steps", "7"], ["tune.densify:none"], ["assign:airspace"], ["--min-views", "3"]]
+    "word",
+    [["--tune.steps", "7"], ["tune.densify:none"], ["assign:airspace"], ["--min-views", "3"], ["--context", "frozen"]],
 )
 def test_settings_of_blocks_where_there_are_none(data, tmp_path, capsys, word):
     words = ["train", "recipe:2dgs", *word, "--data", str(data.path), "--out", str(tmp_path / "run")]
