@@ -10,6 +10,7 @@ from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F4
 
 from surfkit import blocks, foresight, tuning
 from surfkit.blocks import Hands
+from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.densify import ADC
@@ -246,3 +247,9 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
     each = sum(value.nbytes for value in there.points.params.values()) / len(there.points)
     wanted = 3 * each * plan.blocks[0].points + each * around
     assert found["frozen"].least == pytest.approx(wanted, rel=0.1)
+
+
+def test_recipes_with_blocks_densify_what_a_block_owns():
+    made = recipes()
+    names = ("citygs2", "citygs2-short", "citygs2-s", "citygs2-t", "citygs2-aerial", "citygs2-street")
+    assert {made[name].context for name in names} == {"tuned"} and made["citygs"].context == "densified"
