@@ -22,7 +22,7 @@ from surfkit.core.errand import POLL_S
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.folder import Run, discard_results, relay
-from surfkit.foresight import need, tell
+from surfkit.foresight import memory_of, need, tell
 from surfkit.ladder import following
 from surfkit.merging import put_together
 from surfkit.notes import naming
@@ -44,9 +44,9 @@ from surfkit.tuning import BUSY, FULL, Site, coarse_model, guarded, sight_of
 
 ATTEMPTS = 3
 """How often a block is begun in one command before it counts as failed."""
-PROGRAM_BYTES, POINT_BYTES, PIXEL_BYTES = 400 << 20, 3_000, 150
-"""What a process takes, as far as it can be told before: for itself, for each point that it may come to have (values,
-moments, gradients, records of the rasterizer), and for each pixel of a photograph."""
+PROGRAM_BYTES, PIXEL_BYTES = 400 << 20, 150
+"""What a process takes beside its points, as far as it can be told before: for itself, and for each pixel of a
+photograph."""
 STARVED = ("OUT_OF_MEMORY", "OutOfMemoryError")
 """How Slurm and Ray say that memory gave out."""
 LEAVE_S = 20.0
@@ -347,8 +347,6 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
     pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
     mine = [view for view in site.scene.train if view.name in block.views]
     photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
-    growth = 1 if site.this.recipe.tune.densify is None else 3
-    points = read_state(site.place(index)).begun_points or max(block.points, block.begins)
     return executor.Job(
         index=index,
         folder=site.place(index),
@@ -356,7 +354,7 @@ def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
         command=tuple(command),
         cost=block.work,
         memory_bytes=PROGRAM_BYTES
-        + growth * POINT_BYTES * points
+        + memory_of(site, block)
         + PIXEL_BYTES * pixels
         + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
         needs=(site.this.data.path, mine[0].path),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
@@ -75,6 +76,8 @@ class Job:
         start: Gives the points to begin with; if None, those of the `cloud`.
         cloud: Gives the points to begin at; the sparse ones of the scene if None.
         before: The model that it goes on from, if its times count too.
+        frozen: Points that are drawn beside them and stay as they are; none if None.
+        owns: As for `Trainer`.
     """
 
     this: Run
@@ -86,6 +89,8 @@ class Job:
     start: Callable[[], Begun] | None = None
     before: StageState | None = None
     cloud: Callable[[], Cloud] | None = None
+    frozen: Callable[[], Begun] | None = None
+    owns: Callable[[Tensor], Tensor] | None = None
 
 
 def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
@@ -118,7 +123,7 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     this, given = job.this, job.given
     stage, primitive = this.stage, this.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
-    trainer = Trainer(stage, primitive, job.scene.train, *sources)
+    trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
     along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
 
     def begin() -> StageState:
@@ -126,7 +131,7 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         began = time.perf_counter(), time.process_time()
         cloud = job.cloud() if job.cloud else job.scene.cloud
         begun = job.start() if job.start else Begun(primitive.init(cloud, generator), 0)
-        fresh = trainer.begin(Points.fresh(begun.params), generator)
+        fresh = trainer.begin(Points.fresh(begun.params), generator, job.frozen().params if job.frozen else None)
         fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         if job.cloud:
             fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -19,6 +19,9 @@ from surfkit.refine.base import Refine
 from surfkit.start.base import Start
 from surfkit.start.plain import SparseStart
 from surfkit.train.stage import Stage
+
+Context = Literal["densified", "tuned", "frozen"]
+"""What becomes of the points around a block while it is tuned."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,11 @@ class Recipe:
 
     tune: Stage = field(default_factory=Stage)
     """Optimisation of each block, where the scene is cut."""
+
+    context: Context = "densified"
+    """Points around a block that its views show: densified like its own; tuned, but neither cloned nor split; or
+    frozen, drawn as they are in the coarse model. None of them is merged. Whose a point is, its position tells at each
+    edit."""
 
     refine: tuple[Annotated[Refine, choice(Refine)], ...] = ()
     """What the whole model goes through when it is trained, and its blocks merged if there are any; refine.0:NAME adds

@@ -11,9 +11,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.errand import CRASHED, DRIVER, INTERRUPTED, POLL_S
@@ -146,7 +147,12 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
     block, store = eased(site.block(index), site.store)
     part = extract.load(site.views(index))
     scene, steps, folder = part.scene, block.stage.steps, block.out
-    state = saved(block, scene, repair=True)
+    context, state = block.recipe.context, saved(block, scene, repair=True)
+    if state is not None and bool(state.frozen) != (context == "frozen"):
+        there = "frozen points" if state.frozen else "no frozen points"
+        raise BadInput(
+            f"{block.checkpoint} has {there}, and the recipe --context {context}; delete {folder} to tune it anew"
+        )
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
     write_state(
@@ -155,8 +161,12 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
     if state is None or state.index < steps:
         given = read_ahead(site.this.data, scene, block.stage.losses, store, part.priors)
         every = replace(site.every, pictures=0)
-        start = Start(site, blocks, index, scene.train)
-        state = optimise(Job(block, scene, site.rasterizer, every, given, Meter(), start), state)
+        start, frozen = Start(site, blocks, index, scene.train), None
+        if context == "frozen":
+            start, frozen = replace(start, part="own"), replace(start, part="around")
+        owns = None if context == "densified" else start.owns
+        job = Job(block, scene, site.rasterizer, every, given, Meter(), start, frozen=frozen, owns=owns)
+        state = optimise(job, state)
     else:
         say(f"block {index} has all its {steps} steps already")
     write_state(folder, status="done", step=state.index, steps=steps)
@@ -166,13 +176,14 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
 class Start:
     """Where a block begins: with the points that it owns, and those that its views show, of the coarse model.
 
-    The latter are drawn and tuned with the block, so that it need not explain what others own; they are not merged.
+    The latter, its context, are drawn with the block, so that it need not explain what others own; they are not merged.
     """
 
     site: Site
     blocks: Plan
     index: int
     views: Sequence[View]
+    part: Literal["both", "own", "around"] = "both"
 
     def __call__(self) -> Begun:
         """Their raw parameters, and the degree of harmonics that the coarse model has come to."""
@@ -184,10 +195,16 @@ class Start:
         """Those among some points of the coarse model."""
         site = self.site
         params, sight = site.this.recipe.pretrain.finished(piece), sight_of(site, piece)
-        rows = self.blocks.cells.owner(params["means"]) == self.index
-        for view in self.views:
+        own = self.owns(params["means"])
+        rows = own.clone()
+        for view in self.views if self.part != "own" else ():
             rows |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+        rows &= ~own if self.part == "around" else True
         return {name: value[rows] for name, value in params.items()}
+
+    def owns(self, means: Tensor) -> Tensor:
+        """(N,) bool, which of (N, 3) positions are the block's own."""
+        return self.blocks.cells.owner(means) == self.index
 
 
 def coarse_model(this: Run) -> Stored:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit import blocks, pipeline, tuning
+from surfkit import blocks, foresight, pipeline, tuning
 from surfkit.appearance.exposure import Exposure
 from surfkit.blocks import Hands, Unfinished
 from surfkit.cli import main
@@ -403,7 +403,7 @@ def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_pat
     memory = [blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes]
     write_state(fresh.place(0), begun_points=begun + 10)
     memory.append(blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes)
-    assert memory[1] - memory[0] == 10 * 3 * blocks.POINT_BYTES, "what it has really begun with counts more"
+    assert memory[1] - memory[0] == 10 * 3 * foresight.POINT_BYTES, "what it has really begun with counts more"
 
 
 def test_an_inline_executor_is_the_default(recipe):
@@ -411,7 +411,8 @@ def test_an_inline_executor_is_the_default(recipe):
 
 
 @pytest.mark.parametrize(
-    "word", [["--tune.steps", "7"], ["tune.densify:none"], ["assign:airspace"], ["--min-views", "3"]]
+    "word",
+    [["--tune.steps", "7"], ["tune.densify:none"], ["assign:airspace"], ["--min-views", "3"], ["--context", "frozen"]],
 )
 def test_settings_of_blocks_where_there_are_none(data, tmp_path, capsys, word):
     words = ["train", "recipe:2dgs", *word, "--data", str(data.path), "--out", str(tmp_path / "run")]

@@ -29,7 +29,7 @@ from surfkit.train.material import Store
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
-BLOCKS_ONLY = re.compile(r"--(tune\.|assign\.|min-views)|(tune\.|assign:)")
+BLOCKS_ONLY = re.compile(r"--(tune\.|assign\.|min-views|context)|(tune\.|assign:)")
 """Words that say something of blocks alone."""
 
 

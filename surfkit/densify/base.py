@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
+import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
@@ -61,6 +62,7 @@ class Step:
         since_reset: Steps since opacities were last lowered (`Edit.max_opacity`); `index` if they never were.
         rates: Learning rates of this step by parameter, local units.
         seed: Differs from step to step and from run to run; for policies that draw.
+        owns: (N, 3) positions to (N,) bool, whether points there are this block's own; None where all are.
     """
 
     index: int
@@ -74,6 +76,12 @@ class Step:
     since_reset: int = 0
     rates: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
+    owns: Callable[[Tensor], Tensor] | None = None
+
+    def may_multiply(self) -> Tensor:
+        """(N,) bool, the points that stand where this block owns them now; a trainer copies and splits no others."""
+        means = self.shape.means
+        return torch.ones(len(means), dtype=torch.bool) if self.owns is None else self.owns(means)
 
 
 class Policy(Component):
@@ -116,7 +124,8 @@ class Filter(Component):
 
 
 def admitted(filters: Sequence[Filter], step: Step, want: Tensor) -> Tensor:
-    """(N,) bool, the points with a `want` above 0 that pass one filter after the other."""
+    """(N,) bool, the points with a `want` above 0 that may multiply and pass one filter after the other."""
+    want = want * step.may_multiply()
     for condition in filters:
         want = want * condition.admits(step, want)
     return want > 0

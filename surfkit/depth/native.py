@@ -140,8 +140,8 @@ def require_native() -> None:
     """BadInput where surfkit was installed without its compiled part."""
     if module() is None:
         raise BadInput(
-            "patch-match needs the compiled part of surfkit, and no C++ compiler was found when it was installed: install "
-            "GCC or Clang and then surfkit again, or use plane-sweep in its place"
+            "patch-match needs the compiled part of surfkit, and no C++ compiler was found when it was installed: "
+            "install GCC or Clang and then surfkit again, or use plane-sweep in its place"
         )
 
 

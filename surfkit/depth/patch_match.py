@@ -34,11 +34,11 @@ LAST_PASS = 2
 
 @dataclass(frozen=True)
 class PatchMatch(DepthEstimator):
-    """PatchMatch stereo (Bleyer et al. 2011): a slanted plane for every pixel, which pixels try from one another.
+    """PatchMatch stereo (Bleyer et al. 2011): every pixel has a slanted plane, and tries those of other pixels.
 
-    Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency, in
-    the views that match best at each pixel; then also by the reprojection error in the depth maps of other views (Xu and
-    Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit.
+    Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency,
+    in the views that match best at each pixel; then also by the reprojection error in the depth maps of other views
+    (Xu and Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit.
     """
 
     aligned: ClassVar[bool] = True
@@ -158,8 +158,8 @@ class Map:
 class Work:
     """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work.
 
-    `photometric` and `consistent` give the map of the view at a position, or None where none can be made: by photometric
-    consistency alone, and by geometric consistency too.
+    `photometric` and `consistent` give the map of the view at a position, or None where none can be made: by
+    photometric consistency alone, and by geometric consistency too.
     """
 
     def __init__(self, settings: PatchMatch, given: Material, pairs: list[list[int]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -81,6 +81,24 @@ class Edit:
     max_opacity: float | None = None
     nudge: Columns | None = None
     forget: Tensor | None = None
+
+
+def withheld(edit: Edit, may: Tensor) -> Edit:
+    """An edit that copies and splits no others than the points of a (N,) mask.
+
+    Of a point that was to be copied or split and may not, the rest of the edit but for its removal is left out, too: a
+    nudge of it was to make up for its copies.
+    """
+    asked = [mask > 0 for mask in (edit.clone, edit.split) if mask is not None]
+    if not asked:
+        return edit
+    left = ~torch.stack(asked).any(0) | may
+
+    def kept(value: Tensor | None) -> Tensor | None:
+        return None if value is None else value * left.view(-1, *[1] * (value.dim() - 1))
+
+    nudge = None if edit.nudge is None else {name: kept(shift) for name, shift in edit.nudge.items()}
+    return replace(edit, clone=kept(edit.clone), split=kept(edit.split), nudge=nudge, forget=kept(edit.forget))
 
 
 def merge(edits: Sequence[Edit | None]) -> Edit | None:

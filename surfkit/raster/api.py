@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -59,6 +59,11 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def and_then(self, others: Splats) -> Splats:
+        """These and others of the same kind, in this order."""
+        rest = others.tensors()
+        return replace(self, **{name: torch.cat([value, rest[name]]) for name, value in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
         """The five tensors by name, in the order of the fields."""
@@ -138,13 +143,16 @@ class Render(ABC):
     radii: Tensor
 
     @abstractmethod
-    def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
+    def backward(
+        self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
+    ) -> Gradients:
         """Gradients from cotangents of the maps, in one pass; the signal of `chosen` comes beside them.
 
         Args:
             total: Of all losses.
             chosen: Of the losses that drive densification.
             absolute: Sum the absolute values of the pixels' shares of that signal, component by component (AbsGS).
+            rows: Only of the first so many splats, of all if None; the others still hide what is behind them.
         """
 
 

@@ -106,16 +106,20 @@ class NativeRender(Render):
         )
         return Maps(**maps)
 
-    def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
+    def backward(
+        self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
+    ) -> Gradients:
         arrays = self._pass.arrays
-        grads = [torch.zeros_like(a) for a in arrays]
-        signal = torch.zeros(len(arrays[0]), 2)
-        chosen_signal = None if chosen is None else torch.zeros(len(arrays[0]), 2)
+        rows = len(arrays[0]) if rows is None else rows
+        grads = [torch.zeros_like(a[:rows]) for a in arrays]
+        signal = torch.zeros(rows, 2)
+        chosen_signal = None if chosen is None else torch.zeros(rows, 2)
         self._pass.native.backward(
             arrays,
             self._cotangents(total),
             [] if chosen is None else self._cotangents(chosen),
             absolute,
+            rows,
             grads,
             signal,
             chosen_signal,

@@ -185,7 +185,9 @@ class ReferenceRender(Render):
         prints = self._drawn.footprints
         self.radii = torch.where(self.seen, prints.radius.detach(), 0.0)
 
-    def backward(self, total: Maps, chosen: Maps | None = None, absolute: bool = False) -> Gradients:
+    def backward(
+        self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
+    ) -> Gradients:
         leaves = list(self._leaves.values())
         *grads, screen = self._pull(total, [*leaves, self._drawn.footprints.screen])
         part = None
@@ -193,7 +195,8 @@ class ReferenceRender(Render):
             part = self._scaled(self._sizes(chosen))
         elif chosen is not None:
             part = self._signal(self._pull(chosen, [self._drawn.footprints.screen])[0])
-        return Gradients(*grads, self._signal(screen), part)
+        found = (*grads, self._signal(screen), part)
+        return Gradients(*(None if value is None else value[:rows] for value in found))
 
     def _pull(self, cotangents: Maps, wanted: list[Tensor]) -> list[Tensor]:
         given = cotangents.present()

@@ -62,6 +62,7 @@ def save(path: Path, state: StageState) -> None:
         for group in GROUPS
         for name, value in getattr(state.points, group).items()
     }
+    tensors |= {f"frozen.{name}": value.contiguous() for name, value in state.frozen.items()}
     with taking_the_place(path) as part:
         _write(part, tensors, facts)
 
@@ -140,21 +141,22 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         BadInput: They make none.
     """
     facts = _facts(path, tensors, text)
-    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks")}
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks", "frozen")}
     for key, value in tensors.items():
         group, _, name = key.partition(".")
         if group in groups:
             groups[group][name] = value
-    looks = groups.pop("looks")
+    looks, frozen = groups.pop("looks"), groups.pop("frozen")
     points = Points(**groups)
     _check(path, points, tensors["order"], facts)
+    _check_frozen(path, points, frozen)
     generator = torch.Generator()
     try:
         generator.set_state(tensors["generator"])
     except (TypeError, RuntimeError) as error:
         raise _unusable(path, "the state of the random generator is none") from error
     order = Order(facts["views"], tensors["order"], facts["shown"])
-    state = StageState(points, order, generator, looks=looks, **{name: facts[name] for name in SCALARS})
+    state = StageState(points, order, generator, looks=looks, frozen=frozen, **{name: facts[name] for name in SCALARS})
     state.skipped = list(state.skipped)
     return state
 
@@ -276,3 +278,11 @@ def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> 
         raise _unusable(path, "it knows of views or degrees of harmonics that do not exist")
     if min(facts[name] for name in ("index", "seconds", "cpu_seconds", "reset_at", "halvings")) < 0:
         raise _unusable(path, "a number in it is below 0")
+
+
+def _check_frozen(path: Path, points: Points, frozen: dict[str, Tensor]) -> None:
+    """Frozen points have the columns of the others, each as many rows; a state from before there were any has none."""
+    kinds = {name: (value.shape[1:], value.dtype) for name, value in points.params.items()}
+    there = {name: (value.shape[1:], value.dtype) for name, value in frozen.items()}
+    if frozen and (there != kinds or len({len(value) for value in frozen.values()}) != 1):
+        raise _unusable(path, "its frozen points do not fit the others")

@@ -30,7 +30,7 @@ class Meter:
 
     def step(self, state: StageState, material: Material) -> None:
         """See what is held after a step."""
-        groups = (*vars(state.points).values(), state.looks)
+        groups = (*vars(state.points).values(), state.frozen, state.looks)
         points = sum(value.nbytes for group in groups for value in group.values())
         self.parts["points"] = max(self.parts["points"], points)
         for name, count in material.bytes().items():

@@ -26,8 +26,8 @@ ROWS = 1 << 16
 """Points of a piece."""
 BYTES = 1 << 24
 """Read at once where rows do not matter."""
-POINTS = ("params.", "first.", "second.", "stats.")
-"""What names of tensors that have a row for each point begin with."""
+POINTS = ("params.", "first.", "second.", "stats.", "frozen.")
+"""What names of tensors that have a row for each point, or for each frozen one, begin with."""
 CODES = {torch.float32: "F32", torch.float64: "F64", torch.int64: "I64", torch.uint8: "U8"}
 """Types as safetensors names them."""
 

@@ -23,7 +23,7 @@ from surfkit.densify.signal import LossGradient
 from surfkit.losses.base import Loss, Neighbour, Regularizer, Sample, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
-from surfkit.primitives.points import Columns, Edit, Points, merge
+from surfkit.primitives.points import Columns, Edit, Points, merge, withheld
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.scene.cache import Cache
 from surfkit.scene.depth_prior import DepthPrior
@@ -128,6 +128,8 @@ class StageState:
     """How often the learning rates have been halved, after numbers that were not finite."""
     skipped: list[int] = field(default_factory=list)
     """Positions of photographs that turned out damaged, and are not shown any more."""
+    frozen: Columns = field(default_factory=dict)
+    """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
 
     @property
     def seed(self) -> int:
@@ -166,6 +168,7 @@ class Trainer:
         priors: Estimated depths by position, for losses that need them.
         masks: Which pixels count, by position, (H, W) bool or None; None if all do.
         expect: Told the positions in the order in which they will be asked for, whenever a new order begins.
+        owns: (N, 3) positions to (N,) bool: points elsewhere are neither copied nor split; None if all points may be.
     """
 
     stage: Stage
@@ -176,13 +179,14 @@ class Trainer:
     priors: Sequence[DepthPrior | None] | None = None
     masks: Sequence[Tensor | None] | None = None
     expect: Callable[[Sequence[int]], None] | None = None
+    owns: Callable[[Tensor], Tensor] | None = None
 
-    def begin(self, points: Points, generator: torch.Generator) -> StageState:
-        """The state before the first step."""
+    def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
+        """The state before the first step; `frozen` as in `StageState`."""
         missing = set(points.params) ^ set(self.stage.rates)
         if missing:
             raise BadInput(f"rates has {', '.join(self.stage.rates)}; the points have {', '.join(points.params)}")
-        state = StageState(points, Order(len(self.views)), generator)
+        state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.looks = fresh_looks(self.stage.appearance, len(self.views))
         return state
@@ -213,7 +217,7 @@ class Trainer:
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
         shape = self.primitive.shape(leaves, state.sh_degree)
-        splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
+        splats = self.drawn(state, shape)
 
         paired = any(stage.losses[loss].needs_neighbour for loss in active)
         geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
@@ -224,7 +228,7 @@ class Trainer:
         terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
         losses |= {name: float(term.detach()) for name, term in terms.items()}
         require_finite_losses(index, sample.view.name, losses)
-        gradients = render.backward(total, chosen, stage.signal.absolute)
+        gradients = render.backward(total, chosen, stage.signal.absolute, len(state.points))
         facts = self.facts(state, splats, sample, render, gradients)
         edit = self.wanted(state.points, facts)
         adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
@@ -233,6 +237,11 @@ class Trainer:
             state.points = self.edited(state, edit, index)
         state.index = index
         return Done(index, losses, len(state.points), render.maps, sample)
+
+    def drawn(self, state: StageState, shape: Splats) -> Splats:
+        """The splats of a state, detached, and then those that are frozen."""
+        splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
+        return splats.and_then(self.primitive.shape(state.frozen, state.sh_degree)) if state.frozen else splats
 
     def sample(self, state: StageState) -> tuple[int, Sample]:
         """Position and photograph of the view to show now; damaged ones are passed over, and named once."""
@@ -314,28 +323,31 @@ class Trainer:
         return Look(self.stage.appearance, state.looks, shown, rate)
 
     def facts(self, state: StageState, splats: Splats, sample: Sample, render: Render, gradients: Gradients) -> Step:
-        """What the policies are told about a step."""
-        index = state.index + 1
+        """What the policies are told about a step, and nothing about frozen points."""
+        index, count = state.index + 1, len(state.points)
+        own = {name: value[:count] for name, value in splats.tensors().items()}
         chosen = gradients.signal if gradients.chosen is None else gradients.chosen
         return Step(
             index=index,
             steps=self.stage.steps,
-            seen=render.seen,
-            shape=splats,
+            seen=render.seen[:count],
+            shape=replace(splats, **own),
             grad=self.stage.signal.combine(chosen, gradients.signal).norm(dim=-1),
-            radii=render.radii,
+            radii=render.radii[:count],
             image_px=max(sample.view.camera.width, sample.view.camera.height),
-            views=Survey(self.views, self.rasterizer, splats, self.stage.near),
+            views=Survey(self.views, self.rasterizer, splats, self.stage.near, count),
             since_reset=index - state.reset_at,
             rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.stage.rates.items()},
             seed=state.seed,
+            owns=self.owns,
         )
 
     def wanted(self, points: Points, step: Step) -> Edit | None:
-        """What the policies ask for together."""
+        """What the policies ask for together, of what is allowed."""
         for policy in self.stage.policies:
             policy.watch(points, step)
-        return merge([policy.edit(points, step) for policy in self.stage.policies])
+        edit = merge([policy.edit(points, step) for policy in self.stage.policies])
+        return edit if edit is None or self.owns is None else withheld(edit, step.may_multiply())
 
     def edited(self, state: StageState, edit: Edit, index: int) -> Points:
         """The points after an edit."""

@@ -47,6 +47,8 @@ class Survey:
     rasterizer: Rasterizer
     shape: Splats
     near: float
+    rows: int | None = None
+    """Of how many of the splats, the first ones, it tells; None for all."""
     tallies: dict[tuple[float, float], Tally] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -55,13 +57,15 @@ class Survey:
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
         """See `Views.each`."""
         for view in self.views:
-            yield self.rasterizer.contribution(self.shape, view.camera, self.near, alpha_power, transmittance_power)
+            found = self.rasterizer.contribution(self.shape, view.camera, self.near, alpha_power, transmittance_power)
+            yield found[0][: self.rows], found[1][: self.rows]
 
     def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
         """See `Views.survey`."""
         powers = (alpha_power, transmittance_power)
         if powers not in self.tallies:
-            mean, peak = torch.zeros_like(self.shape.opacities), torch.zeros_like(self.shape.opacities)
+            mean = torch.zeros_like(self.shape.opacities[: self.rows])
+            peak = torch.zeros_like(mean)
             hits, views = (torch.zeros_like(mean, dtype=torch.int64) for _ in range(2))
             for amount, count in self.each(*powers):
                 here = amount / count.clamp_min(1)

@@ -68,7 +68,8 @@ def two_pictures(seed: int) -> tuple[Grey, Grey]:
     """Of noise, from two places, with lenses of their own."""
     draw = np.random.default_rng(seed)
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.linalg.qr(torch.eye(3, dtype=torch.float64) + 0.05 * torch.from_numpy(draw.normal(size=(3, 3))))[0]
+    tilted = torch.eye(3, dtype=torch.float64) + 0.05 * torch.from_numpy(draw.normal(size=(3, 3)))
+    pose[:3, :3] = torch.linalg.qr(tilted)[0]
     pose[:3, :3] *= torch.sign(torch.diagonal(pose[:3, :3]))[:, None]
     pose[:3, 3] = torch.tensor([0.4, -0.2, 0.1])
     cameras = (

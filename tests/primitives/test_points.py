@@ -2,7 +2,7 @@ import torch
 
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.base import apply
-from surfkit.primitives.points import Edit, Points, merge
+from surfkit.primitives.points import Edit, Points, merge, withheld
 
 
 def points(count: int = 6) -> Points:
@@ -86,3 +86,21 @@ def test_copies_inherit_the_nudge_and_only_the_named_forget():
     assert after.params["means"][:, 0].tolist() == [3, 6, 3, 3]
     assert after.first["means"][:, 0].tolist() == [1, 0, 0, 0], "a copy has no past"
     assert points.params["opacities"].tolist() == [0, 0, 0], "the points before the edit are as they were"
+
+
+def test_copies_that_are_withheld_take_their_nudge_with_them():
+    edit = Edit(
+        drop=mask(0, 1),
+        clone=torch.tensor([0, 2, 3, 0, 0, 0]),
+        split=mask(3),
+        max_opacity=0.5,
+        nudge={"means": torch.ones(6, 3), "opacities": torch.ones(6)},
+        forget=mask(1, 2, 5),
+    )
+    left = withheld(edit, mask(2, 5))
+    assert left.clone.tolist() == [0, 0, 3, 0, 0, 0] and not left.split.any()
+    assert torch.equal(left.drop, edit.drop) and left.max_opacity == 0.5 and torch.equal(left.forget, mask(2, 5))
+    assert left.nudge["opacities"].tolist() == [1, 0, 1, 0, 1, 1]
+    assert left.nudge["means"][:, 2].tolist() == [1, 0, 1, 0, 1, 1]
+    quiet = Edit(drop=mask(4), nudge={"means": torch.ones(6, 3)})
+    assert withheld(quiet, mask()) is quiet, "what multiplies nothing is allowed to anyone"

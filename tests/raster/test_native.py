@@ -135,6 +135,22 @@ def test_gradients_and_chosen_signals_equal_the_reference_for_all_maps(name, kin
 
 
 @each_case
+def test_gradients_of_the_first_rows_are_those_of_all(name, kind):
+    """To the bit: what gets no gradient hides others as before. Also of the reference."""
+    c = case(name, kind)
+    total, rows = Maps(**c.cotangents), len(c.splats) // 2
+    for render in [rendered(c)] + [c.true] * (name == "tiny"):  # the reference is slow
+        for chosen, absolute in ((None, False), (Maps(color=total.color), False), (total, False), (total, True)):
+            whole = render.backward(total, chosen, absolute)
+            part = render.backward(total, chosen, absolute, rows)
+            for key, value in vars(part).items():
+                wanted = getattr(whole, key)
+                assert (value is None) == (wanted is None) and (value is None or torch.equal(value, wanted[:rows])), key
+            none = render.backward(total, chosen, absolute, 0)
+            assert none.means.shape == (0, 3) and none.signal.shape == (0, 2)
+
+
+@each_case
 def test_absolute_signals_equal_the_reference(name, kind):
     c = case(name, kind)
     render, total = rendered(c), Maps(**c.cotangents)

@@ -79,10 +79,10 @@ class Recording:
         class Noted:
             maps, seen, radii = render.maps, render.seen, render.radii
 
-            def backward(self, total, chosen=None, absolute=False):
+            def backward(self, total, chosen=None, absolute=False, rows=None):
                 outer.backwards.append((total, chosen))
                 outer.absolute.append(absolute)
-                return render.backward(total, chosen, absolute)
+                return render.backward(total, chosen, absolute, rows)
 
         return Noted()
 

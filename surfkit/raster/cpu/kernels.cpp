@@ -489,8 +489,10 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
         const uint64_t blended = saved.blocks[k];
         fetch<K, -8>(tile, k);
         if (!blended) continue;
+        const bool fixed = tile.job.index[tile.job.entries[k].record] >= tile.job.rows;  // it only hides others
         float* const out = sums + (size_t)tile.job.entries[k].slot * width;
-        for (int i = 0; i < width; i += 16) __builtin_prefetch(out + i, 1);
+        if (!fixed)
+            for (int i = 0; i < width; i += 16) __builtin_prefetch(out + i, 1);
         const auto& s = record_of<K>(tile, k);
         const float sx = tile.ox - s.ax, sy = tile.oy - s.ay;
         const typename K::Local local(s, sx, sy);
@@ -517,6 +519,12 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
                 d = m_z - shift[b];
             }
             const Floats per_weight = total.per_weight(s, b, z, d, all[b], m1[b], m2[b]);
+            if (fixed) {
+                total.behind[b] = madd(w, per_weight, total.behind[b]);
+                if (chosen)
+                    part.behind[b] = madd(w, part.per_weight(s, b, z, d, all[b], m1[b], m2[b]), part.behind[b]);
+                continue;
+            }
             const Mask smooth = m & lesser(raw, kAlphaMax);
             const Floats da = keep(smooth, before * per_weight - total.behind[b] * ra);
             total.behind[b] = madd(w, per_weight, total.behind[b]);
@@ -539,6 +547,7 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
                 adder.add_chosen(at, signal, x, y, m, -(pa * raw), pz);
             }
         }
+        if (fixed) continue;
         const uint32_t slot = tile.job.entries[k].slot;
         float row[width];
         adder.finish(sx, sy, row);

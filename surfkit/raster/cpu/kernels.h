@@ -51,6 +51,8 @@ struct Job {
     const void* records;
     const Entry* entries;
     const int64_t* offsets;  // tiles + 1
+    const int64_t* index;    // the splat of each record
+    int64_t rows;            // splats from this one on get no gradient
 };
 
 enum Kind { kSurfel = 0, kGaussian = 1 };

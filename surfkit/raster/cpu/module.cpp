@@ -105,17 +105,17 @@ NB_MODULE(_native, m) {
         .def(
             "backward",
             [](Pass& self, std::vector<Array> splats, std::vector<Optional> total, std::vector<Optional> chosen,
-               bool absolute, std::vector<Array> out, Array signal, Optional chosen_signal, int threads) {
+               bool absolute, int64_t rows, std::vector<Array> out, Array signal, Optional chosen_signal, int threads) {
                 const auto s = arrays(splats);
                 const Planes t = planes(total), c = chosen.empty() ? Planes{} : planes(chosen);
                 const GradientArrays g{out.at(0).data(), out.at(1).data(), out.at(2).data(),   out.at(3).data(),
                                        out.at(4).data(), signal.data(),    data(chosen_signal)};
                 const bool part = !chosen.empty();
                 nb::gil_scoped_release free;
-                self.backward(s, t, part ? &c : nullptr, absolute, g, threads);
+                self.backward(s, t, part ? &c : nullptr, absolute, rows, g, threads);
             },
-            nb::arg("splats"), nb::arg("total"), nb::arg("chosen"), nb::arg("absolute"), nb::arg("out"),
-            nb::arg("signal"), nb::arg("chosen_signal").none(), nb::arg("threads"))
+            nb::arg("splats"), nb::arg("total"), nb::arg("chosen"), nb::arg("absolute"), nb::arg("rows"),
+            nb::arg("out"), nb::arg("signal"), nb::arg("chosen_signal").none(), nb::arg("threads"))
         .def("contribution",
              [](Pass& self, double alpha_power, double open_power, Array sum, Counts count, int threads) {
                  nb::gil_scoped_release free;

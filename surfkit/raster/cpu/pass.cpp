@@ -386,7 +386,8 @@ void Pass::bin(int threads) {
 }
 
 Job Pass::job() const {
-    return {camera_.width, camera_.height, tiles_x_, tiles_y_, records_.get(), entries_.get(), offsets_.data()};
+    return {camera_.width,  camera_.height,  tiles_x_,     tiles_y_, records_.get(),
+            entries_.get(), offsets_.data(), index_.get(), count_};
 }
 
 Saved Pass::saved() {
@@ -421,7 +422,7 @@ splat::GaussianSums<double> gaussian_sums(const double* s) {
 
 }  // namespace
 
-void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute,
+void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute, int64_t rows,
                     const GradientArrays& out, int threads) {
     // Only what has a cotangent costs time.
     const Planes part = chosen ? *chosen : Planes{};
@@ -440,7 +441,8 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     const Buffer<float> sums = buffer<float>(pairs_ * width);
     std::vector<uint8_t> touched(pairs(), 0);
     const Saved kept = saved();
-    const Job work = job();
+    Job work = job();
+    work.rows = rows;
     const Kernels& k = kernels();
     parallel((int64_t)tiles_x_ * tiles_y_, threads, [&](int64_t tile) {
         k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
