@@ -62,14 +62,15 @@ class PatchMatch(DepthEstimator):
     spread: float = 0.12
     """Difference of grey values, of 1, at which a pixel of a window counts 1 / e: windows end at edges."""
 
-    smoothness: float = 0.01
-    """Cost of a difference of one pixel of parallax between a plane and its neighbours; 1 is that of a wrong match."""
+    smoothness: float = 0.03
+    """Cost of a difference of one pixel of parallax between a plane and its neighbours, where the picture is even; 1 is
+    that of a wrong match."""
 
     passes: int = 3
-    """Passes over the pixels at each size."""
+    """Passes over the pixels at each size; the last one at full size compares depth maps."""
 
     consistency: float = 0.1
-    """Cost of one pixel of reprojection error in the depth maps of the photographs compared; 0 leaves that pass out."""
+    """Cost of one pixel of reprojection error in the depth maps of the photographs compared; 0 compares none."""
 
     coarsest: int = 160
     """Longest side of the pictures in which the planes begin, pixels."""
@@ -199,9 +200,11 @@ class Work:
 
     def match(self, at: int) -> Map | None:
         """By photometric consistency, from coarse to fine; None without neighbours or sparse points."""
-        settings, others = self.settings, self.pairs[at]
+        others = self.pairs[at]
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
-        begun = self.sweep.sweep(self.given, at, self.small(at), [self.small(other) for other in others])
+        begun = self.sweep.sweep(
+            self.given, at, self.small(at), [self.small(o) for o in others[: self.sweep.neighbours]]
+        )
         if span is None or begun is None:
             return None
         planes, parallax = Planes.at(begun[0].cpu().numpy(), len(others)), 0.0
@@ -209,10 +212,14 @@ class Work:
             here, there = self.grey(at, level), [self.grey(o, min(level, self.levels(o))) for o in others]
             planes = planes.resized(here.camera.height, here.camera.width)
             parallax = parallax_of(here, there, planes)
-            for index in range(settings.passes):
+            for index in range(self.passes(level)):
                 terms = self.terms(span, parallax, index)
                 improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
         return self.map(planes, parallax)
+
+    def passes(self, level: int) -> int:
+        """Of photometric consistency; at full size, the pass that compares depth maps stands in for the last one."""
+        return max(1, self.settings.passes - (level == 0 and self.settings.consistency > 0))
 
     def reconcile(self, at: int) -> Map | None:
         """One more pass, which looks at the depth maps of the others too."""
