@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from surfkit.densify.adc import ADC
+from surfkit.densify.filters import Elongation
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
@@ -9,6 +13,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.tsdf import TSDF
+from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.start.stereo import StereoStart
@@ -27,7 +32,17 @@ SURFACE = Recipe(
             "depth": DepthRegression(start=10.0, end=10.0),
             "prior": NormalPrior(start=0.05, end=0.05),
         },
-        densify=None,
+        # Stereo leaves holes, which few views see or which show no texture: points multiply there. Opacities are never
+        # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
+        densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
     ),
-    mesh=TSDF(least_views=0.25, trust=Agreement()),
+    mesh=TSDF(least_views=0.1, trust=Agreement(alone=0.1)),
+)
+
+SURFACE_BLOCKS = replace(
+    SURFACE,
+    about="The most accurate surface of a scene that one model cannot hold: blocks that are tuned apart, then merged",
+    partition=ContractedGrid(blocks=(2, 2)),
+    context="tuned",
+    tune=SURFACE.pretrain,
 )
