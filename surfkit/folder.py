@@ -231,7 +231,7 @@ def refuse_other(this: Run) -> None:
 
 def recipe_before(path: Path) -> Any:
     """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none."""
-    there = read_json(path, Any) if path.exists() else None
+    there = read_json(path, dict[str, Any]) if path.exists() else None
     try:
         return dump(load(Recipe, there)) if there is not None else None
     except BadInput:
@@ -331,7 +331,7 @@ def relay(out: Path, folder: Path, prefix: str) -> None:
 
 def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Put measurements into metrics.json beside those of other kinds that are there already, and return them all."""
-    metrics = (read_json(path, Any) if path.exists() else {}) | found
+    metrics = (read_json(path, dict[str, Any]) if path.exists() else {}) | found
     write_json(path, metrics)
     emit(FileWritten(path, "metrics"))
     return metrics

@@ -21,7 +21,7 @@ from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
-from surfkit.train.faults import in_one_line
+from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Evaluate:
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
-            with held(self.target), in_one_line(self.target):
+            with held(self.target), full_disk_in_one_line(self.target):
                 this, state, scene = load_run(self.target)
                 rasterizer, _ = drawer(self.device)
                 show(this, evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,6 +11,8 @@ from typing import BinaryIO
 
 UNFINISHED = (".*.part", ".tmp??????")
 """Names of files that are being written, by us and by safetensors."""
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Errors of a disk that has no room."""
 
 
 @contextmanager
