@@ -67,8 +67,9 @@ class Preparation:
         """What the estimator works from.
 
         Raises:
-            BadInput: The sparse model does not tell which photographs to compare.
+            BadInput: The sparse model does not tell which photographs to compare, or the settings do not fit them.
         """
+        self.estimator.refuse_unfit(self.views(scene))
         tracks = observations(self.data, scene)
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(

@@ -25,6 +25,8 @@ OFF, FAR_OFF = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
 RESIZED = 0.02
 """Change of size by ICP above which it is told."""
+MOST_DRAWS = 1000
+"""Repetitions: the error bars are known long before."""
 
 Align = Literal["similarity", "rigid", "none"]
 WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
@@ -82,8 +84,8 @@ class Comparison:
                 raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0")
         if self.seed < 0:
             raise BadInput(f"--seed {self.seed}: give 0 or more")
-        if self.draws < 1:
-            raise BadInput(f"--draws {self.draws}: give 1 or more")
+        if not 1 <= self.draws <= MOST_DRAWS:
+            raise BadInput(f"--draws {self.draws}: give 1 to {MOST_DRAWS}")
         if self.samples is not None and self.samples < LEAST:
             raise BadInput(f"--samples {self.samples}: give {LEAST} or more points")
         if not 0 < self.visible <= 1:
