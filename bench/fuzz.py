@@ -5,8 +5,9 @@
 Every case copies a small data set or run folder, damages one to three places in it (`damage.py`), and gives a command
 to `surfkit.cli.main` in this process. Whatever is damaged, the command must end within seconds with an exit status of
 its own and at most one line of complaint: no exception, no warning of a library, no write outside the run folder, no
-allocation after a number in a header. The cases run in processes of their own, so that a crash and an endless loop are
-found too. Exits 1 if anything was found.
+allocation after a number in a header. Settings, the output and the memory of a command are damaged likewise: numbers
+that make no sense, a reader that has ended, memory that gives out. The cases run in processes of their own, so that a
+crash and an endless loop are found too. Exits 1 if anything was found.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from damage import Damage, apply, damages
+from damage import NUMBERS, OUTPUTS, Damage, apply, damages
 
 SECONDS = 20
 """Within which a command must end."""
@@ -42,6 +43,12 @@ CHUNK = 100
 """Cases in one process."""
 WRITES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
 FLAGS = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+WRITTEN = ("out", "data/undistorted", "data/estimated_depths")
+"""Where commands may write, below the folder of a case."""
+OUTPUT, MEMORY = "the output", "the memory"
+"""What is damaged beside files, and settings, which begin with --."""
+TIGHT = 300 << 20
+"""Bytes of address space that a command may add at most where memory is damaged."""
 SMALL = "--device cpu --pictures-every 1 --primitive.sh-degree 1 --cache 1MB"
 TRAIN = f"train recipe:2dgs --steps 2 {SMALL} --data {{here}}/data --out {{here}}/out"
 DEEP = f"train recipe:citygs2-coarse --steps 2 {SMALL} --data {{here}}/data --out {{here}}/out"
@@ -55,11 +62,13 @@ class Target:
         make: Fills the folder of the case.
         words: Command lines, taken in turns.
         files: Patterns of what is damaged, below the folder.
+        others: What else is: settings, the output, the memory.
     """
 
     make: Callable[[Path], None]
     words: tuple[str, ...]
     files: tuple[str, ...]
+    others: tuple[str, ...] = ()
 
 
 def truth() -> Any:
@@ -236,6 +245,17 @@ def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     assert status == (130 if stop else 0), status
 
 
+def compared(here: Path) -> None:
+    """A finished run, and what its mesh is compared with and in."""
+    from surfkit.evaluate.transform import write_transform
+    from surfkit.scene.crop import box, write_crop
+
+    run_folder(here)
+    shutil.copy(here / "out" / "mesh.ply", here / "truth.ply")
+    write_crop(here / "crop.json", box((-50.0, -50.0, -50.0, 50.0, 50.0, 50.0)))
+    write_transform(here / "frame.json", np.eye(4))
+
+
 def recipe_file(here: Path) -> None:
     from surfkit.cli.recipes import recipes
     from surfkit.core.codec import write_json
@@ -248,6 +268,19 @@ def recipe_file(here: Path) -> None:
 MODEL = ("data/sparse/0/*",)
 BLOCKS = f"{TRAIN} partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 COMMANDS = ("status {here}/out --json", "export {here}/out", "evaluate {here}/out --device cpu", TRAIN)
+GT = "evaluate {here}/out --gt {here}/truth.ply --tau 0.5 --draws 1"
+CROPPED = f"{GT} --crop {{here}}/crop.json --transform {{here}}/frame.json"
+PREPARE = "prepare depth {here}/data --device cpu --estimator.window 3 --estimator.max-planes 16"
+TETRA = "mesh {here}/out mesh:tetra --device cpu"
+READING = ("--longest", "--scale", "--test-every", "--metres-per-unit")
+SWEEP = tuple(
+    f"--estimator.{name}"
+    for name in (
+        "longest", "neighbours", "angle", "visible", "step-px", "max-planes", "margin", "window", "step-cost",
+        "jump-cost", "tolerance", "edge", "agree",
+    )
+)  # fmt: skip
+DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
 TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
@@ -267,6 +300,49 @@ TARGETS = {
         lambda here: run_folder(here, BLOCKS, "block 1"),
         (BLOCKS, COMMANDS[0], "tune {here}/out 1 --device cpu --cache 1MB"),
         ("out/blocks/*.json", "out/blocks/*.json", "out/blocks/0*/*", "out/blocks/0*/tune/*"),
+    ),
+    "comparison": Target(
+        compared,
+        (CROPPED, CROPPED, "mesh {here}/out --device cpu --crop {here}/crop.json"),
+        ("crop.json", "crop.json", "frame.json", "truth.ply", "out/m*.json", "out/mesh.ply"),
+    ),
+    "outputs": Target(
+        run_folder,
+        ("recipes", "components --markdown", "status {here}/out", "doctor {here}/data --probe 0", *COMMANDS[1:]),
+        (),
+        (OUTPUT,),
+    ),
+    "memory": Target(compared, (f"{GT} --crop none", PREPARE, TETRA), (), (MEMORY,)),
+    "numbers-evaluate": Target(
+        compared,
+        (f"{GT} --crop none", GT),
+        (),
+        tuple(f"--{name}" for name in ("samples tau voxel visible radius far seed".split())),
+    ),
+    "numbers-prepare": Target(colmap, (PREPARE,), (), (*SWEEP, *READING)),
+    "numbers-mesh": Target(
+        run_folder,
+        ("mesh {here}/out --device cpu",),
+        (),
+        (*DELIVERY, *(f"--mesh.{name}" for name in ("voxel", "truncation", "depth-limit", "least-views"))),
+    ),
+    "numbers-tetra": Target(
+        run_folder,
+        (TETRA,),
+        (),
+        (
+            *DELIVERY,
+            *(f"--mesh.{name}" for name in "reach thickness faint level bisections agree min-views longest".split()),
+        ),
+    ),
+    "numbers-train": Target(
+        colmap,
+        (TRAIN,),
+        (),
+        (*READING, "--steps", "--pretrain.steps", "--seed", "--checkpoint-every", "--pictures-every", "--cache"),
+    ),
+    "numbers-doctor": Target(
+        colmap, ("doctor {here}/data --device cpu",), (), ("--steps", "--points", "--probe", "--cache", *READING)
     ),
 }
 """By name."""
@@ -289,7 +365,7 @@ class Watch:
         for name in args[:2] if event in ("os.rename", "os.link", "os.symlink") else args[:1]:
             if isinstance(name, (str, bytes, os.PathLike)):
                 path = os.path.realpath(os.fsdecode(name))
-                if not path.startswith(self.allowed) and "__pycache__" not in path and path != os.devnull:
+                if not path.startswith(self.allowed) and "__pycache__" not in path and not path.startswith("/dev/"):
                     self.found.append(f"{event} {path}")
 
 
@@ -316,7 +392,7 @@ class Fuzz:
         self.target.make(self.here)  # in its place: a run folder knows where its data are
         shutil.move(self.here, self.whole)
         found = [path for pattern in self.target.files for path in sorted(self.whole.glob(pattern)) if path.is_file()]
-        self.files = [path.relative_to(self.whole).as_posix() for path in found]
+        self.files = [*(path.relative_to(self.whole).as_posix() for path in found), *self.target.others]
         self.turn = 0
         self.commands: dict[tuple[str, ...], Any] = {}
 
@@ -328,19 +404,29 @@ class Fuzz:
         shutil.copytree(self.whole, self.here)
         for damage in given:
             apply(damage, self.here)
-        what, said = self.judged(words.format(here=self.here).split())
+            if damage.file.startswith("--"):
+                words += f" {damage.file} {NUMBERS[damage.what % len(NUMBERS)]}"
+        others = {damage.file: damage for damage in given if damage.file in (OUTPUT, MEMORY)}
+        what, said = self.judged(words.format(here=self.here).split(), others)
         return None if what is None else Finding(what, self.name, words, [asdict(d) for d in given], said[-1500:])
 
-    def judged(self, words: list[str]) -> tuple[str | None, str]:
-        """What is wrong with how a command ends, if anything is, and what it said."""
+    def judged(self, words: list[str], others: dict[str, Damage]) -> tuple[str | None, str]:
+        """What is wrong with how a command ends, if anything is, and what it said; `others` are damages of no file."""
         from surfkit.cli import main, parse
 
         before, held, out = self.state(), peak(), io.StringIO()
         self.watch.found.clear()
-        self.watch.allowed = (f"{self.here}/out", f"{self.here}/data/undistorted")
+        self.watch.allowed = tuple(f"{self.here}/{place}" for place in WRITTEN)
+        growth = int(others[MEMORY].at * TIGHT) if MEMORY in others else GROWTH
         start = time.monotonic()
         try:
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), limited(), self.remembered(parse):
+            with (
+                damaged_output(others.get(OUTPUT), out) as to,
+                contextlib.redirect_stdout(to),
+                contextlib.redirect_stderr(out),
+                limited(growth),
+                self.remembered(parse),
+            ):
                 status = main(words)
         except BaseException as error:
             where = [f for f in traceback.extract_tb(error.__traceback__) if "/surfkit/" in f.filename][-1]
@@ -348,7 +434,12 @@ class Fuzz:
             return f"{type(error).__name__} in {place}", out.getvalue() + traceback.format_exc()
         finally:
             self.watch.allowed = None
-        return self.complaint(status, out.getvalue(), time.monotonic() - start, peak() - held, before), out.getvalue()
+        said, seconds = out.getvalue(), time.monotonic() - start
+        if status == 141 and OUTPUT in others:
+            status = 0
+        if status == 1 and MEMORY in others:
+            said = said.replace("out of memory with", "")
+        return self.complaint(status, said, seconds, peak() - held, before), out.getvalue()
 
     @contextlib.contextmanager
     def remembered(self, module: Any) -> Iterator[None]:
@@ -388,7 +479,7 @@ class Fuzz:
         found = {}
         for path in self.here.rglob("*"):
             name = path.relative_to(self.here).as_posix()
-            if not name.startswith(("out", "data/undistorted")) and path.is_file():
+            if not name.startswith(WRITTEN) and path.is_file():
                 found[name] = (path.stat().st_size, path.stat().st_mtime_ns)
         return found
 
@@ -401,7 +492,27 @@ def peak() -> int:
 
 
 @contextlib.contextmanager
-def limited() -> Iterator[None]:
+def damaged_output(damage: Damage | None, sound: io.StringIO) -> Iterator[Any]:
+    """What stands for stdout: a file that takes nothing, or nothing at all."""
+    kind = None if damage is None else OUTPUTS[damage.what % len(OUTPUTS)]
+    if kind in (None, "closed"):
+        yield sound if kind is None else None
+        return
+    if kind == "full":
+        file = open("/dev/full", "w")
+    else:
+        reader, writer = os.pipe()
+        os.close(reader)
+        file = open(writer, "w")
+    try:
+        yield file
+    finally:
+        with contextlib.suppress(OSError):
+            file.close()
+
+
+@contextlib.contextmanager
+def limited(growth: int = GROWTH) -> Iterator[None]:
     """Within, time and address space are bounded."""
 
     def late(number: int, frame: object) -> None:
@@ -411,7 +522,7 @@ def limited() -> Iterator[None]:
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     handler = signal.signal(signal.SIGALRM, late)
     signal.alarm(SECONDS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + GROWTH, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + growth, hard))
     try:
         yield
     finally:
