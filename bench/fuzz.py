@@ -364,7 +364,9 @@ class Watch:
             return
         for name in args[:2] if event in ("os.rename", "os.link", "os.symlink") else args[:1]:
             if isinstance(name, (str, bytes, os.PathLike)):
-                path = os.path.realpath(os.fsdecode(name))
+                below = args[-1] if event in ("os.remove", "os.rmdir") and args[-1] >= 0 else None  # an open folder
+                base = "" if below is None else os.readlink(f"/proc/self/fd/{below}")
+                path = os.path.realpath(os.path.join(base, os.fsdecode(name)))
                 if not path.startswith(self.allowed) and "__pycache__" not in path and not path.startswith("/dev/"):
                     self.found.append(f"{event} {path}")
 
