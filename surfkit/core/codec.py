@@ -104,7 +104,7 @@ def from_json(text: str) -> Any:
     except ValueError as error:  # BadInput, a number of thousands of digits
         raise BadInput(f"not JSON: {error}") from error
     inner = [data]
-    for _ in range(MOST_NESTED + 1):
+    for _ in range(MOST_NESTED):
         inner = [item for one in inner for item in _items(one) if isinstance(item, (dict, list))]
         if not inner:
             return data
