@@ -137,6 +137,7 @@ def test_links_to_themselves_and_folders_are_one_line(made, capsys, tmp_path):
         ("prepare depth {m}/data --estimator.max-planes 1000000000", "max_planes is .* between 3 and 10000"),
         ("prepare depth {m}/data --estimator.margin nan", "margin is nan"),
         ("mesh {m}/run mesh:tetra --mesh.bisections 1000000", "give 0 to 52"),
+        ("mesh {m}/run --memory 99999999999999999999999TB", "--memory .* at most 1000TB"),
         ("train recipe:2dgs --data {m}/data --steps 1000000000000000", "--steps 1000000000000000: give 1 to 100000000"),
         ("train recipe:2dgs --data {m}/data --pretrain.steps 1000000000000000", "a stage has .* give 1 to 100000000"),
         ("train recipe:2dgs --data {m}/data --pretrain.densify.threshold nan", "pretrain.densify.threshold is nan"),
