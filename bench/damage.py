@@ -31,6 +31,13 @@ VALUES = (
 )  # fmt: skip
 DEEP = "[" * 100_000 + "]" * 100_000
 DIGITS = "9" * 5000
+NUMBERS = (
+    "0", "-1", "1", "3", "4", "999", "1e-30", "-1e-30", "1e30", "1e300", "nan", "inf", "-inf", "0.5",
+    "1000000000000000", "100000000000000000000000000000", "1e-320", "2147483648", "-9223372036854775809",
+)  # fmt: skip
+"""Values of settings."""
+OUTPUTS = ("closed", "broken", "full")
+"""What stdout is: closed before the process began, a pipe whose reader has ended, a disk without room."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def damages(files: Sequence[str]) -> st.SearchStrategy[list[Damage]]:
 
 
 def apply(damage: Damage, folder: Path) -> None:
-    """Do it, as far as the file still is one."""
+    """Do it, as far as the file still is one; what is done to the output or to the words, the command sees to."""
     path = folder / damage.file
     if not path.is_file():
         return
@@ -168,6 +175,30 @@ def tree(path: Path, damage: Damage) -> None:
     path.write_text(text)
 
 
+def shape(path: Path, damage: Damage) -> None:
+    """JSON of another shape in the place of the whole."""
+    path.write_text(DEEP if damage.what % 8 == 7 else json.dumps(VALUES[damage.what // 8 % len(VALUES)]))
+
+
+def event(path: Path, damage: Damage) -> None:
+    """A line of JSON with one of its nodes changed."""
+    text = path.read_text(errors="replace").splitlines()
+    if not text:
+        return
+    line = int(damage.at * (len(text) - 1))
+    try:
+        text[line] = json.dumps(node(json.loads(text[line]), damage))
+    except (ValueError, RecursionError):
+        return
+    path.write_text("\n".join(text) + "\n")
+
+
+def looped(path: Path, damage: Damage) -> None:
+    """A link to itself."""
+    path.unlink()
+    path.symlink_to(path.name)
+
+
 def size(path: Path, damage: Damage) -> None:
     """A PNG that claims to be of another size."""
     content = bytearray(path.read_bytes())
@@ -242,6 +273,7 @@ def resealed(path: Path, damage: Damage) -> None:
 ANY = (
     gone,
     folder,
+    looped,
     swapped,
     changed(lambda content, at, damage: content[:at]),
     changed(lambda content, at, damage: b""),
@@ -262,8 +294,8 @@ TEXT = (
 BY_ENDING = {
     ".txt": TEXT,
     ".ply": TEXT,
-    ".jsonl": TEXT,
-    ".json": (*[tree] * 12, lines(token)),
+    ".jsonl": (*TEXT, *[event] * 6),
+    ".json": (*[tree] * 12, *[shape] * 3, lines(token)),
     ".png": (size, size, size),
     ".npy": (*[array_header] * 6,),
     ".safetensors": (*[resealed] * 12,),

@@ -5,14 +5,16 @@
 Every case copies a small data set or run folder, damages one to three places in it (`damage.py`), and gives a command
 to `surfkit.cli.main` in this process. Whatever is damaged, the command must end within seconds with an exit status of
 its own and at most one line of complaint: no exception, no warning of a library, no write outside the run folder, no
-allocation after a number in a header. The cases run in processes of their own, so that a crash and an endless loop are
-found too. Exits 1 if anything was found.
+allocation after a number in a header. Settings, the output and the memory of a command are damaged likewise: numbers
+that make no sense, a reader that has ended, memory that gives out. The cases run in processes of their own, so that a
+crash and an endless loop are found too. Exits 1 if anything was found.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import inspect
 import io
 import json
 import math
@@ -30,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from damage import Damage, apply, damages
+from damage import NUMBERS, OUTPUTS, Damage, apply, damages
 
 SECONDS = 20
 """Within which a command must end."""
@@ -42,6 +44,14 @@ CHUNK = 100
 """Cases in one process."""
 WRITES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "os.chmod"}
 FLAGS = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+WRITTEN = ("out", "data/undistorted", "data/estimated_depths")
+"""Where commands may write, below the folder of a case."""
+OUTPUT, MEMORY = "the output", "the memory"
+"""What is damaged beside files, and settings, which begin with --."""
+MOST_CALLS = 100_000
+"""Calls of functions of surfkit that a command makes at most before memory gives out, where it is damaged."""
+GUARD = tuple(str(Path(__file__).parents[1] / "surfkit" / "cli" / name) for name in ("__init__.py", "streams.py"))
+"""Where errors become lines: memory does not give out in there."""
 SMALL = "--device cpu --pictures-every 1 --primitive.sh-degree 1 --cache 1MB"
 TRAIN = f"train recipe:2dgs --steps 2 {SMALL} --data {{here}}/data --out {{here}}/out"
 DEEP = f"train recipe:citygs2-coarse --steps 2 {SMALL} --data {{here}}/data --out {{here}}/out"
@@ -55,11 +65,13 @@ class Target:
         make: Fills the folder of the case.
         words: Command lines, taken in turns.
         files: Patterns of what is damaged, below the folder.
+        others: What else is: settings, the output, the memory.
     """
 
     make: Callable[[Path], None]
     words: tuple[str, ...]
     files: tuple[str, ...]
+    others: tuple[str, ...] = ()
 
 
 def truth() -> Any:
@@ -236,6 +248,17 @@ def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     assert status == (130 if stop else 0), status
 
 
+def compared(here: Path) -> None:
+    """A finished run, and what its mesh is compared with and in."""
+    from surfkit.evaluate.transform import write_transform
+    from surfkit.scene.crop import box, write_crop
+
+    run_folder(here)
+    shutil.copy(here / "out" / "mesh.ply", here / "truth.ply")
+    write_crop(here / "crop.json", box((-50.0, -50.0, -50.0, 50.0, 50.0, 50.0)))
+    write_transform(here / "frame.json", np.eye(4))
+
+
 def recipe_file(here: Path) -> None:
     from surfkit.cli.recipes import recipes
     from surfkit.core.codec import write_json
@@ -248,6 +271,19 @@ def recipe_file(here: Path) -> None:
 MODEL = ("data/sparse/0/*",)
 BLOCKS = f"{TRAIN} partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 COMMANDS = ("status {here}/out --json", "export {here}/out", "evaluate {here}/out --device cpu", TRAIN)
+GT = "evaluate {here}/out --gt {here}/truth.ply --tau 0.5 --draws 1"
+CROPPED = f"{GT} --crop {{here}}/crop.json --transform {{here}}/frame.json"
+PREPARE = "prepare depth {here}/data --device cpu --estimator.window 3 --estimator.max-planes 16"
+TETRA = "mesh {here}/out mesh:tetra --device cpu"
+READING = ("--longest", "--scale", "--test-every", "--metres-per-unit")
+SWEEP = tuple(
+    f"--estimator.{name}"
+    for name in (
+        "longest", "neighbours", "angle", "visible", "step-px", "max-planes", "margin", "window", "step-cost",
+        "jump-cost", "tolerance", "edge", "agree",
+    )
+)  # fmt: skip
+DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
 TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
@@ -267,6 +303,51 @@ TARGETS = {
         lambda here: run_folder(here, BLOCKS, "block 1"),
         (BLOCKS, COMMANDS[0], "tune {here}/out 1 --device cpu --cache 1MB"),
         ("out/blocks/*.json", "out/blocks/*.json", "out/blocks/0*/*", "out/blocks/0*/tune/*"),
+    ),
+    "comparison": Target(
+        compared,
+        (CROPPED, CROPPED, "mesh {here}/out --device cpu --crop {here}/crop.json"),
+        ("crop.json", "crop.json", "frame.json", "truth.ply", "out/m*.json", "out/mesh.ply"),
+    ),
+    "outputs": Target(
+        run_folder,
+        ("recipes", "components --markdown", "status {here}/out", "doctor {here}/data --probe 0", *COMMANDS[1:]),
+        (),
+        (OUTPUT,),
+    ),
+    "memory": Target(
+        compared, (f"{GT} --crop none", PREPARE, TETRA, *COMMANDS, "doctor {here}/data --probe 0"), (), (MEMORY,)
+    ),
+    "numbers-evaluate": Target(
+        compared,
+        (f"{GT} --crop none", GT),
+        (),
+        tuple(f"--{name}" for name in ("samples tau voxel visible radius far seed".split())),
+    ),
+    "numbers-prepare": Target(colmap, (PREPARE,), (), (*SWEEP, *READING)),
+    "numbers-mesh": Target(
+        run_folder,
+        ("mesh {here}/out --device cpu",),
+        (),
+        (*DELIVERY, *(f"--mesh.{name}" for name in ("voxel", "truncation", "depth-limit", "least-views"))),
+    ),
+    "numbers-tetra": Target(
+        run_folder,
+        (TETRA,),
+        (),
+        (
+            *DELIVERY,
+            *(f"--mesh.{name}" for name in "reach thickness faint level bisections agree min-views longest".split()),
+        ),
+    ),
+    "numbers-train": Target(
+        colmap,
+        (TRAIN,),
+        (),
+        (*READING, "--steps", "--pretrain.steps", "--seed", "--checkpoint-every", "--pictures-every", "--cache"),
+    ),
+    "numbers-doctor": Target(
+        colmap, ("doctor {here}/data --probe 0",), (), ("--steps", "--points", "--cache", *READING)
     ),
 }
 """By name."""
@@ -288,8 +369,10 @@ class Watch:
             return
         for name in args[:2] if event in ("os.rename", "os.link", "os.symlink") else args[:1]:
             if isinstance(name, (str, bytes, os.PathLike)):
-                path = os.path.realpath(os.fsdecode(name))
-                if not path.startswith(self.allowed) and "__pycache__" not in path and path != os.devnull:
+                below = args[-1] if event in ("os.remove", "os.rmdir") and args[-1] >= 0 else None  # an open folder
+                base = "" if below is None else os.readlink(f"/proc/self/fd/{below}")
+                path = os.path.realpath(os.path.join(base, os.fsdecode(name)))
+                if not path.startswith(self.allowed) and "__pycache__" not in path and not path.startswith("/dev/"):
                     self.found.append(f"{event} {path}")
 
 
@@ -316,7 +399,7 @@ class Fuzz:
         self.target.make(self.here)  # in its place: a run folder knows where its data are
         shutil.move(self.here, self.whole)
         found = [path for pattern in self.target.files for path in sorted(self.whole.glob(pattern)) if path.is_file()]
-        self.files = [path.relative_to(self.whole).as_posix() for path in found]
+        self.files = [*(path.relative_to(self.whole).as_posix() for path in found), *self.target.others]
         self.turn = 0
         self.commands: dict[tuple[str, ...], Any] = {}
 
@@ -328,20 +411,33 @@ class Fuzz:
         shutil.copytree(self.whole, self.here)
         for damage in given:
             apply(damage, self.here)
-        what, said = self.judged(words.format(here=self.here).split())
+            if damage.file.startswith("--"):
+                words += f" {damage.file} {NUMBERS[damage.what % len(NUMBERS)]}"
+        others = {damage.file: damage for damage in given if damage.file in (OUTPUT, MEMORY)}
+        what, said = self.judged(words.format(here=self.here).split(), others)
         return None if what is None else Finding(what, self.name, words, [asdict(d) for d in given], said[-1500:])
 
-    def judged(self, words: list[str]) -> tuple[str | None, str]:
-        """What is wrong with how a command ends, if anything is, and what it said."""
+    def judged(self, words: list[str], others: dict[str, Damage]) -> tuple[str | None, str]:
+        """What is wrong with how a command ends, if anything is, and what it said; `others` are damages of no file."""
         import surfkit
         from surfkit.cli import main, parse
 
         before, held, out = self.state(), peak(), io.StringIO()
         self.watch.found.clear()
-        self.watch.allowed = (f"{self.here}/out", f"{self.here}/data/undistorted")
+        self.watch.allowed = (
+            *(f"{self.here}/{place}" for place in WRITTEN),
+            f"{tempfile.gettempdir()}/surfkit-doctor-",
+        )
         start = time.monotonic()
         try:
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out), limited(), self.remembered(parse):
+            with (
+                damaged_output(others.get(OUTPUT), out) as to,
+                contextlib.redirect_stdout(to),
+                contextlib.redirect_stderr(out),
+                limited(),
+                self.remembered(parse),
+                giving_out(others.get(MEMORY)),
+            ):
                 status = main(words)
         except BaseException as error:
             ours = f"{Path(surfkit.__file__).parent}{os.sep}"  # not every folder of this name: a clone may have it
@@ -350,7 +446,12 @@ class Fuzz:
             return f"{type(error).__name__} in {place}", out.getvalue() + traceback.format_exc()
         finally:
             self.watch.allowed = None
-        return self.complaint(status, out.getvalue(), time.monotonic() - start, peak() - held, before), out.getvalue()
+        said, seconds = out.getvalue(), time.monotonic() - start
+        if status == 141 and OUTPUT in others:
+            status = 0
+        if MEMORY in others:
+            said = said.replace("out of memory", "")
+        return self.complaint(status, said, seconds, peak() - held, before), out.getvalue()
 
     @contextlib.contextmanager
     def remembered(self, module: Any) -> Iterator[None]:
@@ -374,7 +475,8 @@ class Fuzz:
         lines = said.strip().splitlines()
         if status not in (0, 1, 2, 3):
             return f"exit status {status}"
-        if status in (1, 2) and not (lines and lines[-1].startswith("surfkit: ")):
+        own = lines and (lines[-1].startswith("surfkit: ") or any(line.startswith("error: ") for line in lines))
+        if status in (1, 2) and not own:
             return f"exit status {status} without a line of its own at the end"
         for word in ("Traceback", "Warning:", "bad_alloc", "out of memory", "gets no more events"):
             if line := next((line for line in lines if word in line), None):
@@ -390,7 +492,7 @@ class Fuzz:
         found = {}
         for path in self.here.rglob("*"):
             name = path.relative_to(self.here).as_posix()
-            if not name.startswith(("out", "data/undistorted")) and path.is_file():
+            if not name.startswith(WRITTEN) and path.is_file():
                 found[name] = (path.stat().st_size, path.stat().st_mtime_ns)
         return found
 
@@ -400,6 +502,52 @@ def peak() -> int:
     from surfkit.core.memory import peak_memory_bytes
 
     return peak_memory_bytes()
+
+
+@contextlib.contextmanager
+def damaged_output(damage: Damage | None, sound: io.StringIO) -> Iterator[Any]:
+    """What stands for stdout: a file that takes nothing, or nothing at all."""
+    kind = None if damage is None else OUTPUTS[damage.what % len(OUTPUTS)]
+    if kind in (None, "closed"):
+        yield sound if kind is None else None
+        return
+    if kind == "full":
+        file = open("/dev/full", "w")
+    else:
+        reader, writer = os.pipe()
+        os.close(reader)
+        file = open(writer, "w")
+    try:
+        yield file
+    finally:
+        with contextlib.suppress(OSError):
+            file.close()
+
+
+@contextlib.contextmanager
+def giving_out(damage: Damage | None) -> Iterator[None]:
+    """Within, one of the calls of surfkit's functions fails for want of memory, as Python, numpy and torch say it."""
+    if damage is None:
+        yield
+        return
+    errors = (MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"))
+    left = int(MOST_CALLS**damage.at)
+
+    def called(frame: Any, event: str, argument: object) -> None:
+        nonlocal left
+        code = frame.f_code
+        ours = "/surfkit/" in code.co_filename and not code.co_filename.startswith(GUARD)
+        if ours and not code.co_flags & inspect.CO_GENERATOR:  # which are also called to be closed
+            left -= 1
+            if left == 0:
+                sys.settrace(None)
+                raise errors[damage.what % 2]
+
+    sys.settrace(called)
+    try:
+        yield
+    finally:
+        sys.settrace(None)
 
 
 @contextlib.contextmanager
@@ -484,9 +632,9 @@ def chunk(name: str, cases: int, seed: int) -> tuple[int, list[Finding]]:
         raise SystemExit(broken[0])
     found = [Finding(**row["found"]) for row in rows if "found" in row]
     made = [row["case"] for row in rows if "case" in row]
-    if "done" not in rows[-1]:
+    if not rows or "done" not in rows[-1]:
         what = "an endless loop" if status == -signal.SIGKILL else f"the process ended with {status}"
-        found.append(Finding(what, name, "", made[-1], ""))
+        found.append(Finding(what, name, "", made[-1] if made else [], ""))
     return len(made), found
 
 

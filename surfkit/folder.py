@@ -242,8 +242,8 @@ def recipe_before(path: Path, now: Recipe) -> Any:
 
     Runs of before made no depth maps: they go on as they began, however the recipe makes them `now`.
     """
-    there = read_json(path, Any) if path.exists() else None
-    if isinstance(there, dict):
+    there = read_json(path, dict[str, Any]) if path.exists() else None
+    if there is not None:
         there = {"depth": dump(now.depth)} | there
     try:
         return dump(load(Recipe, there)) if there is not None else None
@@ -355,7 +355,7 @@ def relay(out: Path, folder: Path, prefix: str) -> None:
 
 def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Put measurements into metrics.json beside those of other kinds that are there already, and return them all."""
-    metrics = (read_json(path, Any) if path.exists() else {}) | found
+    metrics = (read_json(path, dict[str, Any]) if path.exists() else {}) | found
     write_json(path, metrics)
     emit(FileWritten(path, "metrics"))
     return metrics

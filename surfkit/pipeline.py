@@ -56,7 +56,7 @@ from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
-from surfkit.train.stage import StageState
+from surfkit.train.stage import MOST_STEPS, StageState
 from surfkit.tuning import Site
 
 AHEAD = 8
@@ -65,8 +65,8 @@ AHEAD = 8
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
     """The recipe as a run of `steps` steps, every schedule scaled along."""
-    if steps < 1:
-        raise BadInput(f"--steps {steps}: give 1 or more")
+    if not 1 <= steps <= MOST_STEPS:
+        raise BadInput(f"--steps {steps}: give 1 to {MOST_STEPS}")
     return rescale(recipe, steps / recipe.pretrain.steps)
 
 

@@ -69,7 +69,7 @@ def made_for(this: Run, scene: Scene, prints: Fingerprint, store: Store, device:
     preparation = Preparation(this.data, this.recipe.depth, torch_device(device))
     tracks = observations(this.data, scene)
     try:
-        preparation.refuse_unseen(tracks)
+        preparation.refuse_unfit(scene, tracks)
     except BadInput as error:
         emit(Warned(f"depth maps cannot be made: {error}"))
         yield None

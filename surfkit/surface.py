@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, read_json, write_json
+from surfkit.core.codec import dump, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.evaluate.pictures import write_picture
 from surfkit.folder import Run
@@ -203,6 +203,7 @@ def meshed(this: Run, steps: int) -> bool:
         return True
     if not this.mesh_record.exists():
         return False
-    record = read_json(this.mesh_record, Any)
+    remedy = "delete it, and the mesh is made anew"
+    record = read_keys(this.mesh_record, {"files": tuple[str, ...], "steps": int}, remedy)
     there = all((this.out / name).exists() for name in record["files"])
     return there and record["steps"] == steps

@@ -14,7 +14,8 @@ BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (
     "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
-    "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run", "blocks",
+    "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run", "blocks", "comparison", "outputs",
+    "memory", "numbers-evaluate", "numbers-prepare", "numbers-mesh", "numbers-tetra", "numbers-train", "numbers-doctor",
 )  # fmt: skip
 
 

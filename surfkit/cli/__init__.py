@@ -11,11 +11,14 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
-import select
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
+from surfkit.cli.streams import READER_LEFT, open_closed, silence_lost
 from surfkit.core.check import BadInput, Fault
+from surfkit.core.files import DISK_FULL
+from surfkit.core.memory import is_out_of_memory, out_of_memory
 
 COMMANDS = {
     "train": "Reconstruct a surface from photographs with known cameras.",
@@ -33,13 +36,21 @@ COMMANDS = {
     "plugins": "List the plugins: where each comes from, what it offers, why it failed.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
+LIGHTER = {
+    "train": "smaller photographs (--longest, --scale) or fewer points need less",
+    "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
+    "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
+    "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
+    "prepare": "a lower --estimator.longest or smaller photographs (--longest, --scale) need less",
+}
+"""What a user can lower when memory gives out in a command."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
     2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, 3
-    for one with blocks that failed, and 130 for one that was interrupted.
+    for one with blocks that failed, 130 for one that was interrupted, and 141 for output that nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -47,14 +58,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     # Idle threads of torch would otherwise spin, and burn as much processor time as the work itself.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    open_closed()
     try:
         status = _guarded(words)
         sys.stdout.flush()
         return status
-    except BrokenPipeError:
-        if _reader_left():
-            return 141  # what a shell reports for a program that SIGPIPE ends
-        raise
+    except OSError as error:
+        lost = silence_lost()
+        if lost and isinstance(error, BrokenPipeError):
+            return READER_LEFT
+        if not lost and error.errno not in DISK_FULL:
+            raise
+        where = f"standard {lost[0]}" if lost else "what was being written"
+        with suppress(OSError):
+            print(f"surfkit: {where}: {error.strerror}; what is finished is kept", file=sys.stderr)
+        return 1
 
 
 def overview() -> str:
@@ -79,23 +97,42 @@ def _guarded(words: list[str]) -> int:
     """The exit status of a command line, with one line on stderr for what is not a mistake of ours."""
     try:
         return _dispatch(words)
-    except (BadInput, Fault) as error:
-        print(f"surfkit: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else error.status
-    except BrokenPipeError:
-        raise
-    except OSError as error:  # no permission, a folder in the place of a file, a disk that is gone
-        if error.filename is None:
-            raise
-        print(f"surfkit: {os.fsdecode(error.filename)}: {error.strerror}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("surfkit: interrupted", file=sys.stderr)
         return 130
     except SystemExit as stop:  # --help, and rich when nobody reads its output any more
         if isinstance(stop.code, str):
             raise
+        if stop.code == 1:
+            silence_lost()
+            return READER_LEFT
         return stop.code or 0
+    except Exception as error:
+        if (told := _told(error, words)) is None:
+            raise
+        text, status = told
+        print(f"surfkit: {text}", file=sys.stderr)
+        return status
+
+
+def _told(error: Exception, words: list[str]) -> tuple[str, int] | None:
+    """One line for what a user can put right, and the exit status; None for what is a mistake of ours."""
+    if isinstance(error, (BadInput, Fault)):
+        return " ".join(str(error).split()), 2 if isinstance(error, BadInput) else error.status
+    if is_out_of_memory(error):
+        text = f"{' '.join(words[:1])}: {out_of_memory(error)}"
+        _release(error)
+        return f"{text}; {LIGHTER.get(words[0], 'there must be more')}", 1
+    if isinstance(error, OSError) and error.filename is not None:  # no permission, a folder in the place of a file
+        return f"{os.fsdecode(error.filename)}: {error.strerror}", 2
+    return None
+
+
+def _release(error: BaseException | None) -> None:
+    """Let go of all that the frames of an error hold, so that there is memory to tell of it."""
+    while error is not None:
+        error.__traceback__ = None
+        error = error.__cause__ or error.__context__
 
 
 def _dispatch(words: list[str]) -> int:
@@ -124,17 +161,3 @@ def _dispatch(words: list[str]) -> int:
             return 0
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
     return parse(command, rest, f"surfkit {name}").run() or 0
-
-
-def _reader_left() -> bool:
-    """Whether it is our own output that broke; it then goes nowhere, so that Python can exit without a word."""
-    try:
-        output = sys.stdout.fileno()
-    except OSError:  # not a file, so not a pipe either
-        return False
-    watch = select.poll()
-    watch.register(output, 0)
-    broken = any(state & (select.POLLERR | select.POLLHUP) for _, state in watch.poll(0))
-    if broken:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), output)
-    return broken

@@ -28,6 +28,7 @@ from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.data import Reading
 
+MOST_PROBED, MOST_POINTS = 10_000, 2**31 - 1
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
@@ -74,10 +75,10 @@ class Doctor:
     """Where to compute."""
 
     def __post_init__(self) -> None:
-        if self.probe < 0:
-            raise BadInput(f"--probe {self.probe}: give 0 (no estimate) or more steps")
-        if self.points is not None and self.points < 1:
-            raise BadInput(f"--points {self.points}: give 1 or more")
+        if not 0 <= self.probe <= MOST_PROBED:
+            raise BadInput(f"--probe {self.probe}: give 0 (no estimate) to {MOST_PROBED} steps")
+        if self.points is not None and not 1 <= self.points <= MOST_POINTS:
+            raise BadInput(f"--points {self.points}: give 1 to {MOST_POINTS}")
 
     def run(self) -> int:
         """Examine, and tell."""

@@ -23,7 +23,7 @@ from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
-from surfkit.train.faults import in_one_line
+from surfkit.train.faults import full_disk_in_one_line
 from surfkit.zones import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 
 
@@ -79,7 +79,7 @@ class Evaluate:
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
-            with held(self.target), in_one_line(self.target):
+            with held(self.target), full_disk_in_one_line(self.target):
                 this, state, scene = load_run(self.target)
                 zones.refuse_too_many(scene)
                 seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
@@ -124,7 +124,7 @@ class Evaluate:
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
-        with held(self.target), in_one_line(self.target):
+        with held(self.target), full_disk_in_one_line(self.target):
             this, state, scene = load_run(self.target)
             draw = drawing(this, state, drawer(self.device)[0])
             depths = rendered_depths(draw) if truth is None else true_depths(truth, scene.frame, matrix)

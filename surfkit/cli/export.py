@@ -15,7 +15,7 @@ from surfkit.folder import refuse_no_run
 from surfkit.pipeline import load_run
 from surfkit.primitives.base import to_table
 from surfkit.scene.ply import write_splats
-from surfkit.train.faults import in_one_line
+from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Export:
     def run(self) -> None:
         """Write the file."""
         refuse_no_run(self.run_folder)
-        with held(self.run_folder) if self.out is None else nullcontext(), in_one_line(self.run_folder):
+        with held(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
             self._write()
 
     def _write(self) -> None:

@@ -25,7 +25,7 @@ from surfkit.recipe import Recipe
 from surfkit.scene.memory import cache_bytes
 from surfkit.surface import Delivery, deliver, subject
 from surfkit.train.bars import bars
-from surfkit.train.faults import in_one_line
+from surfkit.train.faults import full_disk_in_one_line
 
 
 def named_mesher() -> Mesher:
@@ -76,7 +76,7 @@ class MeshOf:
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             rasterizer, _ = drawer(self.device)
-            with held(this.out), in_one_line(this.out), kept(this.out):
+            with held(this.out), full_disk_in_one_line(this.out), kept(this.out):
                 what = subject(this, state, scene, rasterizer, budget, self.mesh)
                 record = deliver(this, self.mesh, self.delivery, what, state.index)
         show(this, record)

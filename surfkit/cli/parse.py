@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import difflib
 import io
+import math
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import is_dataclass
-from typing import Annotated, TypeVar, get_args, get_origin, get_type_hints
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -53,7 +54,7 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     said = io.StringIO()
     try:
         with _wide_boxes(argv), contextlib.redirect_stderr(said):
-            return tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG)
+            return _with_numbers(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
     except SystemExit as stop:
         if stop.code != 2:
             raise
@@ -63,6 +64,22 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     finally:
         ARGV.reset(token)
         sys.stderr.write(said.getvalue())  # what was not tyro's box: warnings
+
+
+def _with_numbers(settings: T, at: str = "") -> T:
+    """The settings, or BadInput if one at any depth is nan: it passes most checks, and makes nothing right."""
+    inner: Iterable[tuple[Any, Any]] = ()
+    if isinstance(settings, float) and math.isnan(settings):
+        raise BadInput(f"{at.removeprefix('recipe.')} is nan, which is no number")
+    if is_dataclass(settings):
+        inner = ((field.name, getattr(settings, field.name)) for field in fields(settings))
+    elif isinstance(settings, dict):
+        inner = settings.items()
+    elif isinstance(settings, tuple):
+        inner = enumerate(settings)
+    for name, value in inner:
+        _with_numbers(value, f"{at}.{name}" if at else str(name))
+    return settings
 
 
 def _default(command: type, argv: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
 from surfkit.folder import Run
 
 LPIPS = {
@@ -34,12 +35,12 @@ def show(this: Run, metrics: dict[str, Any]) -> None:
     ]
     if metrics.get("prepare_cpu_seconds") is not None:
         rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of processor time"))
-    if metrics["peak_memory_bytes"]:
+    if metrics.get("peak_memory_bytes"):
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
-    if metrics["fps"]:
+    if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
     if "geometry" in metrics:
-        rows += geometry_rows(metrics["geometry"])
+        rows += sound_geometry_rows(this.metrics, metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
     written = [("metrics", this.metrics), ("points", this.cloud)]
@@ -86,6 +87,16 @@ def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> N
     print()
     written = [out / "metrics.json", *sorted(path for path in (out / "geometry").iterdir() if path.is_file())]
     print_table(("written",), [(str(path),) for path in written])
+
+
+def sound_geometry_rows(path: Path, found: Any) -> list[tuple[str, str]]:
+    """`geometry_rows` of what an earlier process has left in metrics.json, or BadInput if that is damaged."""
+    try:
+        return geometry_rows(found)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise BadInput(
+            f"{path}: geometry is damaged; delete that part of it, and measure again with surfkit evaluate --gt"
+        ) from error
 
 
 def zone_rows(images: dict[str, Any]) -> list[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -56,6 +56,19 @@ def leaving_out() -> Iterator[None]:
         yield
     except BadInput as error:
         reject(error)
+
+
+def require_within(ranges: Mapping[str, tuple[float, float]], settings: object) -> None:
+    """BadInput for the first setting outside the range from its least to its greatest value, or no number at all.
+
+    Args:
+        ranges: By the name of the field.
+        settings: What has these fields.
+    """
+    for name, (least, most) in ranges.items():
+        value = getattr(settings, name)
+        if not least <= value <= most:
+            raise BadInput(f"{name} is {value:g}; it must lie between {least:g} and {most:g}")
 
 
 def few(names: Sequence[str], most: int = 3) -> str:

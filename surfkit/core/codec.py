@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import types
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -16,6 +17,9 @@ from surfkit.core.registry import Component, components, find, name_of
 _JSON_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
 _NON_FINITE = ("inf", "-inf", "nan")
 """How floats that JSON lacks are written."""
+MOST_NESTED = 100
+"""Objects and lists within one another that are read: more has no meaning here, and recursion would end at a number
+that depends on who calls."""
 
 
 def dump(value: Any) -> Any:
@@ -72,21 +76,52 @@ def read_json(path: Path, hint: Any) -> Any:
         BadInput: Names the file, the place in it, what came and what is allowed.
     """
     try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=_object)
+        text = Path(path).read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise BadInput(f"{path}: no such file") from error
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-    except json.JSONDecodeError as error:
-        raise BadInput(f"{path}: not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
-    except RecursionError as error:
-        raise BadInput(f"{path}: not JSON: nested too deeply") from error
-    except ValueError as error:  # BadInput, bytes that are no UTF-8, a number of thousands of digits
+    except ValueError as error:  # bytes that are no UTF-8, a name with a zero in it
         raise BadInput(f"{path}: not JSON: {error}") from error
     try:
-        return load(hint, data)
+        return load(hint, from_json(text))
     except BadInput as error:
         raise BadInput(f"{path}: {error}") from error
+
+
+def from_json(text: str) -> Any:
+    """What a JSON text says. All JSON that is not of this process comes through here.
+
+    Raises:
+        BadInput: Not JSON, a key twice in an object, or nested more than `MOST_NESTED` deep.
+    """
+    try:
+        data = json.loads(text, object_pairs_hook=_object)
+    except json.JSONDecodeError as error:
+        raise BadInput(f"not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
+    except RecursionError as error:
+        raise BadInput("not JSON: nested too deeply") from error
+    except ValueError as error:  # BadInput, a number of thousands of digits
+        raise BadInput(f"not JSON: {error}") from error
+    inner = [data]
+    for _ in range(MOST_NESTED):
+        inner = [item for one in inner for item in _items(one) if isinstance(item, (dict, list))]
+        if not inner:
+            return data
+    raise BadInput(f"not JSON: nested too deeply; {MOST_NESTED} levels are allowed")
+
+
+def read_keys(path: Path, hints: Mapping[str, Any], remedy: str) -> dict[str, Any]:
+    """The values of some keys of the object in a JSON file, each checked against its type hint; others do not matter.
+
+    Raises:
+        BadInput: Names the file, the place in it, what came, what is allowed, and the remedy.
+    """
+    try:
+        data = read_json(path, dict[str, Any])
+        return {key: load(hint, data.get(key), f"{path}: {key}") for key, hint in hints.items()}
+    except BadInput as error:
+        raise BadInput(f"{error}; {remedy}") from error
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -191,6 +226,10 @@ def _require(kind: type, data: Any, at: str) -> Any:
 def _unfit(at: str, wanted: str, data: Any) -> BadInput:
     shown = json.dumps(data, default=repr)
     return BadInput(f"{_place(at)}expected {wanted}, got {shown if len(shown) <= 60 else shown[:57] + '...'}")
+
+
+def _items(data: Any) -> Any:
+    return data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,12 +11,15 @@ from typing import BinaryIO
 
 UNFINISHED = (".*.part", ".tmp??????")
 """Names of files that are being written, by us and by safetensors."""
+DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+"""Errors of a disk that has no room."""
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A new file that takes the place of `path` when all went well, and vanishes when not."""
     path = Path(path)
+    refuse_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -27,6 +31,14 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def refuse_special(path: Path) -> None:
+    """OSError if something else than a file has the name, such as a device: root would replace it for the machine."""
+    if path.is_dir():
+        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if (path.exists() and not path.is_file()) or path.parent == Path("/dev"):
+        raise OSError(errno.EINVAL, "a device or a pipe, not a file; name another", str(path))
 
 
 def sync_folder(folder: Path) -> None:

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surfkit.core.codec import dump
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, from_json
 from surfkit.core.events import FileWritten, Progress, StageBegan, StageEnded
 from surfkit.core.files import replacing
 from surfkit.core.registry import hookimpl, plugins
@@ -96,8 +97,8 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     found = []
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
         try:
-            line = json.loads(text)
-        except (ValueError, RecursionError):
+            line = from_json(text)
+        except BadInput:
             continue
         if text.endswith("\n") and _is_sound(line):
             found.append((text, line))

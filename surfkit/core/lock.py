@@ -10,8 +10,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 
 NAME = "lock"
@@ -141,7 +143,7 @@ def _is_at(file: int, path: Path) -> bool:
 
 def _named(path: Path) -> str:
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        said = read_json(path, dict[str, Any])
         return f"process {int(said['pid'])} on {said['host']}"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         return "another process"

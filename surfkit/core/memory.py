@@ -1,10 +1,42 @@
-"""How much memory this process takes."""
+"""How much memory this process takes, and whether it gave out."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
+import re
 import sys
 from contextlib import suppress
+
+from surfkit.core.check import Fault
+
+NO_MEMORY = (
+    "not enough memory", "can't allocate memory", "cannot allocate memory", "out of memory", "alloc_cpu",
+    "insufficient memory", "bad_alloc", "bad allocation", "can't start new thread", "failed to map segment",
+)  # fmt: skip
+"""Words of torch, Qhull, C++, threads and shared libraries, whose errors have no class of their own."""
+ASKED = re.compile(r"allocate ([\d.]+ ?\w+)")
+"""How numpy and torch say what they wanted."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory gave out, of the processor or of the device."""
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    known = isinstance(error, (RuntimeError, ImportError)) and not isinstance(error, Fault)
+    return known and any(words in str(error).lower() for words in NO_MEMORY)
+
+
+def out_of_memory(error: BaseException | None = None) -> str:
+    """What to say when memory gave out: how much is held, and how much more was wanted if the error tells."""
+    parts = [f"{peak / 2**30:.1f} GiB held"] if (peak := peak_memory_bytes()) else []
+    if found := ASKED.search(str(error)):
+        number, _, unit = found[1].partition(" ")
+        wanted = f"{float(number) / 2**30:.1f} GiB" if unit == "bytes" else found[1]
+        parts.append(f"{wanted} more wanted")
+    return f"out of memory{' with ' if parts else ''}{' and '.join(parts)}"
 
 
 def peak_memory_bytes() -> int:

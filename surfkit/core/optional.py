@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from surfkit.core.check import BadInput
+from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
     "OpenEXR": "exr", "lpips": "lpips", "open3d": "mesh", "ray": "ray", "submitit": "slurm",
@@ -39,9 +40,9 @@ def needed(package: str, what: str) -> Iterator[None]:
     """
     try:
         yield
-    except MemoryError:
-        raise
     except Exception as error:  # a package that does not suit the machine raises anything: OSError, AttributeError
+        if is_out_of_memory(error):
+            raise
         raise BadInput(f"{what} needs the package {package}, {_reason(package, error)}") from error
 
 

@@ -68,6 +68,10 @@ class DepthEstimator(Component):
     def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
         """Estimate the depth of the views at the positions `wanted`, one after the other, at any size."""
 
+    def refuse_unfit(self, views: Sequence[View]) -> None:
+        """BadInput if the settings do not fit the photographs; asked before anything is written or deleted."""
+        return None
+
     def notice(self) -> str | None:
         """What a user should know before the results are used, such as a licence."""
         return None

@@ -21,6 +21,8 @@ MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of the colours that the network was trained on."""
 PATCH = 14
 """Pixels on a side of the network's patches."""
+LARGEST = 8400
+"""Shortest side that is taken: what the network needs grows with its fourth power."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,8 @@ class DepthAnythingV2(DepthEstimator):
     """Shortest side of the pictures that the network sees, pixels; rounded to patches of 14."""
 
     def __post_init__(self) -> None:
-        if self.shortest < PATCH:
-            raise BadInput(f"shortest is {self.shortest}; it must be {PATCH} pixels or more")
+        if not PATCH <= self.shortest <= LARGEST:
+            raise BadInput(f"shortest is {self.shortest}; it must be {PATCH} to {LARGEST} pixels")
 
     @property
     def source(self) -> str:

@@ -12,17 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
-from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
 from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
+from surfkit.scene.scene import View
 
 KEPT = 64
 """Pictures and maps kept in memory."""
@@ -30,6 +31,21 @@ JITTER_PX = (2.0, 1.0, 0.5, 0.25, 0.12)
 """Parallax by which planes are changed at random, in one pass after the other."""
 LAST_PASS = 2
 """As many changes as in this pass are tried when depth maps are compared."""
+RANGES = {
+    "longest": (32, 20_000),
+    "neighbours": (1, 16),
+    "angle": (0.01, 180),
+    "best": (1, 16),
+    "window": (3, 17),
+    "spread": (1e-4, 100),
+    "smoothness": (0, 1000),
+    "passes": (1, len(JITTER_PX)),
+    "consistency": (0, 1000),
+    "coarsest": (32, 1000),
+    "tolerance_px": (1e-6, 1000),
+    "agree": (1, 16),
+}
+"""Of the settings: what is larger only costs time, or is the same as no limit."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +101,17 @@ class PatchMatch(DepthEstimator):
     """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
 
     def __post_init__(self) -> None:
-        if self.window not in range(3, 18, 2):
-            raise BadInput(f"window is {self.window}; it must be an odd number of 3 to 17 pixels")
-        if not (1 <= self.neighbours <= 16 and 1 <= self.best <= self.neighbours and self.agree >= 1):
-            raise BadInput("neighbours must be 1 to 16, best 1 to neighbours, and agree 1 or more")
-        if not 1 <= self.passes <= len(JITTER_PX) or min(self.longest, self.coarsest) < 32:
-            raise BadInput(f"passes must be 1 to {len(JITTER_PX)}, longest and coarsest 32 pixels or more")
-        if not (min(self.angle, self.spread, self.tolerance_px) > 0 and min(self.smoothness, self.consistency) >= 0):
-            raise BadInput("angle, spread and tolerance_px must be above 0, smoothness and consistency 0 or more")
+        require_within(RANGES, self)
+        if self.window % 2 == 0:
+            raise BadInput(f"window is {self.window}; it must be an odd number of pixels, so that it has a middle")
+        if self.best > self.neighbours:
+            raise BadInput(f"best is {self.best}; it must be no more than neighbours, {self.neighbours}")
         if not 0 < self.edge < 1:
             raise BadInput(f"edge is {self.edge:g}; it must lie between 0 and 1")
+
+    def refuse_unfit(self, views: Sequence[View]) -> None:
+        """See `DepthEstimator.refuse_unfit`."""
+        refuse_wide_window(self.window, self.longest, views)
 
     def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
         require_native()
@@ -156,6 +173,14 @@ class Map:
         return -away / away.norm(dim=0).clamp_min(1e-20)
 
 
+class Beginning(PlaneSweep):
+    """The sweep in which planes begin."""
+
+    def remedy(self, longest: int) -> str:
+        """See `PlaneSweep.remedy`."""
+        return f"give a lower coarsest, of {longest} or less"
+
+
 class Work:
     """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work.
 
@@ -165,7 +190,7 @@ class Work:
 
     def __init__(self, settings: PatchMatch, given: Material, pairs: list[list[int]]) -> None:
         self.settings, self.given, self.pairs = settings, given, pairs
-        self.sweep = PlaneSweep(longest=settings.coarsest)
+        self.sweep = Beginning(longest=settings.coarsest)
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.grey = lru_cache(3 * KEPT)(self.read)
         self.photometric = lru_cache(KEPT)(lambda at: self.kept("matching photographs", at, self.match))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,17 +12,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, require_within
+from surfkit.core.memory import size
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
-from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
 from surfkit.depth.scanlines import best_planes, smoothed
 from surfkit.scene.depth_files import save_array
+from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo
+from surfkit.scene.scene import View
 
 KEPT = 64
 """Pictures kept in memory."""
+VOLUME_BYTES = 16
+"""For each pixel and depth: the costs, their smoothed sums, and both again turned."""
+RANGES = {
+    "longest": (1, 20_000),
+    "neighbours": (1, CANDIDATES),
+    "angle": (0.01, 180),
+    "step_px": (0.01, 100),
+    "max_planes": (3, 10_000),
+    "margin": (0, 100),
+    "window": (3, 51),
+    "step_cost": (1e-6, 1000),
+    "jump_cost": (1e-6, 1000),
+    "tolerance": (1e-6, 1),
+    "agree": (1, CANDIDATES),
+}
+"""Of the settings: what is larger only costs time, which grows with the side of a window and the number of depths."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +91,17 @@ class PlaneSweep(DepthEstimator):
     """Neighbours whose maps must agree with a depth to trust it fully."""
 
     def __post_init__(self) -> None:
-        if self.window < 3 or self.window % 2 == 0:
-            raise BadInput(f"window is {self.window}; it must be an odd number of 3 or more pixels")
-        if min(self.longest, self.neighbours, self.agree) < 1 or self.max_planes < 3:
-            raise BadInput("longest, neighbours and agree must be 1 or more, and max_planes 3 or more")
-        if not (min(self.angle, self.step_px, self.tolerance) > 0 and 0 < self.visible <= 1 and self.margin >= 0):
-            raise BadInput("angle, step_px and tolerance must be above 0, visible in (0, 1] and margin 0 or more")
-        if not (0 < self.edge < 1 and 0 < self.step_cost <= self.jump_cost):
-            raise BadInput("edge must be in (0, 1), and step_cost above 0 and no more than jump_cost")
+        require_within(RANGES, self)
+        if self.window % 2 == 0:
+            raise BadInput(f"window is {self.window}; it must be an odd number of pixels, so that it has a middle")
+        if not 0 < self.visible <= 1:
+            raise BadInput(f"visible is {self.visible:g}; it is a share of the neighbours, above 0 and at most 1")
+        if not (0 < self.edge < 1 and self.step_cost <= self.jump_cost):
+            raise BadInput("edge must be in (0, 1), and step_cost no more than jump_cost")
+
+    def refuse_unfit(self, views: Sequence[View]) -> None:
+        """See `DepthEstimator.refuse_unfit`."""
+        refuse_wide_window(self.window, self.longest, views)
 
     def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
@@ -121,6 +144,7 @@ class PlaneSweep(DepthEstimator):
         if span is None or not others:
             return None
         count = self.planes(here, others, span)
+        self.refuse_too_large(here, count, given.device)
         planes = torch.linspace(*span, count, device=given.device)
         volume = cost_volume(here, others, planes, self.window, self.visible)
         plane, position = best_planes(smoothed(volume, here.light, self.step_cost, self.jump_cost))
@@ -128,6 +152,21 @@ class PlaneSweep(DepthEstimator):
         matched = 1 - volume.gather(0, plane[None])[0]
         inner = (plane > 0) & (plane < count - 1)
         return inverse, torch.where(inner, matched, 0)
+
+    def refuse_too_large(self, here: Picture, count: int, device: torch.device) -> None:
+        """BadInput if the costs of `count` depths would not fit into memory."""
+        needed = VOLUME_BYTES * count * here.camera.width * here.camera.height
+        free = free_bytes() if device.type == "cpu" else torch.cuda.mem_get_info(device)[0]
+        if needed > free:
+            longest = int(max(here.camera.width, here.camera.height) * (free / needed) ** (1 / 3))
+            raise BadInput(
+                f"depth maps of {here.camera.width} x {here.camera.height} pixels with {count} depths to try take "
+                f"{size(needed)}, and {size(free)} are free; {self.remedy(max(1, longest))}"
+            )
+
+    def remedy(self, longest: int) -> str:
+        """What to do for maps whose longest side is no more than so many pixels."""
+        return f"give --estimator.longest {longest} or less, or a lower --estimator.max-planes"
 
     def planes(self, here: Picture, others: Sequence[Picture], span: tuple[float, float]) -> int:
         """How many depths to try, so that no picture moves by more than a step from one to the next."""
@@ -137,4 +176,17 @@ class PlaneSweep(DepthEstimator):
             ends = [a[:, ::16, ::16] + c * b[:, None, None] for c in span]
             x, y = (ends[1][i] / ends[1][2] - ends[0][i] / ends[0][2] for i in range(2))
             moves.append(float(torch.hypot(x, y).median()))
-        return min(max(3, round(max(moves) / self.step_px) + 1), self.max_planes)
+        most = max(move if math.isfinite(move) else math.inf for move in moves)  # a pixel may pass through a camera
+        return min(max(3, round(min(most, 1e9) / self.step_px) + 1), self.max_planes)
+
+
+def refuse_wide_window(window: int, longest: int, views: Sequence[View]) -> None:
+    """BadInput if a window is larger than the depth map of a view, whose longest side is at most `longest` pixels."""
+    for view in views:
+        camera = view.camera.fitted(longest)
+        most = min(camera.width, camera.height)
+        if 3 <= most < window:  # in smaller ones nothing is found, with any window
+            raise BadInput(
+                f"window is {window}, and the depth map of {view.name} is {camera.width} x {camera.height} pixels: "
+                f"give an odd number from 3 to {most}"
+            )

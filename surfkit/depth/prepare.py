@@ -84,14 +84,15 @@ class Preparation:
         """What the estimator works from; `tracks` are read if None.
 
         Raises:
-            BadInput: The sparse model does not tell which photographs to compare.
+            BadInput: The sparse model does not tell which photographs to compare, or the settings do not fit them.
         """
         tracks = tracks or observations(self.data, scene)
-        self.refuse_unseen(tracks)
+        self.refuse_unfit(scene, tracks)
         return Material(self.views(scene), tracks, self.device, self.work)
 
-    def refuse_unseen(self, tracks: Observations) -> None:
-        """BadInput if the sparse model does not tell which photographs to compare, and the estimator compares some."""
+    def refuse_unfit(self, scene: Scene, tracks: Observations) -> None:
+        """BadInput if the settings do not fit the photographs, or the sparse model does not tell which to compare."""
+        self.estimator.refuse_unfit(self.views(scene))
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(
                 f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "

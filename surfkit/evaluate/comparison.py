@@ -25,6 +25,10 @@ OFF, FAR_OFF = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
 RESIZED = 0.02
 """Change of size by ICP above which it is told."""
+SHORTEST, FURTHEST = 1e-7, 1e4
+"""Lengths that can be meant, as shares of the diagonal of the truth."""
+MOST_DRAWS = 1000
+"""Repetitions: the error bars are known long before."""
 
 Align = Literal["similarity", "rigid", "none"]
 WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
@@ -87,8 +91,8 @@ class Comparison:
                 raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0")
         if self.seed < 0:
             raise BadInput(f"--seed {self.seed}: give 0 or more")
-        if self.draws < 1:
-            raise BadInput(f"--draws {self.draws}: give 1 or more")
+        if not 1 <= self.draws <= MOST_DRAWS:
+            raise BadInput(f"--draws {self.draws}: give 1 to {MOST_DRAWS}")
         if self.samples is not None and self.samples < LEAST:
             raise BadInput(f"--samples {self.samples}: give {LEAST} or more points")
         if not 0 < self.visible <= 1:
@@ -141,6 +145,7 @@ def compare(
         BadInput: The two do not lie in one frame, too few points, no volume to compare in.
     """
     matrix = np.eye(4) if settings.transform is None else read_transform(settings.transform)
+    refuse_sizes(settings, truth)
     theirs, tau = truth_side(truth, settings)
     ours = sided(reconstruction, None, settings.samples, tau / scale_of(matrix))
     first = theirs.points(np.random.default_rng(settings.seed))
@@ -159,6 +164,22 @@ def compare(
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
     return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs))
+
+
+def refuse_sizes(settings: Comparison, truth: Surface) -> None:
+    """BadInput for lengths that have nothing to do with the size of the truth."""
+    ends = [(block.min(0), block.max(0)) for block in truth.blocks() if len(block)]
+    if not ends:
+        return  # which is told later
+    low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
+    span = float(np.linalg.norm(high - low))
+    for name in ("tau", "voxel", "radius", "far"):
+        value = getattr(settings, name)
+        if value is not None and not SHORTEST * span <= value <= FURTHEST * span and span > 0:
+            raise BadInput(
+                f"--{name} {value:g}: {truth.path} spans {span:.3g}, so it must lie between {SHORTEST * span:.3g} and "
+                f"{FURTHEST * span:.3g}"
+            )
 
 
 def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.core.memory import size
 from surfkit.evaluate.registration import Alignment, align
 from surfkit.evaluate.sampling import face_areas, sample_surface
 from surfkit.evaluate.scores import Distances, nearest, tree
@@ -18,6 +19,7 @@ from surfkit.evaluate.thinning import thin, voxel_for
 from surfkit.evaluate.transform import apply
 from surfkit.evaluate.volume import said
 from surfkit.scene.crop import Crop
+from surfkit.scene.memory import free_bytes
 
 MOST = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
@@ -25,6 +27,8 @@ FOR_ICP = 400_000
 """Points of the reconstruction that ICP thins and looks at: many more than seven numbers need."""
 LEAST = 10
 """Points on either side without which shares mean nothing."""
+SAMPLE_BYTES = 200
+"""Memory for a point that is drawn from a mesh; as much again for one of the other side."""
 SMALL = 0.1
 """Of the truth's extent: a reconstruction smaller than this has another unit."""
 
@@ -93,6 +97,12 @@ def mesh_side(surface: Surface, count: int | None, tau: float) -> Side:
                     f"surfaces count as missing; give a larger --tau, or --samples {needed}"
                 )
             )
+    free = free_bytes()
+    if count * SAMPLE_BYTES > free:
+        raise BadInput(
+            f"{surface.path}: {count:,} samples take {size(count * SAMPLE_BYTES)}, and {size(free)} are free; give "
+            f"--samples {max(LEAST, free // SAMPLE_BYTES // 2)} or less"
+        )
     return Side(surface, None, count)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import write_json
+from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 
 NAMES = ("transform", "transformation", "matrix", "trans")
@@ -57,12 +57,11 @@ def read_transform(path: Path) -> np.ndarray:
         BadInput: Not such a file, or not a turn, a shift and one change of size.
     """
     try:
-        text = path.read_text()
-        values = _from_json(path, text) if path.suffix.lower() == ".json" else [float(word) for word in text.split()]
+        values = _from_json(path) if path.suffix.lower() == ".json" else [float(w) for w in path.read_text().split()]
         matrix = np.array(values, np.float64).reshape(-1)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         if isinstance(error, BadInput):
             raise
         raise BadInput(f"{path}: must hold four rows of four numbers, and nothing else") from error
@@ -71,8 +70,8 @@ def read_transform(path: Path) -> np.ndarray:
     return _similarity(path, matrix.reshape(4, 4))
 
 
-def _from_json(path: Path, text: str) -> object:
-    data = json.loads(text)
+def _from_json(path: Path) -> object:
+    data = read_json(path, Any)
     if not isinstance(data, dict):
         return data
     found = [name for name in NAMES if name in data]

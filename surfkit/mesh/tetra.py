@@ -26,6 +26,9 @@ TRIANGLES = (
 )  # fmt: skip
 """Edges of a positively oriented tetrahedron whose points make its triangles, by the bits of the vertices inside."""
 
+FINEST = 52
+"""Halvings after which float64 has no more digits."""
+
 
 @dataclass(frozen=True)
 class Tetra(Mesher):
@@ -60,10 +63,10 @@ class Tetra(Mesher):
             raise BadInput(f"mesh: tetra.reach is {self.reach} and thickness {self.thickness}; both must be positive")
         if not (0 < self.level < 1 and 0 <= self.agree < 1):
             raise BadInput(f"mesh: tetra.level is {self.level} and agree {self.agree}; both must lie between 0 and 1")
-        if self.bisections < 0 or self.min_views < 1 or self.longest < 0:
+        if not 0 <= self.bisections <= FINEST or self.min_views < 1 or self.longest < 0:
             raise BadInput(
                 f"mesh: tetra.bisections {self.bisections}, min-views {self.min_views}, longest {self.longest}: "
-                "give 0 or more, 1 or more, 0 or more"
+                f"give 0 to {FINEST}, 1 or more, 0 or more"
             )
 
     def mesh(self, subject: Subject) -> Mesh:

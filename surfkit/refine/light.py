@@ -29,6 +29,9 @@ STARTS = {name: rate.start for name, rate in RATES.items()}
 RECOVERY = slowing(STARTS | {"scales": 7.5e-5}, 0.95**75) | {"means": Rate(3e-7, 3e-9)}
 DISTILLATION = slowing(STARTS | {"scales": 7.5e-5, "opacities": 0.0}, 0.9**20) | {"means": Rate(9.5e-9, 3e-9)}
 
+MOST_COPIES = 1000
+"""Of each camera."""
+
 
 @dataclass(frozen=True)
 class Recover(Refine):
@@ -62,8 +65,8 @@ class Distil(Refine):
     def __post_init__(self) -> None:
         if self.sh_degree not in range(4):
             raise BadInput(f"distil.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
-        if self.jitter < 0 or self.copies < 1:
-            raise BadInput(f"distil.jitter {self.jitter}, copies {self.copies}: give 0 or more, and 1 or more")
+        if self.jitter < 0 or not 1 <= self.copies <= MOST_COPIES:
+            raise BadInput(f"distil.jitter {self.jitter}, copies {self.copies}: give 0 or more, and 1 to {MOST_COPIES}")
 
     def primitive(self, primitive: Primitive) -> Primitive:
         """The same with fewer harmonics."""

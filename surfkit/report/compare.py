@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Mapping
 from typing import Any
 
-from surfkit.core.codec import dump
+from surfkit.core.codec import dump, load
 from surfkit.report.ablation import Row, Table, built_on
 
 MEASURED = ("psnr", "ssim", "points", "seconds", "cpu_seconds")
@@ -18,8 +18,14 @@ Figures = Mapping[str, float]
 
 
 def figures(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers that are compared, out of the metrics of a run."""
-    return {name: {**metrics, **metrics["images"]}[name] for name in MEASURED}
+    """The numbers that are compared, out of the metrics of a run.
+
+    Raises:
+        BadInput: Some are not there, or no numbers.
+    """
+    images = load(dict[str, Any], metrics.get("images"), "images")
+    found = {name: {**metrics, **images}.get(name) for name in MEASURED}
+    return {name: load(int if name == "points" else float, value, name) for name, value in found.items()}
 
 
 def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list[dict[str, Any]]:

@@ -154,7 +154,13 @@ def versions() -> dict[str, str]:
 def finished(folder: Path) -> dict[str, float] | None:
     """The numbers of a run that is over: its metrics are written last, and deleted when it is trained further."""
     path = folder / "metrics.json"
-    return figures(read_json(path, Any)) if path.exists() else None
+    if not path.exists():
+        return None
+    metrics = read_json(path, dict[str, Any])
+    try:
+        return figures(metrics)
+    except BadInput as error:
+        raise BadInput(f"{path}: {error}; delete it, and the row is measured again") from error
 
 
 def refuse_unusable(plan: Plan) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import write_json
+from surfkit.core.codec import read_json, write_json
 
 Axis = Literal["x", "y", "z"]
 
@@ -85,15 +84,13 @@ def read_crop(path: Path) -> Crop:
         BadInput: Not such a file.
     """
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path, dict[str, Any])
         axis = str(data["orthogonal_axis"]).lower()
         if axis not in PLANES:
             raise BadInput(f"{path}: orthogonal_axis is {data['orthogonal_axis']!r}; it must be X, Y or Z")
         corners = np.array(data["bounding_polygon"], np.float64)
         low, high = float(data["axis_min"]), float(data["axis_max"])
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, BadInput):
             raise
         raise BadInput(

@@ -154,10 +154,10 @@ def read_record(root: Path) -> Mapping[str, Any]:
     path = root / FOLDER / RECORD
     if not path.exists():
         return {}
-    record = read_json(path, Any)
-    if not isinstance(record, dict):
-        raise BadInput(f"{path}: expected an object that tells what made the maps; delete it or make them again")
-    return record
+    try:
+        return read_json(path, dict[str, Any])
+    except BadInput as error:
+        raise BadInput(f"{error}; it tells what made the maps: delete it or make them again") from error
 
 
 def write_record(root: Path, record: Mapping[str, Any]) -> None:

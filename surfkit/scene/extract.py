@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump
+from surfkit.core.codec import dump, from_json
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import replacing
 from surfkit.scene.camera import Camera
@@ -109,7 +109,7 @@ def load(path: Path) -> Extract:
 
 
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:
-    facts = load_value(Facts, json.loads(str(arrays["facts"])))
+    facts = load_value(Facts, from_json(str(arrays["facts"])))
     views = tuple(
         View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white)
         for s, pose in zip(facts.shots, arrays["poses"], strict=True)

@@ -13,6 +13,8 @@ from surfkit.core.check import BadInput
 SHARE = 0.5
 """Of the free memory that the cache takes by default: the points and the rasterizer need the rest."""
 UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12, "ki": 2**10, "mi": 2**20, "gi": 2**30, "ti": 2**40}
+MOST = 10**15
+"""Bytes that can be asked for."""
 GROUPS = Path("/sys/fs/cgroup")
 OWN = Path("/proc/self/cgroup")
 VMSTAT = Path("/proc/vmstat")
@@ -25,7 +27,10 @@ def cache_bytes(text: str, flag: str = "--cache") -> int:
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
     if not found or found[2] not in UNITS:
         raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, or auto")
-    return int(float(found[1]) * UNITS[found[2]])
+    size = float(found[1]) * UNITS[found[2]]
+    if size > MOST:
+        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, of at most 1000TB, or auto")
+    return int(size)
 
 
 def free_bytes() -> int:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import from_json
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import sync_folder
 from surfkit.primitives.points import Points
@@ -212,8 +213,8 @@ def reading(path: Path) -> Iterator[tuple[Any, dict[str, str]]]:
 def _facts(path: Path, tensors: Mapping[str, Tensor], text: str) -> dict[str, Any]:
     """What is written beside the tensors; all that should be there is."""
     try:
-        facts = json.loads(text)
-    except ValueError as error:
+        facts = from_json(text)
+    except BadInput as error:
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
     if not isinstance(facts, dict):
         raise _unusable(path, "it lacks its facts")

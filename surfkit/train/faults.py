@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,13 +11,12 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import Fault
-from surfkit.core.memory import peak_memory_bytes
+from surfkit.core.files import DISK_FULL
+from surfkit.core.memory import is_out_of_memory
+from surfkit.core.memory import out_of_memory as say_out_of_memory
 
 MOST_HALVINGS = 2
 """Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""
-DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-NO_MEMORY = ("not enough memory", "can't allocate memory", "out of memory", "alloc_cpu")
-"""Words of torch's errors on processors, which have no class of their own."""
 
 
 class Diverged(RuntimeError):
@@ -83,17 +81,9 @@ def require_finite_values(index: int, view: str, params: Mapping[str, Tensor]) -
             raise Diverged(index, view, f"the {name} are not finite")
 
 
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory gave out, of the processor or of the device."""
-    if isinstance(error, (MemoryError, torch.cuda.OutOfMemoryError)):
-        return True
-    known = isinstance(error, RuntimeError) and not isinstance(error, Fault)
-    return known and any(words in str(error).lower() for words in NO_MEMORY)
-
-
 @contextmanager
-def in_one_line(out: Path) -> Iterator[None]:
-    """Within, what gives out in the run in the folder `out` becomes a `Fault`; the checkpoints stay as they are."""
+def full_disk_in_one_line(out: Path) -> Iterator[None]:
+    """Within, a disk that is full becomes a `Fault` of the run in the folder `out`."""
     try:
         yield
     except OSError as error:
@@ -101,7 +91,15 @@ def in_one_line(out: Path) -> Iterator[None]:
             raise
         where = error.filename or out
         raise DiskFull(out, f"{where}: the disk is full ({error.strerror})") from error
-    except (MemoryError, RuntimeError) as error:
+
+
+@contextmanager
+def in_one_line(out: Path) -> Iterator[None]:
+    """Within, what gives out while the run in the folder `out` is trained becomes a `Fault`; the checkpoints stay."""
+    try:
+        with full_disk_in_one_line(out):
+            yield
+    except (MemoryError, RuntimeError, OSError) as error:
         if not is_out_of_memory(error):
             raise
         raise out_of_memory(out) from error
@@ -109,8 +107,7 @@ def in_one_line(out: Path) -> Iterator[None]:
 
 def out_of_memory(out: Path, also: str = "") -> OutOfMemory:
     """What is said of a run in the folder `out` that cannot go on; `also` tells what has been tried."""
-    held = f" with {peak / 2**30:.1f} GiB held" if (peak := peak_memory_bytes()) else ""
-    what = f"out of memory{held}{also}"
+    what = f"{say_out_of_memory()}{also}"
     return OutOfMemory(
         f"{out}: {what}; smaller photographs (--longest, --scale) or fewer points (a higher "
         "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "

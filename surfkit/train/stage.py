@@ -44,6 +44,8 @@ RATES = {
     "sh_rest": Rate(1.25e-4),
 }
 """Of 3DGS, for a scene extent of 1."""
+MOST_STEPS = 100_000_000
+"""Of a stage: days and days of the fastest machine."""
 GEOMETRY = {"depth", "median", "normal", "distortion"}
 """Maps beyond the colours."""
 
@@ -84,8 +86,8 @@ class Stage:
     """Nothing nearer to a camera than this is drawn, as a share of the scene extent."""
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise BadInput(f"a stage has {self.steps} steps; give 1 or more")
+        if not 1 <= self.steps <= MOST_STEPS:
+            raise BadInput(f"a stage has {self.steps} steps; give 1 to {MOST_STEPS}")
         if self.sh_every < 1:
             raise BadInput(f"sh_every is {self.sh_every}; it must be 1 or more steps")
         if unknown := set(self.signal.terms or ()) - set(self.losses):

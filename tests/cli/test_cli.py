@@ -1,3 +1,6 @@
+import contextlib
+import errno
+import importlib
 import io
 import os
 import re
@@ -6,9 +9,12 @@ import sys
 import types
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
+import torch
 
-from surfkit.cli import COMMANDS, main
+from surfkit.cli import COMMANDS, LIGHTER, main
+from surfkit.cli.parse import parse
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.registry import hookimpl
@@ -221,6 +227,133 @@ def test_a_closed_pipe_is_quiet(unbuffered):
     done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, env=environ, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (141, b"")
+
+
+def ended(words, shell):
+    """Exit status and stderr of a command whose streams a shell sets up."""
+    code = f"import sys; from surfkit.cli import main; sys.exit(main({list(words)}))"
+    line = f'"$0" -c "$1" {shell}'
+    environ = os.environ | {"SURFKIT_PLUGINS": "none"}
+    done = subprocess.run(["bash", "-c", line, sys.executable, code], capture_output=True, env=environ, check=False)
+    return done.returncode, done.stderr.decode()
+
+
+@pytest.mark.parametrize(
+    ("words", "shell", "status", "said"),
+    [
+        (["recipes"], ">&-", 0, ""),
+        (["train", "--help"], ">&- <&- 2>&-", 0, ""),
+        (["status", "nowhere"], ">&-", 2, "surfkit: nowhere: no run folder"),
+        (["recipes"], ">/dev/full", 1, "surfkit: standard output: No space left on device"),
+        (["recipes"], "1</dev/null", 1, "surfkit: standard output: Bad file descriptor"),
+        (["train", "--help"], "| true; exit ${PIPESTATUS[0]}", 141, ""),
+        (["status", "nowhere"], "2>&1 >/dev/null | true; exit ${PIPESTATUS[0]}", 141, ""),
+    ],
+)
+def test_outputs_that_take_nothing_are_one_line_at_most(words, shell, status, said):
+    found, line = ended(words, shell)
+    assert found == status and line.startswith(said) and line.count("\n") == bool(said)
+
+
+def test_rich_that_finds_no_reader_is_as_quiet(monkeypatch):
+    def stopped():
+        raise SystemExit(1)  # as rich does then
+
+    command(monkeypatch, stopped)
+    assert main(["export"]) == 141
+
+
+def test_a_closed_stdout_takes_no_number_of_a_file(tmp_path):
+    """What a library writes to file 1 must not land in a file of ours."""
+    code = (
+        "import os; from surfkit.cli import main; main(['recipes']); file = open('x', 'w'); os.write(1, b'noise');"
+        "file.write('ours'); file.close(); os.system('echo more')"
+    )
+    subprocess.run(["bash", "-c", '"$0" -c "$1" >&-', sys.executable, code], cwd=tmp_path, check=True)
+    assert (tmp_path / "x").read_text() == "ours"
+
+
+class Big:
+    """Something large that a frame holds."""
+
+    alive = 0
+
+    def __init__(self):
+        Big.alive += 1
+
+    def __del__(self):
+        Big.alive -= 1
+
+
+def numpy_error():
+    np.empty(2**60, np.uint8)
+
+
+def torch_error():
+    torch.empty(2**60, dtype=torch.uint8)
+
+
+def python_error():
+    big = Big()  # noqa: F841
+    raise MemoryError
+
+
+def system_error():
+    raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+
+def qhull_error():
+    raise RuntimeError("QH6082 qhull error (qh_memalloc): insufficient memory")
+
+
+@pytest.mark.parametrize(
+    ("fails", "wanted"),
+    [
+        (numpy_error, " and 1.00 EiB more wanted"),
+        (torch_error, " and 1073741824.0 GiB more wanted"),
+        (python_error, ""),
+        (system_error, ""),
+        (qhull_error, ""),
+    ],
+)
+def test_memory_that_gives_out_is_one_line(monkeypatch, capsys, fails, wanted):
+    command(monkeypatch, fails)
+    assert main(["export"]) == 1
+    pattern = rf"surfkit: export: out of memory with [\d.]+ GiB held{re.escape(wanted)}; there must be more\n"
+    assert re.fullmatch(pattern, capsys.readouterr().err) and Big.alive == 0
+
+
+@pytest.mark.parametrize("name", LIGHTER)
+def test_what_to_lower_when_memory_gives_out_exists(name):
+    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
+    command = command["depth"] if isinstance(command, dict) else command
+    flags = re.findall(r"--[\w.-]+", LIGHTER[name])
+    choices = re.findall(r"\w+:[\w-]+", LIGHTER[name])
+    assert flags
+    for words in [choices[at : at + 1] for at in range(max(1, len(choices)))]:
+        helped = io.StringIO()
+        with contextlib.redirect_stdout(helped), pytest.raises(SystemExit):
+            parse(command, [*words, "--help"], "surfkit")
+        flags = [flag for flag in flags if not re.search(rf"{re.escape(flag)}\b", helped.getvalue())]
+    assert not flags
+
+
+def test_other_errors_without_a_file_are_mistakes_of_ours(monkeypatch):
+    def broken():
+        raise OSError(errno.ENOTCONN, "not connected")
+
+    command(monkeypatch, broken)
+    with pytest.raises(OSError, match="not connected"):
+        main(["export"])
+
+
+def test_a_full_disk_is_one_line_in_any_command(monkeypatch, capsys):
+    def full():
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    command(monkeypatch, full)
+    assert main(["export"]) == 1
+    assert capsys.readouterr().err.startswith("surfkit: what was being written: No space left on device")
 
 
 def test_help_loads_neither_torch_nor_tyro():

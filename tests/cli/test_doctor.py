@@ -75,8 +75,8 @@ def test_an_estimate_in_words(farm, capsys, monkeypatch):
 
 def test_words_that_do_not_fit(farm, capsys):
     for words, said in (
-        (["--probe", "-1"], "--probe -1: give 0 (no estimate) or more steps"),
-        (["--points", "0"], "--points 0: give 1 or more"),
+        (["--probe", "-1"], "--probe -1: give 0 (no estimate) to 10000 steps"),
+        (["--points", "0"], "--points 0: give 1 to 2147483647"),
         (["recipe:none"], "no recipe named 'none'"),
         (["--scale", "0.5"], "--scale 0.5"),
         (["--scal", "4"], "no option --scal; perhaps you meant --scale"),

@@ -89,7 +89,7 @@ def test_another_mesh_of_the_same_run(finished, tmp_path, capsys):
         (["--memory", "much"], "--memory much: give a size"),
         (["--memory", "1MB"], "too little to mesh in"),
         (["--crop-box", "0", "0", "0", "1", "1", "1", "--crop", "x.json"], "give one of the two"),
-        (["--crop", "none.json"], "none.json: cannot be read"),
+        (["--crop", "none.json"], "none.json: no such file"),
         (["--crop-box", "900", "900", "900", "901", "901", "901"], "outside the crop"),
         (["mesh:tsdf", "--mesh.least-views", "999"], "no surface"),
         (["mesh:tsfd"], "tsdf"),

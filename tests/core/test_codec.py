@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, load, read_json, write_json
+from surfkit.core.codec import MOST_NESTED, dump, load, read_json, read_keys, write_json
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,33 @@ def test_wrong_files_are_named(tmp_path, text, message):
     with pytest.raises(BadInput) as caught:
         read_json(path, Scalars)
     assert str(caught.value).startswith(f"{path}: {message}")
+
+
+def test_json_may_be_nested_as_deep_as_is_said_and_no_deeper(tmp_path):
+    path = tmp_path / "r.json"
+    for left, right in (("[", "]"), ('{"a":', "}")):
+        path.write_text(left * MOST_NESTED + "1" + right * MOST_NESTED)
+        assert dump(read_json(path, Any))
+        for depth in (MOST_NESTED + 1, 900, 100_000):
+            path.write_text(left * depth + "1" + right * depth)
+            with pytest.raises(BadInput, match="r.json: not JSON: nested too deeply"):
+                read_json(path, Any)
+
+
+def test_some_keys_of_an_object(tmp_path):
+    path = tmp_path / "r.json"
+    path.write_text('{"files": ["a"], "steps": 3, "more": null}')
+    hints = {"files": tuple[str, ...], "steps": int}
+    assert read_keys(path, hints, "delete it") == {"files": ("a",), "steps": 3}
+    for text, said in (
+        ("null", "expected an object, got null"),
+        ('{"files": [1], "steps": 3}', "files.0: expected text, got 1"),
+        ('{"files": []}', "steps: expected a whole number, got null"),
+    ):
+        path.write_text(text)
+        with pytest.raises(BadInput) as caught:
+            read_keys(path, hints, "delete it")
+        assert str(caught.value) == f"{path}: {said}; delete it"
 
 
 def test_files_that_are_none(tmp_path):

@@ -1,8 +1,10 @@
 import os
+import stat
+from pathlib import Path
 
 import pytest
 
-from surfkit.core.files import replacing, sweep
+from surfkit.core.files import refuse_special, replacing, sweep
 
 
 def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
@@ -30,3 +32,18 @@ def test_what_the_dead_left_is_swept_away(tmp_path):
         (tmp_path / name).touch()
     sweep(tmp_path)
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [".hidden", "a.json"]
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name, said in (("pipe", "a device or a pipe"), ("folder", "Is a directory")):
+        with pytest.raises(OSError, match=said) as caught, replacing(tmp_path / name) as file:
+            file.write(b"new")
+        assert caught.value.filename == str(tmp_path / name)
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode) and len(list(tmp_path.iterdir())) == 2
+    for name in ("null", "stdout", "new.png"):  # the check alone: were it wrong, writing would harm the machine
+        with pytest.raises(OSError, match="a device or a pipe"):
+            refuse_special(Path("/dev") / name)
+    refuse_special(Path("/dev/shm/new.png"))
+    refuse_special(tmp_path / "new.png")

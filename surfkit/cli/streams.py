@@ -1,0 +1,71 @@
+"""Standard streams that take nothing: closed, on a disk that is full, or with a reader that has ended."""
+
+from __future__ import annotations
+
+import io
+import os
+import select
+import sys
+
+READER_LEFT = 141
+"""What a shell reports for a program that SIGPIPE ends, and so what a command returns whose output nobody reads."""
+STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
+
+
+def open_closed() -> None:
+    """Give streams that were closed before the process began (`>&-`) to /dev/null.
+
+    Without, printing to them would fail, and the next file that is opened would take their number: what a library
+    writes to stdout or stderr would then land in it.
+    """
+    for number, name, mode in STREAMS:
+        if getattr(sys, name) is not None:
+            continue
+        try:
+            os.fstat(number)
+        except OSError:
+            _give_to_null(number)
+        setattr(sys, name, open(os.devnull, mode))
+
+
+def silence_lost() -> list[str]:
+    """Give the output streams that take nothing any more to /dev/null, so that Python ends without a word of its own.
+
+    Returns:
+        Which they were: "output" and "error".
+    """
+    lost = []
+    for name, stream in (("output", sys.stdout), ("error", sys.stderr)):
+        try:
+            number = stream.fileno()
+        except (OSError, ValueError):  # not a file, so nothing can be wrong with it
+            continue
+        if _has_no_reader(number) or _is_refused(stream, number):
+            _give_to_null(number)
+            lost.append(name)
+    return lost
+
+
+def _has_no_reader(number: int) -> bool:
+    watch = select.poll()
+    watch.register(number, 0)
+    return any(state & (select.POLLERR | select.POLLHUP) for _, state in watch.poll(0))
+
+
+def _is_refused(stream: io.TextIOBase, number: int) -> bool:
+    """Whether what is still in the buffer, or nothing at all, cannot be written."""
+    try:
+        stream.flush()
+        os.write(number, b"")
+    except OSError:
+        return True
+    return False
+
+
+def _give_to_null(number: int) -> None:
+    null = os.open(os.devnull, os.O_RDWR)
+    if null == number:
+        os.set_inheritable(number, True)
+    else:
+        os.dup2(null, number)
+        os.close(null)
