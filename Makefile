@@ -21,6 +21,7 @@ bench: $(VENV)/.installed
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/dgd.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/survey.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/mesh.py
+	OMP_WAIT_POLICY=PASSIVE $(PY) bench/stereo.py
 
 # Half an hour: damaged files of every kind, through the command line.
 fuzz: $(VENV)/.installed
