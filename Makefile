@@ -3,12 +3,13 @@ VENV ?= .venv
 PYTHON ?= python3
 PY = $(VENV)/bin/python
 STEPS ?= 1000
+SCALE ?= 1.5
 OUT ?= runs/demo
 
 .PHONY: demo test lint bench fuzz clean
 
 demo: $(VENV)/.installed
-	$(VENV)/bin/surfkit train recipe:2dgs --steps $(STEPS) --out $(OUT)
+	$(VENV)/bin/surfkit train recipe:surface --scale $(SCALE) --steps $(STEPS) --out $(OUT)
 
 test: $(VENV)/.installed
 	$(PY) -m pytest
@@ -21,6 +22,7 @@ bench: $(VENV)/.installed
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/dgd.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/survey.py
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/mesh.py
+	OMP_WAIT_POLICY=PASSIVE $(PY) bench/stereo.py
 
 # Half an hour: damaged files of every kind, through the command line.
 fuzz: $(VENV)/.installed

@@ -11,11 +11,13 @@ import tyro
 
 from surfkit.cli.table import print_table
 from surfkit.cli.tables import chosen_table
+from surfkit.core.check import BadInput
 from surfkit.raster.select import Device
 from surfkit.report.ablation import Table
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate
 from surfkit.report.table import LEGEND, STACKED, drawing, failures, lines
+from surfkit.report.truth import Truth
 from surfkit.scene.data import Data
 
 
@@ -42,6 +44,13 @@ class Ablate:
     seeds: int = 1
     """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
 
+    gt: Path | None = None
+    """True geometry, a mesh or a cloud of points: the mesh of every row is compared with it, for F1, in one crop volume
+    for all rows. Rows without a mesh get mesh:tsdf then."""
+
+    tau: float | None = None
+    """With --gt, distance below which a point counts as right, in units of the truth; a mesh needs it."""
+
     rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
     """Run only these rows, by number or label; what is known of the others is shown with them."""
 
@@ -54,7 +63,10 @@ class Ablate:
     def run(self) -> int:
         """Run the table and show it; 1 if a row failed."""
         out = self.out or Path("runs") / f"{self.data.path.resolve().name}-ablate-{self.table.name}"
-        plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device, self.max_points)
+        if self.tau is not None and self.gt is None:
+            raise BadInput(f"--tau {self.tau:g}: it belongs to the truth; name that with --gt, or leave it out")
+        truth = None if self.gt is None else Truth(self.gt, self.tau)
+        plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device, self.max_points, truth)
         try:
             with Screen() as screen:
                 report = ablate(plan, screen)

@@ -12,6 +12,7 @@ from surfkit.core.tree import evolve
 from surfkit.densify.filters import CountCap
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe
+from surfkit.start.stereo import StereoStart
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,16 @@ def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
 
 def capped(recipe: Recipe, points: int | None) -> Recipe:
     """The recipe with a limit on the number of points, if there is one to set."""
-    if points is None or recipe.pretrain.densify is None:
+    if points is None:
+        return recipe
+    limit = CountCap(points)
+    if isinstance(start := recipe.start, StereoStart):
+        given = start.points if start.points == "auto" else min(start.points, points)
+        recipe = replace(recipe, start=replace(start, points=given, most=min(start.most, points)))
+    if recipe.pretrain.densify is None:
         return recipe
     filters = getattr(recipe.pretrain.densify, "filters", ())
-    return evolve(recipe, "pretrain.densify.filters", (*filters, CountCap(points)))
+    return evolve(recipe, "pretrain.densify.filters", (*filters, limit))
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:

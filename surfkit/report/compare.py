@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from surfkit.core.codec import dump, load
 from surfkit.report.ablation import Row, Table, built_on
 
-MEASURED = ("psnr", "ssim", "points", "seconds", "cpu_seconds")
-"""What is taken from the metrics of a run."""
+MEASURED = ("psnr", "ssim", "points", "f1", "seconds", "cpu_seconds")
+"""What is taken from the metrics of a run; `f1` where its mesh was compared with the truth."""
 
 Figures = Mapping[str, float]
 """Numbers of a run, by the names in `MEASURED`."""
 
 
 def figures(metrics: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers that are compared, out of the metrics of a run.
+    """The numbers that are compared, out of the metrics of a run; depth maps made for it are part of its CPU time.
 
     Raises:
         BadInput: Some are not there, or no numbers.
     """
     images = load(dict[str, Any], metrics.get("images"), "images")
-    found = {name: {**metrics, **images}.get(name) for name in MEASURED}
-    return {name: load(int if name == "points" else float, value, name) for name, value in found.items()}
+    known = {**load(dict[str, Any], metrics.get("geometry", {}), "geometry"), **metrics, **images}
+    wanted = [name for name in MEASURED if name != "f1" or name in known]
+    found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
+    made = load(float, metrics.get("prepare_cpu_seconds") or 0.0, "prepare_cpu_seconds")
+    return found | {"cpu_seconds": found["cpu_seconds"] + made}
 
 
 def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list[dict[str, Any]]:
@@ -42,7 +45,7 @@ def compare(table: Table, measured: Mapping[str, Mapping[int, Figures]]) -> list
 def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mapping[int, Figures]]) -> dict[str, Any]:
     here = measured.get(row.label, {})
     there = measured.get(base.label, {}) if base else {}
-    columns = {name: [run[name] for run in here.values()] for name in MEASURED} if here else {}
+    columns = {name: [run[name] for run in here.values()] for name in _known(here.values())}
     return {
         "number": at,
         "label": row.label,
@@ -67,7 +70,7 @@ def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dic
     mean that they are to; {} if no seed is in both."""
     seeds = [seed for seed in here if seed in there]
     found = {}
-    for name in MEASURED if seeds else ():
+    for name in _known([*(here[seed] for seed in seeds), *(there[seed] for seed in seeds)]):
         pairs = [here[seed][name] - there[seed][name] for seed in seeds]
         spread = deviation(pairs)
         found[name] = {
@@ -77,6 +80,11 @@ def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dic
             "base": statistics.fmean(there[seed][name] for seed in seeds),
         }
     return found
+
+
+def _known(runs: Collection[Figures]) -> list[str]:
+    """Names that all of some runs have a number for."""
+    return [name for name in MEASURED if runs and all(name in run for run in runs)]
 
 
 def deviation(values: list[float]) -> float | None:

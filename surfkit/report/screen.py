@@ -57,11 +57,13 @@ class Screen:
     def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
         """See `Watch.end`."""
         self.report = report
-        if outcome.figures is None:
+        if outcome.failed is not None:
             say(f"{self.heading}: failed: {outcome.failed}")
-        elif self.live is None:
+        elif self.live is None and outcome.figures is not None:
             psnr, ssim, points, seconds = (outcome.figures[name] for name in ("psnr", "ssim", "points", "seconds"))
-            say(f"{self.heading}: PSNR {psnr:.2f} dB, SSIM {ssim:.3f}, {points:,} points, {seconds / 60:.1f} minutes")
+            f1 = f", F1 {outcome.figures['f1']:.3f}" if "f1" in outcome.figures else ""
+            size = f"{points:,} points, {seconds / 60:.1f} minutes"
+            say(f"{self.heading}: PSNR {psnr:.2f} dB, SSIM {ssim:.3f}{f1}, {size}")
 
     def draw(self, below: Any) -> None:
         """Show the table with something below it."""

@@ -18,11 +18,14 @@ from surfkit.blocks import Hands
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
+from surfkit.mesh.tsdf import TSDF
+from surfkit.notes import noted
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.report.ablation import Table, build, capped, pick, scaled
 from surfkit.report.compare import compare, figures
 from surfkit.report.table import markdown
+from surfkit.report.truth import Truth
 from surfkit.scene.data import Data
 from surfkit.scene.read import read
 
@@ -43,6 +46,7 @@ class Plan:
         rows: Numbers or labels of those to run; all if empty.
         device: Where to compute.
         max_points: No row grows beyond this number of points.
+        truth: What the meshes of all rows are compared with, for their F1; rows without a mesh get one then.
     """
 
     table: Table
@@ -53,6 +57,7 @@ class Plan:
     rows: tuple[str, ...] = ()
     device: Device = "auto"
     max_points: int | None = None
+    truth: Truth | None = None
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -71,7 +76,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run came to: numbers, or the reason why it failed in one line."""
+    """What a run came to: numbers, the reason in one line why it failed, or both where only its mesh did."""
 
     figures: Mapping[str, float] | None = None
     failed: str | None = None
@@ -95,8 +100,9 @@ def ablate(plan: Plan, watch: Watch) -> dict[str, Any]:
         KeyboardInterrupt: Someone asked to stop; the same plan goes on from there.
     """
     every = trials(plan)
-    outcomes = {trial.folder: Outcome(found) for trial in every if (found := finished(trial.folder))}
-    left = unfinished(every, pick(plan.table, plan.rows), outcomes)
+    outcomes = {trial.folder: Outcome(found) for trial in every if (found := finished(trial.folder, plan.truth))}
+    done = [folder for folder, known in outcomes.items() if plan.truth is None or "f1" in known.figures]
+    left = unfinished(every, pick(plan.table, plan.rows), done)
     if left:
         refuse_unusable(plan)
     report = save(plan, every, outcomes)
@@ -122,7 +128,9 @@ def trials(plan: Plan) -> list[Trial]:
 
 
 def sized(recipe: Recipe, plan: Plan) -> Recipe:
-    """A row's recipe at the length and with the limit of the plan."""
+    """A row's recipe at the length and with the limit of the plan, and with a mesh where F1 is wanted."""
+    if plan.truth is not None and recipe.mesh is None:
+        recipe = replace(recipe, mesh=TSDF())
     return capped(scaled(recipe, plan.table, plan.steps), plan.max_points)
 
 
@@ -151,12 +159,14 @@ def versions() -> dict[str, str]:
     return {plugin.distribution: plugin.version for plugin in offering}
 
 
-def finished(folder: Path) -> dict[str, float] | None:
+def finished(folder: Path, truth: Truth | None = None) -> dict[str, float] | None:
     """The numbers of a run that is over: its metrics are written last, and deleted when it is trained further."""
     path = folder / "metrics.json"
     if not path.exists():
         return None
     metrics = read_json(path, dict[str, Any])
+    if truth is None or not truth.known(metrics):
+        metrics.pop("geometry", None)  # of another truth
     try:
         return figures(metrics)
     except BadInput as error:
@@ -170,21 +180,27 @@ def refuse_unusable(plan: Plan) -> None:
     pipeline.drawer(plan.device)
     if not read(plan.data).held_out:
         raise BadInput("no photograph is kept from training, so rows cannot be compared; see --test-every")
+    if plan.truth is not None:
+        plan.truth.refuse_unusable()
 
 
 def attempt(trial: Trial, plan: Plan) -> Outcome:
     """Run one recipe, or go on with it; what goes wrong becomes its outcome."""
-    trace = trial.folder / TRACE
+    trace, found = trial.folder / TRACE, finished(trial.folder)
     try:
-        metrics = pipeline.run(trial.recipe, plan.data, trial.folder, Hands(plan.device))
+        if found is None:
+            found = figures(pipeline.run(trial.recipe, plan.data, trial.folder, Hands(plan.device)))
+        if plan.truth is not None:
+            with noted():
+                found = figures(plan.truth.measure(trial.folder, plan.out))
     except (BadInput, Fault) as error:
-        return Outcome(failed=" ".join(str(error).split()))
+        return Outcome(found, " ".join(str(error).split()))
     except Exception as error:
         write_text(trace, traceback.format_exc())
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return Outcome(failed=f"{reason[:200]}; see {trace}")
+        return Outcome(found, f"{reason[:200]}; see {trace}")
     trace.unlink(missing_ok=True)
-    return Outcome(figures(metrics))
+    return Outcome(found)
 
 
 def save(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
@@ -202,8 +218,9 @@ def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) 
     failed: dict[str, str] = {}
     runs: dict[str, list[dict[str, Any]]] = {}
     for trial, outcome in known:
-        if outcome.figures is None:
+        if outcome.failed is not None:
             failed.setdefault(trial.label, f"seed {trial.seed}: {outcome.failed}")
+        if outcome.figures is None:
             continue
         measured.setdefault(trial.label, {})[trial.seed] = outcome.figures
         folder = trial.folder.relative_to(plan.out).as_posix()
@@ -214,6 +231,7 @@ def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) 
         "about": plan.table.about,
         "steps": scaled(plan.table.base, plan.table, plan.steps).pretrain.steps,
         "max_points": plan.max_points,
+        "truth": None if plan.truth is None else {"path": str(plan.truth.path), "tau": plan.truth.tau},
         "seeds": plan.seeds,
         "data": dump(replace(plan.data, path=plan.data.path.resolve())),
         "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},

@@ -11,20 +11,21 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-METRICS = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3)}
-"""Heads and digits of the numbers whose difference is shown as it is; that of points is shown in percent."""
+METRICS = {"psnr": 2, "ssim": 3, "points": None, "f1": 3}
+"""Digits of the numbers that are shown with their difference, which for points is in percent."""
 
 LEGEND = (
     "Numbers are means over the seeds ± standard deviation. Differences are to the row that a row is built on, the "
-    "last one above that is not in brackets; ± is the standard error of the differences between runs of one seed."
+    "last one above that is not in brackets; ± is the standard error of the differences between runs of one seed. "
+    "CPU minutes are of all processors, with the depth maps that were made for the run, and without its mesh."
 )
 STACKED = "Below each number are the difference and, dimmed, what was published with its difference."
 
 
 def lines(report: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of texts, with the published figures in columns of their own where there are any."""
-    head = ["", "row", "seeds", "PSNR", "diff.", "SSIM", "diff.", "points", "diff.", "minutes"]
-    head += [f"paper: {name}" for name in ("PSNR", "diff.", "SSIM", "diff.", "points", "diff.", "F1", "diff.")]
+    names = ("PSNR", "diff.", "SSIM", "diff.", "points", "diff.", "F1", "diff.")
+    head = ["", "row", "seeds", *names, "minutes", "CPU min", *(f"paper: {name}" for name in names)]
     return head, [[*_own(report, row), *_published(report, row)] for row in report["rows"]]
 
 
@@ -54,14 +55,14 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
         running: Label of the row at work.
     """
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
-    for head in ("", "row", "seeds", "PSNR", "SSIM", "points", "min"):
+    for head in ("", "row", "seeds", "PSNR", "SSIM", "points", "F1", "min", "CPU min"):
         table.add_column(head, justify="left" if head == "row" else "right", no_wrap=head != "row")
     for row in report["rows"]:
-        number, label, seeds, *own, minutes = _own(report, row)
+        number, label, seeds, *own, minutes, cpu = _own(report, row)
         paper = _published(report, row)
         style = "red" if row["failed"] else "bold" if row["label"] == running else "" if row["kept"] else "italic"
-        cells = [_stacked(*own[i : i + 2], *paper[i : i + 2], style) for i in (0, 2, 4)]
-        table.add_row(number, Text(label, style), seeds, *cells, minutes)
+        cells = [_stacked(*own[i : i + 2], *paper[i : i + 2], style) for i in (0, 2, 4, 6)]
+        table.add_row(number, Text(label, style), seeds, *cells, minutes, cpu)
     return table
 
 
@@ -71,25 +72,29 @@ def _stacked(value: str, step: str, paper: str, paper_step: str, style: str) -> 
 
 
 def _own(report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
-    """Number, label, seeds, then value and difference of PSNR, SSIM and points, then minutes."""
+    """Number, label, seeds, then value and difference of PSNR, SSIM, points and F1, then minutes and those of CPUs."""
     label = row["label"] if row["kept"] else f"({row['label']})"
     cells = [str(row["number"]), label, "failed" if row["failed"] else f"{len(row['runs'])}/{report['seeds']}"]
     mean, sd, step = row["mean"], row["sd"], row["difference"]
     if not mean:
-        return [*cells, *[""] * 7]
-    for name, (_, digits) in METRICS.items():
-        cells.append(_spread(f"{mean[name]:.{digits}f}", sd[name], digits))
-        cells.append(_difference(step[name], 1, digits) if step else "")
-    cells.append(f"{mean['points']:,.0f}" + (f" ± {sd['points']:,.0f}" if sd["points"] is not None else ""))
-    cells.append(_difference(step["points"], 100 / step["points"]["base"], 1, " %") if step else "")
-    return [*cells, f"{mean['seconds'] / 60:.1f}"]
+        return [*cells, *[""] * 10]
+    for name, digits in METRICS.items():
+        if name not in mean:
+            cells += ["", ""]
+        elif digits is None:
+            cells.append(f"{mean[name]:,.0f}" + (f" ± {sd[name]:,.0f}" if sd[name] is not None else ""))
+            cells.append(_difference(step[name], 100 / step[name]["base"], 1, " %") if name in step else "")
+        else:
+            cells.append(_spread(f"{mean[name]:.{digits}f}", sd[name], digits))
+            cells.append(_difference(step[name], 1, digits) if name in step else "")
+    return [*cells, f"{mean['seconds'] / 60:.1f}", f"{mean['cpu_seconds'] / 60:.1f}"]
 
 
 def _published(report: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
     """Value and difference in print of PSNR, SSIM, points and F1."""
     paper, step = row["paper"], row["paper_difference"]
     cells = []
-    for name, digits in {"psnr": 2, "ssim": 3, "points": None, "f1": 3}.items():
+    for name, digits in METRICS.items():
         if digits is None:
             cells.append(f"{paper[name] / 1e6:.2f} M" if name in paper else "")
             cells.append(f"{100 * step[name] / (paper[name] - step[name]):+.1f} %" if name in step else "")

@@ -25,8 +25,11 @@ def scene(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--data", "d"], "no table chosen: add one of table:model, table:gradient"),
-        (["table:modle", "--data", "d"], "no table named 'modle'; did you mean 'model'? known: model, gradient"),
+        (["--data", "d"], "no table chosen: add one of table:model, table:gradient, table:surface"),
+        (
+            ["table:modle", "--data", "d"],
+            "no table named 'modle'; did you mean 'model'? known: model, gradient, s",
+        ),
         (["table:model", "table:gradient", "--data", "d"], "table is chosen twice: table:model, table:gradient; keep"),
         (["table:model"], "--data PATH missing; see surfkit ablate --help"),
         (
@@ -35,6 +38,8 @@ def scene(tmp_path_factory):
         ),
         (["table:model", "--data", "d", "--seeds", "0"], "--seeds 0: give 1 or more"),
         (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 or more"),
+        (["table:model", "--data", "d", "--tau", "1"], "--tau 1: it belongs to the truth; name that with --gt"),
+        (["table:model", "--data", "d", "--gt", "t", "--tau", "0"], "--tau 0: it is a length, so it must be above 0"),
         (["table:model", "--data", "d"], "d: no such folder; "),
         (["table:model", "--data", "d", "--scale", "0.5"], "--scale 0.5: it divides the size"),
     ],

@@ -1,6 +1,7 @@
 """Every row of every table builds, and a table is what the paper means by one."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -12,8 +13,9 @@ from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe
-from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, TABLES
-from surfkit.report.ablation import Row, Table, build, built_on, pick, scaled
+from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, SURFACE, TABLES
+from surfkit.recipes.surface import SURFACE as BEST
+from surfkit.report.ablation import Row, Table, build, built_on, capped, pick, scaled
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
 LADDER = Table(
@@ -34,8 +36,9 @@ def test_every_row_is_a_recipe(name, label):
     recipe = build(table)[label]
     assert load(Recipe, json.loads(json.dumps(dump(recipe), allow_nan=False))) == recipe
     short = with_steps(recipe, 600)
-    assert short.pretrain.steps == 600 and short.pretrain.densify.until == 300
-    assert short.pretrain.losses["normal"].start == 140
+    assert short.pretrain.steps == 600
+    if table is not SURFACE:
+        assert short.pretrain.densify.until == 300 and short.pretrain.losses["normal"].start == 140
     assert label in recipe.about and name in recipe.about
 
 
@@ -48,11 +51,26 @@ def test_every_row_changes_what_it_is_built_on(name, label):
     after = build(table)[label]
     for path, value in row.change.items():
         before = evolve(before, path, value)
-    assert before.pretrain == after.pretrain and before.primitive == after.primitive
-    assert after.pretrain.policies, "all these tables are about how points multiply"
+    assert before == replace(after, about=before.about)
+    if table is SURFACE:
+        assert (before == (build(table)[below] if below else table.base)) == (below is None), "a row changes something"
+    else:
+        assert after.pretrain.policies, "these tables are about how points multiply"
 
 
-@pytest.mark.parametrize("name", TABLES)
+def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_wants_its_maps():
+    recipes = build(SURFACE)
+    last = [row.label for row in SURFACE.rows if row.kept][-1]
+    assert recipes[last] == replace(BEST, about=recipes[last].about)
+    first, *others = recipes.values()
+    assert first.depth is None and "depth" not in first.pretrain.losses and first.pretrain.densify is not None
+    assert all(recipe.depth is not None and recipe.mesh is not None for recipe in others)
+    alone = recipes["stereo alone (mesh:stereo)"]
+    assert alone.mesh.needs_prior and scaled(alone, SURFACE, 2_000).pretrain.steps == 1
+    assert capped(recipes[last], 500).start.most == 500
+
+
+@pytest.mark.parametrize("name", ["model", "gradient"])
 def test_every_row_has_its_published_figures(name):
     for row in TABLES[name].rows:
         assert row.paper.keys() == {"psnr", "ssim", "f1", "points"}

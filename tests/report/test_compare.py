@@ -38,6 +38,13 @@ def test_one_seed_has_no_error_and_none_no_difference():
     assert deviation([4.0]) is None and deviation([1.0, 3.0]) == pytest.approx(2**0.5)
 
 
+def test_numbers_that_not_all_runs_have_are_left_out():
+    some, other = run(22.0) | {"f1": 0.5}, run(21.0)
+    (row, *_) = compare(TABLE, {"base": {0: some, 1: other}})
+    assert "f1" not in row["mean"] and row["mean"]["psnr"] == 21.5
+    assert "f1" not in difference({0: some}, {0: other}) and difference({0: some}, {0: some})["f1"]["base"] == 0.5
+
+
 def test_rows_are_compared_with_the_kept_one():
     base, more, most = compare(TABLE, {"base": {0: run(20.0), 1: run(22.0)}, "most": {0: run(23.0)}})
     assert base["mean"]["psnr"] == 21 and base["sd"]["psnr"] == pytest.approx(2**0.5) and base["difference"] == {}
@@ -57,3 +64,5 @@ def test_figures_are_found_in_the_metrics():
         "seconds": 4.0,
         "cpu_seconds": 5.0,
     }
+    more = figures(metrics | {"prepare_cpu_seconds": 2.0, "geometry": {"f1": 0.5, "precision": 0.4}})
+    assert more == figures(metrics) | {"f1": 0.5, "cpu_seconds": 7.0}

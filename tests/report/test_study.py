@@ -112,10 +112,10 @@ def test_what_is_saved(data, runs, tmp_path):
     assert report["rows"][2]["change"] == {"primitive.sh_degree": 1} and report["rows"][1]["kept"] is False
     page = (tmp_path / "ablation.md").read_text()
     own = "| 3 | less \\| more | 2/2 | 23.50 ± 0.71 | +3.00 ± 0.00 | 0.500 ± 0.000 | +0.000 ± 0.000 | 100 ± 0 | "
-    assert own + "-66.7 ± 0.0 % | 1.5 | 22.24 | +1.12 |  |  | 9.51 M | -0.3 % |  |  |" in page
+    assert own + "-66.7 ± 0.0 % |  |  | 1.5 | 1.7 | 22.24 | +1.12 |  |  | 9.51 M | -0.3 % |  |  |" in page
     assert "| 2 | (same) |" in page and page.startswith("# table:twins\n")
     widths = {line.replace("\\|", "").count("|") for line in page.splitlines() if line.startswith("|")}
-    assert widths == {19}
+    assert widths == {22}
 
 
 def test_an_interrupted_table_goes_on(data, runs, tmp_path):
@@ -191,6 +191,50 @@ def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs,
     plan.out.write_text("")
     with pytest.raises(BadInput, match="a file, not a folder"):
         ablate(plan, Silent())
+
+
+def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp_path):
+    from surfkit.report import truth
+
+    calls = []
+
+    class Opened:
+        def __init__(self, folder):
+            self.data, self.mesh, self.mesh_record, self.metrics = (
+                data,
+                folder / "mesh.ply",
+                folder,
+                folder / "metrics.json",
+            )
+
+    def measure(files, settings, out, views, frame):
+        if "bad" in calls:
+            raise BadInput("nowhere near")
+        calls.append(settings.crop)
+        write_json(out / "crop.json", {})
+        return {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
+
+    monkeypatch.setattr(truth, "opened", Opened)
+    monkeypatch.setattr(truth, "measure_geometry", measure)
+    gt = tmp_path / "gt.ply"
+    vertices = "".join(f"{x} {y} 0\n" for x in range(20) for y in range(20))
+    head = "ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\n"
+    gt.write_text(f"{head}end_header\n{vertices}")
+    plan = Plan(TABLE, data, tmp_path / "out", truth=truth.Truth(gt, 0.5))
+    assert all(trial.recipe.mesh is not None for trial in trials(plan)), "rows without a mesh get one"
+    report = ablate(plan, Silent())
+    assert [row["mean"]["f1"] for row in report["rows"]] == [0.25, 0.25, 0.5]
+    assert report["rows"][2]["difference"]["f1"]["mean"] == 0.25
+    assert calls == ["auto", str(plan.truth.crop(plan.out))], "the second row is measured in the volume of the first"
+    assert "| 0.500 | +0.250 | 1.5 | 1.7 |" in (plan.out / "ablation.md").read_text()
+    assert ablate(plan, Silent()) == report and len(calls) == 2 and len(runs.calls) == 2
+    calls.append("bad")
+    other = ablate(replace(plan, truth=truth.Truth(gt, 0.25)), Silent())
+    assert len(runs.calls) == 2 and other["rows"][0]["failed"] == "seed 0: nowhere near", "nothing is trained again"
+    assert other["rows"][0]["mean"]["psnr"] == 20 and "f1" not in other["rows"][0]["mean"]
+    with pytest.raises(BadInput, match="gone.ply"):
+        ablate(replace(plan, out=tmp_path / "new", truth=truth.Truth(tmp_path / "gone.ply")), Silent())
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_fingerprint_tells_what_a_run_is_made_from(data, monkeypatch):

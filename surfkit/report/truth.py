@@ -1,0 +1,78 @@
+"""F1 of the meshes of an ablation table, all in one crop volume."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json, write_json
+from surfkit.evaluate.comparison import Comparison, truth_side
+from surfkit.evaluate.geometry import measure_geometry
+from surfkit.evaluate.surface import read_surface
+from surfkit.folder import note_metrics
+from surfkit.pipeline import opened
+from surfkit.scene.read import read
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What meshes are compared with.
+
+    Attributes:
+        path: A mesh, or a cloud of points.
+        tau: Distance below which a point counts as right; None for what the spacing of a cloud gives.
+    """
+
+    path: Path
+    tau: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", self.path.resolve())
+        self.settings  # noqa: B018 (refuses a threshold of no length)
+
+    @property
+    def settings(self) -> Comparison:
+        """How meshes are compared."""
+        return Comparison(tau=self.tau, classes=False)
+
+    def refuse_unusable(self) -> None:
+        """BadInput for a file that no mesh could be compared with."""
+        truth_side(read_surface(self.path), self.settings)
+
+    def crop(self, out: Path) -> Path:
+        """Where the crop volume of all rows is kept in the folder of a table."""
+        digest = hashlib.sha256(f"{self.path} {self.tau}".encode()).hexdigest()[:12]
+        return out / f"crop-{digest}.json"
+
+    def known(self, metrics: Mapping[str, Any]) -> bool:
+        """Whether the metrics of a run have its F1 against this."""
+        geometry = metrics.get("geometry") or {}
+        given = self.tau is None or geometry.get("tau") == self.tau
+        return geometry.get("truth") == str(self.path) and given
+
+    def measure(self, folder: Path, out: Path) -> dict[str, Any]:
+        """Compare the mesh of a run, and return its metrics with what came out.
+
+        The first run that is measured decides the crop volume by its views; the others take it from there.
+
+        Args:
+            folder: Of the run.
+            out: Of the table.
+
+        Raises:
+            BadInput: There is no mesh, or it is nowhere near the truth.
+        """
+        this = opened(folder)
+        if not this.mesh_record.exists():
+            raise BadInput(f"{folder}: no mesh that could be compared with {self.path}")
+        crop, scene = self.crop(out), read(this.data)
+        settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
+        files = (this.mesh, self.path)
+        found = measure_geometry(files, settings, folder / "geometry", scene.train, scene.frame)
+        if not crop.exists():
+            write_json(crop, read_json(folder / "geometry" / "crop.json", Any))
+        return note_metrics(this.metrics, {"geometry": found})
