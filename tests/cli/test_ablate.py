@@ -37,7 +37,7 @@ def scene(tmp_path_factory):
             "--rows: no row named 'DGD'; did you mean '+ DGD'? ",
         ),
         (["table:model", "--data", "d", "--seeds", "0"], "--seeds 0: give 1 or more"),
-        (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 or more"),
+        (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 to 100000000"),
         (["table:model", "--data", "d", "--tau", "1"], "--tau 1: it belongs to the truth; name that with --gt"),
         (["table:model", "--data", "d", "--gt", "t", "--tau", "0"], "--tau 0: it is a length, so it must be above 0"),
         (["table:model", "--data", "d"], "d: no such folder; "),
