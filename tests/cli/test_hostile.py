@@ -136,6 +136,15 @@ def test_links_to_themselves_and_folders_are_one_line(made, capsys, tmp_path):
         ("prepare depth {m}/data --estimator.longest 100000000000000000000", "longest is .* between 1 and 20000"),
         ("prepare depth {m}/data --estimator.max-planes 1000000000", "max_planes is .* between 3 and 10000"),
         ("prepare depth {m}/data --estimator.margin nan", "margin is nan"),
+        (
+            "prepare depth {m}/data --again estimator:patch-match --estimator.longest 100000000000000000000",
+            "longest is .* between 32 and 20000",
+        ),
+        ("prepare depth {m}/data --again estimator:patch-match --estimator.agree 0", "agree is 0; .* between 1 and 16"),
+        (
+            "prepare depth {m}/data --again --longest 12 estimator:patch-match --estimator.window 17",
+            r"window is 17, and .* is 12 x 9 .* to 9",
+        ),
         ("mesh {m}/run mesh:tetra --mesh.bisections 1000000", "give 0 to 52"),
         ("mesh {m}/run --memory 99999999999999999999999TB", "--memory .* at most 1000TB"),
         ("train recipe:2dgs --data {m}/data --steps 1000000000000000", "--steps 1000000000000000: give 1 to 100000000"),
