@@ -110,7 +110,7 @@ SURFACE = Table(
     (
         Row("2DGS, sparse points"),
         Row("+ stereo depth as a loss", DEPTH | {"depth": BEST.depth}),
-        Row("+ dense start", {"start": BEST.start, "pretrain.densify": None}),
+        Row("+ dense start", {"start": BEST.start, "pretrain.densify": BEST.pretrain.densify}),
         Row("+ constant depth weight", {"pretrain.losses.depth": BEST.pretrain.losses["depth"]}),
         Row("+ stereo normals", {"pretrain.losses.prior": BEST.pretrain.losses["prior"]}),
         Row("+ normals of depth", {"pretrain.losses.normal": BEST.pretrain.losses["normal"]}),

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-import trimesh
+from needs import needs
 
 from surfkit.blocks import Record
 from surfkit.cli import main
@@ -18,6 +18,8 @@ from surfkit.pipeline import run, with_steps
 from surfkit.scene.data import Data
 from surfkit.scene.ply import write_points
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+trimesh = needs("trimesh")
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-import trimesh
+from needs import needs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -26,6 +26,8 @@ from surfkit.scene.scene import Frame, View
 from surfkit.scene.synthetic import Flight, photograph
 
 from .test_crop_volume import exact_visible, overhead, synthetic_points
+
+trimesh = needs("trimesh")
 
 TAU = 0.5
 HOUSES = [((-12, -10), (-4, -3), 5.0), ((3, -8), (9, 6), 8.0), ((-10, 4), (-5, 12), 3.0)]

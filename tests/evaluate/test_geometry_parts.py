@@ -216,7 +216,7 @@ def test_transform_files_of_others(tmp_path):
         ("a.txt", "1 0.1 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "shears"),
         ("a.txt", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 5 1", "end with the row"),
         ("a.json", '{"pose": []}', "no matrix in it under"),
-        ("a.json", "{", "four rows of four numbers"),
+        ("a.json", "{", "not JSON"),
     ],
 )
 def test_bad_transform_files(tmp_path, name, text, message):

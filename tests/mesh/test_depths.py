@@ -2,12 +2,14 @@
 
 import numpy as np
 import torch
-import trimesh
+from needs import needs
 
 from surfkit.mesh.depths import mesh_depth
 from surfkit.scene.camera import Camera
 
 from .shapes import look_at, seen, sphere
+
+trimesh = needs("trimesh")
 
 
 def test_depth_of_a_ball():

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import trimesh
+from needs import needs
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clean
 from surfkit.mesh.holes import close_holes, fill
+
+trimesh = needs("trimesh")
 
 
 def ball(without=()):
