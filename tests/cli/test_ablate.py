@@ -34,7 +34,7 @@ def scene(tmp_path_factory):
             "--rows: no row named 'DGD'; did you mean '+ DGD'? ",
         ),
         (["table:model", "--data", "d", "--seeds", "0"], "--seeds 0: give 1 or more"),
-        (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 or more"),
+        (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 to 100000000"),
         (["table:model", "--data", "d"], "d: no such folder; "),
         (["table:model", "--data", "d", "--scale", "0.5"], "--scale 0.5: it divides the size"),
     ],
