@@ -67,10 +67,12 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
 
 def _with_numbers(settings: T, at: str = "") -> T:
-    """The settings, or BadInput if one at any depth is nan: it passes most checks, and makes nothing right."""
+    """The settings, or BadInput if one at any depth is nan, which passes most checks, or has no place in 64 bits."""
     inner: Iterable[tuple[Any, Any]] = ()
     if isinstance(settings, float) and math.isnan(settings):
         raise BadInput(f"{at.removeprefix('recipe.')} is nan, which is no number")
+    if isinstance(settings, int) and abs(settings) >= 2**63:
+        raise BadInput(f"{at.removeprefix('recipe.')} is {settings}; whole numbers lie within 9.2e18 of 0")
     if is_dataclass(settings):
         inner = ((field.name, getattr(settings, field.name)) for field in fields(settings))
     elif isinstance(settings, dict):

@@ -68,7 +68,8 @@ def require_within(ranges: Mapping[str, tuple[float, float]], settings: object) 
     for name, (least, most) in ranges.items():
         value = getattr(settings, name)
         if not least <= value <= most:
-            raise BadInput(f"{name} is {value:g}; it must lie between {least:g} and {most:g}")
+            shown = f"{value:g}" if isinstance(value, float) else value  # as a float, a whole number may be too large
+            raise BadInput(f"{name} is {shown}; it must lie between {least:g} and {most:g}")
 
 
 def few(names: Sequence[str], most: int = 3) -> str:

@@ -1,7 +1,10 @@
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from surfkit.core.check import BadInput, collecting, expect, few, leaving_out, reject
+from surfkit.core.check import BadInput, collecting, expect, few, leaving_out, reject, require_within
 
 
 def test_letters_are_bound_and_passed_on():
@@ -61,3 +64,17 @@ def test_faults_are_raised_unless_they_are_collected():
 def test_a_few_names_stand_for_many():
     assert few(["a"]) == "'a'" and few(["a", "b", "c"]) == "'a', 'b', 'c'"
     assert few(list("abcde")) == "'a', 'b', 'c' and 2 more"
+
+
+def test_settings_outside_their_range_are_named():
+    ranges = {"a": (1, 5), "b": (0.5, 2.0)}
+    require_within(ranges, SimpleNamespace(a=1, b=2.0))
+    for a, b, said in (
+        (0, 1.0, "a is 0; it must lie between 1 and 5"),
+        (2, math.nan, "b is nan; it must lie between 0.5 and 2"),
+        (10**400, 1.0, f"a is {10**400}; it"),
+        (2, math.inf, "b is inf; it"),
+    ):
+        with pytest.raises(BadInput) as caught:
+            require_within(ranges, SimpleNamespace(a=a, b=b))
+        assert str(caught.value).startswith(said)
