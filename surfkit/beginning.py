@@ -61,7 +61,7 @@ def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
     if needed and not known.fits:
         raise BadInput(
             f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; make "
-            f"some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:plane-sweep, or "
+            f"some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match, or "
             "choose start:sparse"
         )
     return known

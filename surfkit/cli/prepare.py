@@ -35,7 +35,8 @@ class Depth:
     """Estimate the depth of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
     An interrupted estimate goes on when the same command is given again. Choose how with `estimator:plane-sweep`
-    (several photographs, no weights) or `estimator:depth-anything-v2` (one photograph, a network).
+    or `estimator:patch-match` (several photographs, no weights), or `estimator:depth-anything-v2` (one photograph, a
+    network).
     """
 
     data: Annotated[Path, tyro.conf.Positional]

@@ -111,10 +111,10 @@ class PatchMatch(DepthEstimator):
 
     def refuse_unfit(self, views: Sequence[View]) -> None:
         """See `DepthEstimator.refuse_unfit`."""
+        require_native()
         refuse_wide_window(self.window, self.longest, views)
 
     def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
-        require_native()
         work = Work(self, given, neighbours(given.views, given.observations, self.neighbours, self.angle))
         for at in wanted:
             found = work.consistent(at)
@@ -224,7 +224,7 @@ class Work:
         return Map.unpacked(numbers) if len(numbers) else None
 
     def match(self, at: int) -> Map | None:
-        """By photometric consistency, from coarse to fine; None without neighbours or sparse points."""
+        """By photometric consistency, from coarse to fine; None without neighbours, parallax or sparse points."""
         others = self.pairs[at]
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         begun = self.sweep.sweep(
@@ -237,6 +237,8 @@ class Work:
             here, there = self.grey(at, level), [self.grey(o, min(level, self.levels(o))) for o in others]
             planes = planes.resized(here.camera.height, here.camera.width)
             parallax = parallax_of(here, there, planes)
+            if parallax <= 0:
+                return None  # all were taken from the same place
             for index in range(self.passes(level)):
                 terms = self.terms(span, parallax, index)
                 improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)

@@ -171,6 +171,15 @@ def test_views_without_points_have_no_depth(farm, tmp_path):
     assert estimate.inverse is None and estimate.confidence is None
 
 
+def test_photographs_from_one_place_have_no_depth(farm, tmp_path):
+    scene, tracks, _ = farm
+    views = [replace(view, camera=scene.train[7].camera) for view in scene.train]
+    (estimate,) = PatchMatch(longest=40, coarsest=32, neighbours=2, best=1).estimate(
+        Material(views, tracks, CPU, tmp_path), [7]
+    )
+    assert estimate.inverse is None
+
+
 def test_settings_that_make_no_sense_are_refused():
     for setting in (
         {"window": 4},
