@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -25,9 +26,14 @@ class Grey:
     camera: Camera
     value: np.ndarray
 
+    @cached_property
     def packed(self) -> np.ndarray:
-        """(H, W) uint32: a pixel, and those to the right, below, and below to the right, which interpolate it."""
-        wide = np.pad(self.value, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
+        """(H + 2 b, W + 2 b) uint32: a pixel, and those to the right, below, and below to the right, for interpolation.
+
+        Continued by a border of b pixels.
+        """
+        border = module().STEREO_BORDER
+        wide = np.pad(self.value, (border, border + 1), mode="edge").astype(np.uint32)
         return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
 
     def padded(self) -> np.ndarray:
@@ -81,8 +87,11 @@ class Terms:
         smoothness: Cost of a difference of one pixel of parallax from the neighbours.
         consistency: Cost of a reprojection error of one pixel.
         spread: Difference of grey values, of 255, at which a pixel of the window counts 1 / e.
+        samples: Pixels of a window that are compared; 16 or 32.
         best: Views that count for a pixel.
         window: Side of the windows compared, pixels; odd.
+        survey: Look at all views anew, to choose those that count.
+        same_px: Parallax by which planes must differ to be tried both.
     """
 
     low: float
@@ -92,9 +101,11 @@ class Terms:
     smoothness: float
     consistency: float
     spread: float
+    samples: int
     best: int
     window: int
-    survey: bool = True
+    survey: bool
+    same_px: float = 0.06
 
 
 def improve(
@@ -121,13 +132,23 @@ def improve(
         here.padded(),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         pattern(terms.window),
-        [other.packed() for other in others],
+        [other.packed for other in others],
         ways,
         list(known or [None] * len(others)),
         planes.value,
         planes.cost,
         planes.each,
-        [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread],
+        [
+            terms.low,
+            terms.high,
+            terms.parallax,
+            terms.jitter_px,
+            terms.smoothness,
+            terms.consistency,
+            terms.spread,
+            terms.same_px,
+        ],
+        terms.samples,
         terms.best,
         terms.survey,
         seed % 2**32,
@@ -148,16 +169,21 @@ def require_native() -> None:
 def pattern(window: int) -> np.ndarray:
     """(3, S) float32: x and y of the S pixels of a window that are compared, and their weights; 0 for unused ones.
 
-    As many as there is room for, those of an even coarser grid first, then those next to the middle.
+    As many as there is room for: those of an even coarser grid first, then those next to the middle. The first half
+    alone is such a pattern too.
     """
     room, half = module().STEREO_SAMPLES, window // 2
-    step = next(step for step in range(1, window) if len(range(-half, half + 1, step)) ** 2 <= room)
-    grid = [(x, y) for y in range(-half, half + 1, step) for x in range(-half, half + 1, step)]
-    more = [(x, y) for y in range(-half, half + 1) for x in range(-half, half + 1) if (x, y) not in grid]
-    chosen = np.array((grid + sorted(more, key=lambda at: at[0] ** 2 + at[1] ** 2))[:room], np.float32).T
+    chosen: list[tuple[int, int]] = []
+    for some in (room // 2, room):
+        step = next(step for step in range(1, window) if len(range(-half, half + 1, step)) ** 2 <= some)
+        grid = [(x, y) for y in range(-half, half + 1, step) for x in range(-half, half + 1, step)]
+        every = [(x, y) for y in range(-half, half + 1) for x in range(-half, half + 1)]
+        wanted = grid + sorted(every, key=lambda at: at[0] ** 2 + at[1] ** 2)
+        chosen += [at for at in dict.fromkeys(wanted) if at not in chosen][: some - len(chosen)]
     found = np.zeros((3, room), np.float32)
-    found[:2, : chosen.shape[1]] = chosen
-    found[2, : chosen.shape[1]] = np.exp(-np.square(chosen).sum(0) / (2 * half**2))
+    at = np.array(chosen, np.float32).T
+    found[:2, : at.shape[1]] = at
+    found[2, : at.shape[1]] = np.exp(-np.square(at).sum(0) / (2 * half**2))
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import ClassVar
 
@@ -27,10 +27,12 @@ from surfkit.scene.scene import View
 
 KEPT = 64
 """Pictures and maps kept in memory."""
-JITTER_PX = (2.0, 1.0, 0.5, 0.25, 0.12)
-"""Parallax by which planes are changed at random, in one pass after the other."""
-LAST_PASS = 2
-"""As many changes as in this pass are tried when depth maps are compared."""
+JITTER_PX = 0.5
+"""Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
+LAST_JITTER_PX = 0.25
+"""Of the pass that compares depth maps."""
+FEW, MANY = 16, 32
+"""Pixels of a window that are compared in small pictures, and at full size."""
 RANGES = {
     "longest": (32, 20_000),
     "neighbours": (1, 16),
@@ -39,7 +41,7 @@ RANGES = {
     "window": (3, 17),
     "spread": (1e-4, 100),
     "smoothness": (0, 1000),
-    "passes": (1, len(JITTER_PX)),
+    "passes": (1, 8),
     "consistency": (0, 1000),
     "coarsest": (32, 1000),
     "tolerance_px": (1e-6, 1000),
@@ -66,7 +68,7 @@ class PatchMatch(DepthEstimator):
     neighbours: int = 8
     """Photographs that each one is compared with."""
 
-    angle: float = 8.0
+    angle: float = 12.0
     """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
 
     best: int = 3
@@ -83,12 +85,13 @@ class PatchMatch(DepthEstimator):
     that of a wrong match."""
 
     passes: int = 3
-    """Passes over the pixels at each size; the last one at full size compares depth maps."""
+    """Passes over the pixels at the smallest size, and one less at the larger ones, where the last one compares depth
+    maps at full size."""
 
     consistency: float = 0.1
     """Cost of one pixel of reprojection error in the depth maps of the photographs compared; 0 compares none."""
 
-    coarsest: int = 160
+    coarsest: int = 80
     """Longest side of the pictures in which the planes begin, pixels."""
 
     tolerance_px: float = 1.0
@@ -126,7 +129,7 @@ class PatchMatch(DepthEstimator):
         others = [(work.camera(near, 0), other.inverse) for near in work.pairs[at] if (other := work.consistent(near))]
         share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
         count, fused = agreement(camera, found.inverse, others, share)
-        trust = (count / min(self.agree, max(1, len(others)))).clamp_max(1) * found.matched
+        trust = (count / min(self.agree, max(1, len(others)))).clamp_max(1) * found.matched(self.best)
         trust[at_edge(found.inverse, self.window // 2, self.edge)] = 0
         return Estimate(at, fused, trust, found.normals(camera))
 
@@ -137,24 +140,30 @@ class Map:
 
     Attributes:
         value: (H, W, 3) float32, see `Planes`.
-        matched: (H, W) float32 in [0, 1], how well they match.
+        each: (H, W, V) uint8, see `Planes`; of all photographs that this one is compared with.
         parallax: Pixels by which the photographs move that it is compared with, a unit of inverse depth.
     """
 
     value: np.ndarray
-    matched: Tensor
+    each: np.ndarray
     parallax: float
 
     def packed(self) -> np.ndarray:
-        """(H, W, 5) float32, for a file."""
-        flat = np.full(self.matched.shape, self.parallax, np.float32)
-        return np.concatenate([self.value, self.matched.numpy()[..., None], flat[..., None]], 2)
+        """(H, W, 16 + V) uint8, for a file."""
+        flat = np.full(self.value.shape[:2], self.parallax, np.float32)
+        numbers = np.concatenate([self.value, flat[..., None]], 2)
+        return np.concatenate([numbers.view(np.uint8), self.each], 2)
 
     @classmethod
-    def unpacked(cls, numbers: np.ndarray) -> Map:
+    def unpacked(cls, packed: np.ndarray) -> Map:
         """From what is packed."""
-        value, matched = np.ascontiguousarray(numbers[..., :3]), torch.from_numpy(numbers[..., 3].copy())
-        return cls(value, matched, float(numbers[0, 0, 4]))
+        numbers = np.ascontiguousarray(packed[..., :16]).view(np.float32)
+        return cls(np.ascontiguousarray(numbers[..., :3]), packed[..., 16:], float(numbers[0, 0, 3]))
+
+    def matched(self, best: int) -> Tensor:
+        """(H, W) float32 in [0, 1], how well the best views match."""
+        costs = np.sort(self.each, 2)[..., :best].mean(2, dtype=np.float32)
+        return torch.from_numpy(1 - costs / 255)
 
     @property
     def inverse(self) -> Tensor:
@@ -218,7 +227,7 @@ class Work:
         path = self.given.work / what.replace(" ", "-") / f"{at:06d}.npy"
         if not path.exists():
             made = make(at)
-            save_array(path, np.zeros(0, np.float32) if made is None else made.packed())
+            save_array(path, np.zeros(0, np.uint8) if made is None else made.packed())
             emit(Progress(what, len(list(path.parent.glob("*.npy"))), len(self.given.views)))
         numbers = np.load(path)
         return Map.unpacked(numbers) if len(numbers) else None
@@ -239,50 +248,54 @@ class Work:
             parallax = parallax_of(here, there, planes)
             if parallax <= 0:
                 return None  # all were taken from the same place
-            for index in range(self.passes(level)):
-                terms = self.terms(span, parallax, index)
+            passes = self.passes(level, at)
+            for index in range(passes):
+                terms = replace(
+                    self.terms(span, parallax),
+                    jitter_px=JITTER_PX * 2 ** (passes - 1 - index),
+                    samples=MANY if level == 0 else FEW,
+                    survey=index == 0 and level == self.levels(at),
+                )
                 improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
-        return self.map(planes, parallax)
+        return Map(planes.value, planes.each, parallax)
 
-    def passes(self, level: int) -> int:
+    def passes(self, level: int, at: int) -> int:
         """Of photometric consistency; at full size, the pass that compares depth maps stands in for the last one."""
-        return max(1, self.settings.passes - (level == 0 and self.settings.consistency > 0))
+        fewer = (level < self.levels(at)) + (level == 0 and self.settings.consistency > 0)
+        return max(1, self.settings.passes - fewer)
 
     def reconcile(self, at: int) -> Map | None:
         """One more pass, which looks at the depth maps of the others too."""
         found = self.photometric(at)
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
-        others = [(near, other) for near in self.pairs[at] if (other := self.photometric(near)) is not None]
-        if found is None or span is None or not others:
-            return found
-        planes = Planes.at(found.value[..., 0], len(others))
-        planes.value[:] = found.value
-        known = [other.inverse.numpy() for _, other in others]
-        terms = self.terms(span, found.parallax, LAST_PASS, self.settings.consistency)
-        there = [self.grey(near, 0) for near, _ in others]
+        if found is None or span is None:
+            return None
+        known = [
+            None if (other := self.photometric(near)) is None else other.inverse.numpy() for near in self.pairs[at]
+        ]
+        planes = Planes.at(found.value[..., 0], len(known))
+        planes.value[:], planes.each[:] = found.value, found.each
+        terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
+        there = [self.grey(near, 0) for near in self.pairs[at]]
         improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30, known=known)
-        return self.map(planes, found.parallax)
+        return Map(planes.value, planes.each, found.parallax)
 
-    def terms(self, span: tuple[float, float], parallax: float, index: int, consistency: float = 0.0) -> Terms:
-        """Of a pass; the views that count are chosen anew in the first one."""
+    def terms(self, span: tuple[float, float], parallax: float) -> Terms:
+        """Of the pass that compares depth maps, but for the weight of that."""
         settings = self.settings
         return Terms(
             low=span[0],
             high=span[1],
             parallax=parallax,
-            jitter_px=JITTER_PX[index],
+            jitter_px=LAST_JITTER_PX,
             smoothness=settings.smoothness,
-            consistency=consistency,
+            consistency=0.0,
             spread=255 * settings.spread,
+            samples=MANY,
             best=settings.best,
             window=settings.window,
-            survey=index == 0 or consistency > 0,
+            survey=False,
         )
-
-    def map(self, planes: Planes, parallax: float) -> Map:
-        """The planes, and how well the best views match."""
-        best = np.sort(planes.each, 2)[..., : self.settings.best].mean(2, dtype=np.float32)
-        return Map(planes.value, torch.from_numpy(1 - best / 255), parallax)
 
 
 def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:

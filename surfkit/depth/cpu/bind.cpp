@@ -7,6 +7,7 @@
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <cmath>
 #include <optional>
 #include <string>
 #include <vector>
@@ -38,17 +39,17 @@ void add_stereo(nb::module_& m) {
         [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Words> pixels, std::vector<std::vector<double>> ways,
            std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
            nb::ndarray<float, nb::c_contig, nb::device::cpu> cost,
-           nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int best, bool survey,
+           nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int samples, int best, bool survey,
            uint32_t seed, const std::string& kernels, int threads) {
             std::vector<StereoSource> sources(pixels.size());
             for (size_t i = 0; i < pixels.size(); i++) {
                 StereoSource& s = sources[i];
                 s.pixels = pixels[i].data();
-                s.height = (int)pixels[i].shape(0);
-                s.width = (int)pixels[i].shape(1);
+                s.stride = (int)pixels[i].shape(1);
+                s.height = (int)pixels[i].shape(0) - 2 * kBorder;
+                s.width = s.stride - 2 * kBorder;
                 const std::vector<double>& way = ways.at(i);
-                for (int j = 0; j < 9; j++) s.a[j] = (float)way.at(j), s.back_a[j] = (float)way.at(12 + j);
-                for (int j = 0; j < 3; j++) s.b[j] = (float)way.at(9 + j), s.back_b[j] = (float)way.at(21 + j);
+                for (int j = 0; j < 12; j++) s.way[j] = (float)way.at(j), s.back[j] = (float)way.at(12 + j);
                 const std::optional<Floats>& map = inverse.at(i);
                 s.inverse = map ? map->data() : nullptr;
                 s.inverse_height = map ? (int)map->shape(0) : 0;
@@ -70,9 +71,15 @@ void add_stereo(nb::module_& m) {
             job.low = (float)settings.at(0), job.high = (float)settings.at(1);
             job.parallax = (float)settings.at(2);
             job.jitter_px = (float)settings.at(3);
+            job.same_px = (float)settings.at(7);
             job.smoothness = (float)settings.at(4);
             job.consistency = (float)settings.at(5);
             job.spread = (float)settings.at(6);
+            for (int i = 0; i < 256; i++) job.alike[i] = std::exp(-(float)i / job.spread);
+            float reach = 1;
+            for (int i = 0; i < 2 * kSamples; i++) reach = std::max(reach, std::abs(pattern.data()[i]));
+            job.stretch = (kBorder - 2) / reach;
+            job.samples = samples;
             job.best = best;
             job.survey = survey;
             job.seed = seed;
@@ -86,10 +93,11 @@ void add_stereo(nb::module_& m) {
                 });
         },
         nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("inverse"), nb::arg("plane"),
-        nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
+        nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("samples"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
         nb::arg("threads"));
     m.attr("STEREO_SAMPLES") = kSamples;
     m.attr("STEREO_RADIUS") = kRadius;
+    m.attr("STEREO_BORDER") = kBorder;
     m.attr("STEREO_MOST_VIEWS") = kMostViews;
 }
 

@@ -15,13 +15,15 @@
 namespace surfkit {
 namespace {
 
-constexpr int kVectors = kSamples / kLanes;
+constexpr int kVectors = kSamples / kLanes;  // at most
 constexpr float kNoise = 1.0f;       // variance of grey values below which a window shows nothing
 constexpr float kNothing = 2.0f;     // cost of a plane that a view does not show; more than that of any match
 constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
 constexpr float kMostError = 3.0f;   // pixels of reprojection
 constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
-constexpr float kSame = 0.06f;       // pixels of parallax by which planes differ that need not be tried
+constexpr float kNever = 1e9f;       // cost of a plane that is not tried
+constexpr int kTrials = 16;          // room for planes that are tried together
+constexpr int kFraction = 6, kOne = 1 << kFraction;  // of a pixel, to which positions are rounded
 
 struct Window {
     Floats weight[kVectors], centred[kVectors];  // weights that sum to 1; times the grey values less their mean
@@ -51,14 +53,12 @@ static inline float total(Floats v) {
     return out[0];
 }
 
-static inline Floats grey(Ints v, int shift) { return __builtin_convertvector((v >> shift) & 255, Floats); }
-
 SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
     const int stride = job.width + 2 * kRadius;
     const float* middle = job.image + (int64_t)(y + kRadius) * stride + x + kRadius;
     const float here = *middle, scale = -1.0f / job.spread;
     Floats value[kVectors], all = {}, mean = {};
-    for (int v = 0; v < kVectors; v++) {
+    for (int v = 0; v < job.samples / kLanes; v++) {
         const Ints at = __builtin_convertvector(
             load(job.offset_y + v * kLanes) * (float)stride + load(job.offset_x + v * kLanes), Ints);
         const Ints raw = gather((const uint32_t*)middle, at);
@@ -69,7 +69,7 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
     }
     const float turn = 1.0f / total(all), m = total(mean) * turn;
     Floats square = {};
-    for (int v = 0; v < kVectors; v++) {
+    for (int v = 0; v < job.samples / kLanes; v++) {
         out.weight[v] = out.weight[v] * turn;
         const Floats d = value[v] - m;
         out.centred[v] = out.weight[v] * d;
@@ -78,58 +78,124 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
     out.contrast = total(square) + kNoise;
 }
 
-// 1 - correlation of a window with what a view shows on a plane through it; kNothing if the view does not show the middle.
-SURFKIT_INLINE float compare(const StereoJob& job, const Window& window, const StereoSource& s, float x, float y, const Plane& p) {
-    const float base[3] = {s.a[0] * x + s.a[1] * y + s.a[2] + s.b[0] * p.w,
-                           s.a[3] * x + s.a[4] * y + s.a[5] + s.b[1] * p.w,
-                           s.a[6] * x + s.a[7] * y + s.a[8] + s.b[2] * p.w};
-    const float wide = (float)(s.width - 1), high = (float)(s.height - 1);
-    if (!(base[2] > 0) || !(base[0] >= 0) || !(base[1] >= 0) || base[0] > wide * base[2] || base[1] > high * base[2])
-        return kNothing;
-    const Floats hx = broadcast(s.a[0] + s.b[0] * p.gx), hy = broadcast(s.a[1] + s.b[0] * p.gy);
-    const Floats vx = broadcast(s.a[3] + s.b[1] * p.gx), vy = broadcast(s.a[4] + s.b[1] * p.gy);
-    const Floats zx = broadcast(s.a[6] + s.b[2] * p.gx), zy = broadcast(s.a[7] + s.b[2] * p.gy);
-    const Floats zero = {}, most_x = broadcast(wide), most_y = broadcast(high);
-    Floats sum = {}, square = {}, both = {};
-    for (int v = 0; v < kVectors; v++) {
-        const Floats dx = load(job.offset_x + v * kLanes), dy = load(job.offset_y + v * kLanes);
-        const Floats turn = reciprocal(madd(zx, dx, madd(zy, dy, broadcast(base[2]))));
-        const Floats at_x = higher(zero, lower(most_x, madd(hx, dx, madd(hy, dy, broadcast(base[0]))) * turn));
-        const Floats at_y = higher(zero, lower(most_y, madd(vx, dx, madd(vy, dy, broadcast(base[1]))) * turn));
-        const Ints left = __builtin_convertvector(at_x, Ints), above = __builtin_convertvector(at_y, Ints);
-        const Floats fx = at_x - __builtin_convertvector(left, Floats);
-        const Floats fy = at_y - __builtin_convertvector(above, Floats);
-        const Ints four = gather(s.pixels, above * s.width + left);
-        const Floats a = grey(four, 0), b = grey(four, 8), c = grey(four, 16), d = grey(four, 24);
-        const Floats upper = madd(fx, b - a, a), under = madd(fx, d - c, c);
-        const Floats value = madd(fy, under - upper, upper);
-        const Floats weighed = window.weight[v] * value;
-        sum += weighed;
-        square = madd(weighed, value, square);
-        both = madd(window.centred[v], value, both);
-    }
-    const Floats sums[4] = {sum, square, both, Floats{}};
-    alignas(64) float out[4];
-    sum_lanes(sums, 4, out);
-    const float variance = std::max(0.0f, out[1] - out[0] * out[0]) + kNoise;
-    return std::min(1.0f, std::max(0.0f, 1.0f - out[2] / std::sqrt(variance * window.contrast)));
+// Grey values between pixels, times 64 * 64, at fixed-point positions of which six bits are fractions. The four bytes of a
+// pixel are those that interpolation takes.
+SURFKIT_INLINE Ints between(const StereoSource& s, Ints x, Ints y) {
+    const Ints four = gather(s.pixels, (y >> kFraction) * s.stride + (x >> kFraction));
+    const Ints right = x & (kOne - 1), down = y & (kOne - 1);
+#if defined(__AVX512BW__)
+    const __m512i across = _mm512_maddubs_epi16((__m512i)four, (__m512i)(0x00ff00ff * right + 0x00400040));
+    return (Ints)_mm512_madd_epi16(across, (__m512i)(0xffff * down + kOne));
+#elif defined(__AVX2__) && !defined(__AVX512F__)
+    const __m256i across = _mm256_maddubs_epi16((__m256i)four, (__m256i)(0x00ff00ff * right + 0x00400040));
+    return (Ints)_mm256_madd_epi16(across, (__m256i)(0xffff * down + kOne));
+#else
+    const Ints upper = (four & 255) * (kOne - right) + (four >> 8 & 255) * right;
+    const Ints under = (four >> 16 & 255) * (kOne - right) + (four >> 24 & 255) * right;
+    return upper * (kOne - down) + under * down;
+#endif
 }
 
-// Pixels by which a pixel misses itself when it is carried to a view and back by the depth found there (ACMM).
-SURFKIT_INLINE float reprojection(const StereoSource& s, float x, float y, float w) {
-    const float z = s.a[6] * x + s.a[7] * y + s.a[8] + s.b[2] * w;
-    const float u = (s.a[0] * x + s.a[1] * y + s.a[2] + s.b[0] * w) / z;
-    const float v = (s.a[3] * x + s.a[4] * y + s.a[5] + s.b[1] * w) / z;
-    const float at_x = (u + 0.5f) * s.to_inverse[0], at_y = (v + 0.5f) * s.to_inverse[1];
-    if (!(z > 0) || !(at_x >= 0) || !(at_y >= 0) || !(at_x < (float)s.inverse_width) || !(at_y < (float)s.inverse_height))
-        return kMostError;
-    const float found = s.inverse[(int64_t)(int)at_y * s.inverse_width + (int)at_x];
-    if (!(found > 0)) return kMostError;
-    const float back = s.back_a[6] * u + s.back_a[7] * v + s.back_a[8] + s.back_b[2] * found;
-    const float to_x = (s.back_a[0] * u + s.back_a[1] * v + s.back_a[2] + s.back_b[0] * found) / back;
-    const float to_y = (s.back_a[3] * u + s.back_a[4] * v + s.back_a[5] + s.back_b[1] * found) / back;
-    const float miss = std::sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y));
-    return back > 0 && miss < kMostError ? miss : kMostError;
+// Planes through one pixel that are tried together, so that none waits for another; in lanes, except for the samples.
+struct Trials {
+    alignas(64) float w[kTrials], gx[kTrials], gy[kTrials];
+    alignas(64) float cost[kTrials];  // of all views so far
+    alignas(64) float u[kTrials], v[kTrials], ux[kTrials], uy[kTrials], vx[kTrials], vy[kTrials];  // in one view
+    alignas(64) float sum[kTrials], square[kTrials], both[kTrials], match[kTrials];
+    int count = 0;
+
+    void add(const Plane& p) { w[count] = p.w, gx[count] = p.gx, gy[count] = p.gy, count++; }
+    Plane at(int i) const { return {w[i], gx[i], gy[i]}; }
+
+    void fill() {  // lanes that are not used
+        for (int i = count; i % kLanes; i++) w[i] = gx[i] = gy[i] = 0;
+    }
+};
+
+// Where the middle of the window falls in a view, and what a step in the window moves it by: across a window, the map to a
+// view is taken as affine. `match` is 0, or kNothing where the view does not show the middle, or shows it many times larger.
+SURFKIT_INLINE void project(const StereoJob& job, const StereoSource& s, float x, float y, Trials& trials) {
+    const float* t = s.way;
+    const float from[3] = {t[0] * x + t[1] * y + t[2], t[3] * x + t[4] * y + t[5], t[6] * x + t[7] * y + t[8]};
+    const float wide = (float)(s.width - 1), high = (float)(s.height - 1);
+    const Floats zero{};
+    for (int i = 0; i < trials.count; i += kLanes) {
+        const Floats w = load(trials.w + i), gx = load(trials.gx + i), gy = load(trials.gy + i);
+        const Floats z = madd(w, t[11], from[2]), turn = reciprocal(higher(z, broadcast(1e-20f)));
+        const Floats u = madd(w, t[9], from[0]) * turn, v = madd(w, t[10], from[1]) * turn;
+        const Floats zx = madd(gx, t[11], t[6]), zy = madd(gy, t[11], t[7]);
+        const Floats ux = (madd(gx, t[9], t[0]) - u * zx) * turn, uy = (madd(gy, t[9], t[1]) - u * zy) * turn;
+        const Floats vx = (madd(gx, t[10], t[3]) - v * zx) * turn, vy = (madd(gy, t[10], t[4]) - v * zy) * turn;
+        const Mask shown = lesser(zero, z) & less_equal(zero, u) & less_equal(zero, v) & less_equal(u, wide) &
+                           less_equal(v, high) & less_equal(magnitude(ux) + magnitude(uy), job.stretch) &
+                           less_equal(magnitude(vx) + magnitude(vy), job.stretch);
+        const float one = (float)kOne, border = (float)kBorder * one + 0.5f;
+        store(trials.u + i, madd(keep(shown, u), one, border)), store(trials.v + i, madd(keep(shown, v), one, border));
+        store(trials.ux + i, keep(shown, ux) * one), store(trials.uy + i, keep(shown, uy) * one);
+        store(trials.vx + i, keep(shown, vx) * one), store(trials.vy + i, keep(shown, vy) * one);
+        store(trials.match + i, select(shown, zero, kNothing));
+    }
+}
+
+// 1 - correlation of a window with what a view shows on each plane; kNothing where it does not show it.
+SURFKIT_INLINE void compare(const StereoJob& job, const Window& window, const StereoSource& s, float x, float y, Trials& trials) {
+    project(job, s, x, y, trials);
+    const int vectors = job.samples / kLanes;
+    Floats sums[3][kTrials];
+    for (int i = 0; i < trials.count; i++) {
+        const Floats u = broadcast(trials.u[i]), ux = broadcast(trials.ux[i]), uy = broadcast(trials.uy[i]);
+        const Floats v = broadcast(trials.v[i]), vx = broadcast(trials.vx[i]), vy = broadcast(trials.vy[i]);
+        Floats sum = {}, square = {}, both = {};
+        for (int j = 0; j < vectors; j++) {
+            const Floats dx = load(job.offset_x + j * kLanes), dy = load(job.offset_y + j * kLanes);
+            const Ints at_x = __builtin_convertvector(madd(ux, dx, madd(uy, dy, u)), Ints);
+            const Ints at_y = __builtin_convertvector(madd(vx, dx, madd(vy, dy, v)), Ints);
+            const Floats value = __builtin_convertvector(between(s, at_x, at_y), Floats);
+            const Floats weighed = window.weight[j] * value;
+            sum += weighed;
+            square = madd(weighed, value, square);
+            both = madd(window.centred[j], value, both);
+        }
+        sums[0][i] = sum, sums[1][i] = square, sums[2][i] = both;
+    }
+    for (int i = trials.count; i % 4; i++) sums[0][i] = sums[1][i] = sums[2][i] = Floats{};
+    for (int i = 0; i < trials.count; i += 4) {
+        sum_lanes(sums[0] + i, 4, trials.sum + i);
+        sum_lanes(sums[1] + i, 4, trials.square + i);
+        sum_lanes(sums[2] + i, 4, trials.both + i);
+    }
+    constexpr float kUnit = 1.0f / (kOne * kOne);
+    for (int i = 0; i < trials.count; i += kLanes) {
+        const Floats mean = load(trials.sum + i) * kUnit, square = load(trials.square + i) * (kUnit * kUnit), zero{};
+        const Floats contrast = higher(zero, square - mean * mean) + kNoise;
+        const Floats off = 1.0f - load(trials.both + i) * kUnit / root(contrast * window.contrast);
+        store(trials.match + i, higher(load(trials.match + i), lower(broadcast(1.0f), higher(zero, off))));
+    }
+}
+
+// Add what the pixel misses itself by when it is carried to a view on each plane, and back by the depth found there (ACMM).
+SURFKIT_INLINE void add_reprojection(const StereoJob& job, const StereoSource& s, float x, float y, Trials& trials) {
+    const float* t = s.back;
+    const Floats zero{}, wide = broadcast((float)s.inverse_width), high = broadcast((float)s.inverse_height);
+    for (int i = 0; i < trials.count; i += kLanes) {
+        const Floats u = load(trials.u + i) * (1.0f / kOne) - (kBorder + 0.5f / kOne);
+        const Floats v = load(trials.v + i) * (1.0f / kOne) - (kBorder + 0.5f / kOne);
+        const Floats at_x = (u + 0.5f) * s.to_inverse[0], at_y = (v + 0.5f) * s.to_inverse[1];
+        const Mask inside = less_equal(zero, at_x) & lesser(at_x, wide) & less_equal(zero, at_y) & lesser(at_y, high);
+        const Ints column = __builtin_convertvector(keep(inside, at_x), Ints);
+        const Ints row = __builtin_convertvector(keep(inside, at_y), Ints);
+        const Ints word = gather((const uint32_t*)s.inverse, row * s.inverse_width + column);
+        Floats found;
+        std::memcpy(&found, &word, sizeof found);
+        const Floats z = madd(u, t[6], madd(v, t[7], madd(found, t[11], broadcast(t[8]))));
+        const Floats turn = reciprocal(higher(z, broadcast(1e-20f)));
+        const Floats off_x = madd(u, t[0], madd(v, t[1], madd(found, t[9], broadcast(t[2])))) * turn - x;
+        const Floats off_y = madd(u, t[3], madd(v, t[4], madd(found, t[10], broadcast(t[5])))) * turn - y;
+        const Mask known = inside & lesser(zero, found) & lesser(zero, z);
+        const Floats miss = select(known, lower(broadcast(kMostError), root(madd(off_x, off_x, off_y * off_y))), kMostError);
+        const Floats match = load(trials.match + i);
+        store(trials.match + i, select(lesser(match, kNothing), madd(miss, job.consistency, match), match));
+    }
 }
 
 // Draws that depend on pixel and pass alone, so that no order of the work changes them.
@@ -155,6 +221,7 @@ struct Pixel {
     int neighbours = 0;
     Plane plane;
     float cost;
+    Trials trials;
 
     Plane at(int px, int py) const {
         const float* p = job.plane + ((int64_t)py * job.width + px) * 3;
@@ -168,31 +235,6 @@ struct Pixel {
         return p;
     }
 
-    bool valid(const Plane& p) const {
-        if (!(p.w >= job.low) || !(p.w <= job.high)) return false;
-        const float rx = ((float)x + 0.5f - job.cx) / job.fx, ry = ((float)y + 0.5f - job.cy) / job.fy;
-        const float nx = p.gx * job.fx, ny = p.gy * job.fy, nz = p.w - nx * rx - ny * ry;
-        const float lengths = (nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + 1.0f);
-        return p.w * p.w > kOblique * kOblique * lengths;
-    }
-
-    // How much a plane differs from what lies around: less where the picture changes, and no more than at an edge.
-    float roughness(const Plane& p) const {
-        float sum = 0;
-        for (int i = 0; i < neighbours; i++) {
-            const float there = p.w + p.gx * offset[i][0] + p.gy * offset[i][1];
-            sum += alike[i] * std::min(kMostBend, std::fabs(there - around[i]) * job.parallax);
-        }
-        return job.smoothness * sum / 4;
-    }
-
-    float seen(int view, const Plane& p) const {
-        const StereoSource& s = job.sources[view];
-        const float match = compare(job, window, s, (float)x, (float)y, p);
-        if (!s.inverse || match >= kNothing) return match;
-        return match + job.consistency * reprojection(s, (float)x, (float)y, p.w);
-    }
-
     void gather_around() {
         const int stride = job.width + 2 * kRadius;
         const float* middle = job.image + (int64_t)(y + kRadius) * stride + x + kRadius;
@@ -201,57 +243,110 @@ struct Pixel {
             const int px = x + step[0], py = y + step[1];
             if (px < 0 || py < 0 || px >= job.width || py >= job.height) continue;
             around[neighbours] = at(px, py).w;
-            alike[neighbours] = std::exp(-std::fabs(middle[step[1] * stride + step[0]] - *middle) / job.spread);
+            alike[neighbours] = job.alike[(int)std::fabs(middle[step[1] * stride + step[0]] - *middle)];
             offset[neighbours][0] = (float)step[0];
             offset[neighbours++][1] = (float)step[1];
         }
     }
 
-    // Costs of the present plane in all views, and the views that count: those that match best here and around.
+    // The views that count: those that match best here and around.
     void choose() {
-        const int64_t here = ((int64_t)y * job.width + x) * job.views;
-        float cost_of[kMostViews];
+        uint8_t* here = job.each + ((int64_t)y * job.width + x) * job.views;
+        if (job.survey) {
+            trials.add(plane);
+            trials.fill();
+            for (int view = 0; view < job.views; view++) {
+                see(view);
+                here[view] = told(trials.match[0]);
+            }
+            trials.count = 0;
+        }
         int vote[kMostViews];
         for (int view = 0; view < job.views; view++) {
-            if (job.survey) {
-                cost_of[view] = seen(view, plane);
-                job.each[here + view] = (uint8_t)(std::min(cost_of[view], 1.0f) * 255.0f);
-            }
-            vote[view] = 2 * job.each[here + view];
+            vote[view] = 2 * here[view];
             for (int i = 0; i < neighbours; i++) {
                 const int64_t there = (int64_t)(y + (int)offset[i][1]) * job.width + x + (int)offset[i][0];
                 vote[view] += job.each[there * job.views + view];
             }
             vote[view] = vote[view] * kMostViews + view;  // equal ones in their order
         }
-        std::sort(vote, vote + job.views);
         count = std::min(job.best, job.views);
-        cost = roughness(plane);
-        for (int i = 0; i < count; i++) {
-            const int view = chosen[i] = vote[i] % kMostViews;
-            if (!job.survey) {
-                cost_of[view] = seen(view, plane);
-                job.each[here + view] = (uint8_t)(std::min(cost_of[view], 1.0f) * 255.0f);
-            }
-            cost += cost_of[view] / (float)count;
-        }
+        std::partial_sort(vote, vote + count, vote + job.views);
+        for (int i = 0; i < count; i++) chosen[i] = vote[i] % kMostViews;
     }
 
-    void attempt(const Plane& p) {
-        if (!valid(p)) return;
-        const float by = std::fabs(p.w - plane.w) + 2.0f * (std::fabs(p.gx - plane.gx) + std::fabs(p.gy - plane.gy));
-        if (by * job.parallax < kSame) return;
-        float sum = roughness(p);
-        for (int i = 0; i < count && sum < cost; i++) sum += seen(chosen[i], p) / (float)count;
-        if (sum < cost) {
-            cost = sum;
-            plane = p;
+    static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
+
+    // What a view says of all trials.
+    void see(int view) {
+        const StereoSource& s = job.sources[view];
+        compare(job, window, s, (float)x, (float)y, trials);
+        if (s.inverse) add_reprojection(job, s, (float)x, (float)y, trials);
+    }
+
+    // Costs of the trials before any view is looked at: how much they differ from what lies around, less where the picture
+    // changes and no more than at an edge. Planes are dropped that are out of range, oblique, or like one before them; and the
+    // first, which is the present one, if its cost is known.
+    void screen(bool known) {
+        trials.fill();
+        const float rx = ((float)x + 0.5f - job.cx) / job.fx, ry = ((float)y + 0.5f - job.cy) / job.fy;
+        const float away = kOblique * kOblique * (rx * rx + ry * ry + 1.0f), same = job.same_px / job.parallax;
+        for (int i = 0; i < trials.count; i += kLanes) {
+            const Floats w = load(trials.w + i), gx = load(trials.gx + i), gy = load(trials.gy + i);
+            const Floats nx = gx * job.fx, ny = gy * job.fy, nz = w - nx * rx - ny * ry;
+            Floats rough{};
+            for (int j = 0; j < neighbours; j++) {
+                const Floats there = madd(gx, offset[j][0], madd(gy, offset[j][1], w));
+                rough = madd(lower(broadcast(kMostBend), magnitude(there - around[j]) * job.parallax), alike[j], rough);
+            }
+            const Mask fits = less_equal(job.low, w) & less_equal(w, job.high) &
+                              lesser((nx * nx + ny * ny + nz * nz) * away, w * w);
+            store(trials.cost + i, select(fits, rough * (job.smoothness / 4), kNever));
         }
+        for (int i = 1; i < trials.count; i++)
+            for (int j = 0; j < i; j++) {
+                const float by = std::fabs(trials.gx[i] - trials.gx[j]) + std::fabs(trials.gy[i] - trials.gy[j]);
+                if (std::fabs(trials.w[i] - trials.w[j]) + 2.0f * by < same) trials.cost[i] = kNever;
+            }
+        int left = known ? 0 : 1;
+        for (int i = 1; i < trials.count; i++) {
+            trials.w[left] = trials.w[i], trials.gx[left] = trials.gx[i], trials.gy[left] = trials.gy[i];
+            trials.cost[left] = trials.cost[i];
+            left += trials.cost[i] < kNever;
+        }
+        trials.count = left;
+        trials.fill();
+    }
+
+    // Take the best of the trials, of which the first is the present plane; its cost may be known already.
+    void attempt(bool known) {
+        screen(known);
+        float match[kMostViews][kTrials];
+        const float share = 1.0f / (float)count;
+        for (int at = 0; at < count; at++) {
+            see(chosen[at]);
+            for (int i = 0; i < trials.count; i++) {
+                match[at][i] = trials.match[i];
+                trials.cost[i] += share * trials.match[i];
+            }
+        }
+        int best = -1;
+        float least = known ? cost : kNever;
+        for (int i = 0; i < trials.count; i++)
+            if (trials.cost[i] < least) best = i, least = trials.cost[i];
+        if (best >= 0) {
+            uint8_t* here = job.each + ((int64_t)y * job.width + x) * job.views;
+            for (int at = 0; at < count; at++) here[chosen[at]] = told(match[at][best]);
+            plane = trials.at(best);
+        }
+        cost = least;
+        trials.count = 0;
     }
 
     // Planes of the neighbours, and of the best of those further away in each direction.
     void propagate() {
         static const int steps[4][2] = {{-1, 0}, {1, 0}, {0, -1}, {0, 1}};
+        trials.add(plane);
         for (const auto& step : steps) {
             int best_x = -1, best_y = -1;
             float least = 1e9f;
@@ -259,27 +354,28 @@ struct Pixel {
                 const int px = x + far * step[0], py = y + far * step[1];
                 if (px < 0 || py < 0 || px >= job.width || py >= job.height) break;
                 if (far == 1) {
-                    attempt(carried(px, py));
+                    trials.add(carried(px, py));
                 } else if (const float c = job.cost[(int64_t)py * job.width + px]; c < least) {
                     least = c, best_x = px, best_y = py;
                 }
             }
-            if (best_x >= 0) attempt(carried(best_x, best_y));
+            if (best_x >= 0) trials.add(carried(best_x, best_y));
         }
+        attempt(false);
     }
 
-    // The slopes that the neighbours make, and small changes at random.
+    // The slopes that the neighbours make, and a small change at random.
     void refine(Draw draw) {
+        trials.add(plane);
         if (neighbours == 4) {
-            attempt({plane.w, (around[1] - around[0]) / 2, (around[3] - around[2]) / 2});
-            attempt({(around[0] + around[1] + around[2] + around[3]) / 4, plane.gx, plane.gy});
+            trials.add({plane.w, (around[1] - around[0]) / 2, (around[3] - around[2]) / 2});
+            trials.add({(around[0] + around[1] + around[2] + around[3]) / 4, plane.gx, plane.gy});
         }
-        float by = job.jitter_px / job.parallax;
-        for (int i = 0; i < 2; i++, by /= 4) {
-            const float w = by * draw(), gx = by * draw() / kRadius, gy = by * draw() / kRadius;
-            attempt({plane.w + w, plane.gx, plane.gy});
-            attempt({plane.w, plane.gx + gx, plane.gy + gy});
-        }
+        const float by = job.jitter_px / job.parallax;
+        const float w = by * draw(), gx = by * draw() / kRadius, gy = by * draw() / kRadius;
+        trials.add({plane.w + w, plane.gx, plane.gy});
+        trials.add({plane.w, plane.gx + gx, plane.gy + gy});
+        attempt(true);
     }
 };
 

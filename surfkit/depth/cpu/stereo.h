@@ -5,21 +5,23 @@
 
 namespace surfkit {
 
-constexpr int kSamples = 32;   // pixels of a window that are compared
+constexpr int kSamples = 32;   // most pixels of a window that are compared
 constexpr int kRadius = 8;     // most pixels from the middle of a window to its border
 constexpr int kMostViews = 16; // that one picture is compared with
+constexpr int kBorder = 32;    // pixels by which pictures to compare with are continued
 
 // A picture to compare with. A pixel (x, y) of inverse depth w falls on the pixel a (x, y, 1) + b w of it, over the third
 // component; pixels are numbered from the middle of the first one.
 struct StereoSource {
-    const uint32_t* pixels;  // four bytes: a grey value, and those to the right, below, and below to the right
-    int width, height;
-    float a[9], b[3];
+    // Four bytes: a grey value, and those to the right, below, and below to the right; continued by kBorder on each side.
+    const uint32_t* pixels;
+    int width, height, stride;
+    float way[12];  // a, then b
     // Inverse depths of that picture, for geometric consistency, or null; and the way back.
     const float* inverse;
     int inverse_width, inverse_height;
     float to_inverse[2];  // from pixels of the picture to pixels of the map
-    float back_a[9], back_b[3];
+    float back[12];
 };
 
 // State and settings of one picture. A plane is an inverse depth and its slopes: in the picture, inverse depth is linear on
@@ -37,9 +39,13 @@ struct StereoJob {
     float low, high;     // inverse depths
     float parallax;      // pixels by which a picture moves, a unit of inverse depth
     float jitter_px;     // by which planes are changed at random
+    float same_px;       // planes that differ by less parallax need not be tried
     float smoothness;    // cost of a difference of one pixel of parallax from the neighbours
     float consistency;   // cost of a reprojection error of one pixel
     float spread;        // difference of grey values at which a pixel of the window counts 1 / e
+    float alike[256];    // what pixels of such a difference count
+    float stretch;       // most pixels of a view that one pixel of a window may cover: its window must stay within kBorder
+    int samples;         // pixels of a window that are compared, the first ones; a multiple of 16
     int best;            // views that count
     bool survey;         // look at all views anew, to choose those that count
     uint32_t seed;
