@@ -11,7 +11,7 @@ from surfkit.folder import Run
 from surfkit.scene.depth_prior import Alignment, alignment, prior_bytes, read_priors
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.start.base import Known
-from surfkit.train.material import Material, needs_priors
+from surfkit.train.material import Material, needs_normals, needs_priors
 
 AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""
@@ -54,10 +54,10 @@ def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
     Raises:
         BadInput: The run is still to begin, at depth maps, and there are none that can be used.
     """
-    needed = this.recipe.start.needs_prior and not begun
-    if not needed and not needs_priors(this.recipe.pretrain.losses):
+    needed, losses = this.recipe.start.needs_prior and not begun, this.recipe.pretrain.losses
+    if not needed and not needs_priors(losses):
         return None
-    known = alignment(this.data, scene)
+    known = alignment(this.data, scene, needs_normals(losses))
     if needed and not known.fits:
         raise BadInput(
             f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; make "

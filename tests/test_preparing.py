@@ -20,7 +20,7 @@ from surfkit.core.lock import USED, held, is_used, used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.losses import DepthRegression
+from surfkit.losses import DepthRegression, NormalPrior
 from surfkit.partition import PictureShare, Pool, QuantileGrid
 from surfkit.pipeline import run
 from surfkit.recipe import Recipe
@@ -203,8 +203,21 @@ def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, re
     sparse = replace(recipe, start=Recipe().start)
     metrics = run(sparse, farm, tmp_path / "b", store=Store(maps=None))
     (note,) = record(tmp_path / "b")["notes"]
-    assert "has no depth priors, so the depth loss is off" in note and metrics["prepare_cpu_seconds"] is None
+    assert "has no depth priors, so what needs them is off" in note and metrics["prepare_cpu_seconds"] is None
     assert not seen and not (own_cache / "depth").exists()
+
+
+def test_a_loss_of_normals_that_the_maps_do_not_have_is_warned_of(farm, recipe, tmp_path):
+    recipe = evolve(recipe, "pretrain.losses.prior", NormalPrior())
+    tune = replace(recipe.pretrain, steps=6, sh_every=1)
+    recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
+    for _ in range(2):  # the second time, nothing is left to do
+        run(recipe, farm, tmp_path / "run")
+        made, without = record(tmp_path / "run")["notes"]
+        assert "made with plane-sweep" in made and without == (
+            "7 of 7 depth priors have no normals, and the loss normal-prior learns nothing from those; "
+            "depth:patch-match makes some that have"
+        )
 
 
 def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, own_cache):
