@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.table import print_table
+from surfkit.core.files import sweep
+from surfkit.core.lock import held
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -62,14 +64,16 @@ class Depth:
         if notice := self.estimator.notice():
             print(f"note: {notice}", file=sys.stderr)
         given = preparation.material(scene)
-        wanted, views = preparation.begin(scene, self.again), given.views
-        if there := len(views) - len(wanted):
-            print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
-        done = watched(preparation.run(scene, given, wanted), len(wanted))
-        path = self.data / FOLDER / "overview.png"
-        write_overview(path, self.data, views)
+        folder, views = self.data / FOLDER, given.views
+        with held(folder):
+            sweep(folder)
+            wanted = preparation.begin(scene, self.again)
+            if there := len(views) - len(wanted):
+                print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
+            done = watched(preparation.run(scene, given, wanted), len(wanted))
+            write_overview(folder / "overview.png", self.data, views)
         show(done)
-        print(f"depth maps in {self.data / FOLDER}; look at {path}")
+        print(f"depth maps in {folder}; look at {folder / 'overview.png'}")
 
 
 def watched(steps: Iterable[Prepared], total: int) -> list[Prepared]:
