@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.folder import Run
-from surfkit.scene.depth_prior import Alignment, alignment, prior_bytes, read_priors
+from surfkit.scene.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.start.base import Known
 from surfkit.train.material import Material, needs_normals, needs_priors
@@ -60,8 +60,16 @@ def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
     known = alignment(this.data, scene, needs_normals(losses))
     if needed and not known.fits:
         raise BadInput(
-            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; make "
-            f"some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match, or "
-            "choose start:sparse"
+            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "
+            f"{remedy(this, scene)}, or choose start:sparse"
         )
     return known
+
+
+def remedy(this: Run, scene: Scene) -> str:
+    """How to get depth maps that can be used, after those that there are cannot."""
+    if this.data.priors is not None:
+        return "see whether photographs and cameras belong together, and which points they share"
+    if prior_files(this.data, scene):
+        return f"make others with `surfkit prepare depth {this.data.path} {WITH_NORMALS} --again`"
+    return f"make some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match"

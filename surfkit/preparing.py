@@ -13,10 +13,11 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.lock import used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
-from surfkit.depth.prepare import Preparation, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, torch_device
 from surfkit.folder import Run, read_data
 from surfkit.mesh.base import Mesher
 from surfkit.raster.select import Device
+from surfkit.scene.depth_files import FOLDER
 from surfkit.scene.depth_prior import prior_files
 from surfkit.scene.fingerprint import Fingerprint, fingerprint
 from surfkit.scene.made_maps import is_there, located
@@ -107,10 +108,15 @@ def made_for(this: Run, scene: Scene, prints: Fingerprint, store: Store, device:
         return
     if notice := this.recipe.depth.notice():
         emit(Warned(notice))
+    if (folder := this.data.path / FOLDER).is_dir():
+        emit(Warned(f"{folder} has no map of these photographs, so others are made"))
     key = key_of(this.recipe.depth, scene, prints, tracks)
     with maps(preparation, scene, tracks, key, store.maps_bytes()) as (folder, made):
-        what, cost = f"depth maps of {made.maps} photographs", f"{made.cpu_seconds:.0f} s of CPU time"
+        count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
+        what, cost = f"depth maps of {count} photographs", f"{made.cpu_seconds:.0f} s of CPU time"
         emit(Warned(f"{what} made with {name_of(this.recipe.depth)} in {cost}, in {folder}"))
+        if made.without:
+            emit(Warned(f"the others give no depth: they are damaged, {WITHOUT_DEPTH}"))
         yield folder
 
 
