@@ -8,10 +8,10 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.folder import Run
-from surfkit.scene.depth_prior import Alignment, alignment, prior_bytes, read_priors
+from surfkit.scene.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.start.base import Known
-from surfkit.train.material import Material, needs_priors
+from surfkit.train.material import Material, needs_normals, needs_priors
 
 AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""
@@ -54,14 +54,22 @@ def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
     Raises:
         BadInput: The run is still to begin, at depth maps, and there are none that can be used.
     """
-    needed = this.recipe.start.needs_prior and not begun
-    if not needed and not needs_priors(this.recipe.pretrain.losses):
+    needed, losses = this.recipe.start.needs_prior and not begun, this.recipe.pretrain.losses
+    if not needed and not needs_priors(losses):
         return None
-    known = alignment(this.data, scene)
+    known = alignment(this.data, scene, needs_normals(losses))
     if needed and not known.fits:
         raise BadInput(
-            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; make "
-            f"some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match, or "
-            "choose start:sparse"
+            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "
+            f"{remedy(this, scene)}, or choose start:sparse"
         )
     return known
+
+
+def remedy(this: Run, scene: Scene) -> str:
+    """How to get depth maps that can be used, after those that there are cannot."""
+    if this.data.priors is not None:
+        return "see whether photographs and cameras belong together, and which points they share"
+    if prior_files(this.data, scene):
+        return f"make others with `surfkit prepare depth {this.data.path} {WITH_NORMALS} --again`"
+    return f"make some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match"

@@ -37,7 +37,7 @@ from surfkit.scene.depth_prior import alignment
 from surfkit.scene.memory import oom_kills
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull
-from surfkit.train.material import needs_priors
+from surfkit.train.material import needs_normals, needs_priors
 from surfkit.train.pieces import Stored
 from surfkit.train.stage import StageState
 from surfkit.tuning import BUSY, FULL, Site, coarse_model, guarded, sight_of
@@ -165,9 +165,9 @@ def extract_views(site: Site, blocks: Plan) -> None:
     """
     missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
     priors = None
-    if missing and needs_priors(site.this.recipe.tune.losses):
+    if missing and needs_priors(losses := site.this.recipe.tune.losses):
         with naming("blocks: "):  # what the coarse stage has said already is not said again
-            priors = alignment(site.this.data, site.scene)
+            priors = alignment(site.this.data, site.scene, needs_normals(losses))
     for block in missing:
         extract.save(site.views(block.index), extract.of(site.scene, block.views, priors))
 

@@ -98,12 +98,7 @@ def run(
     hands, every, store, meter = hands or Hands(), every or Every(), store or Store(), Meter()
     if every.pictures is None:
         every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
-    refuse_file(out)
-    store.bytes(), store.maps_bytes()  # or BadInput, before anything is done
-    if recipe.partition is not None:
-        hands.workers.ready()
-    if recipe.mesh is not None:
-        recipe.mesh.ready()
+    refuse_unready(this, hands, store)
     with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
         sweep(out, out / "blocks")
         refuse_other(this)
@@ -114,31 +109,50 @@ def run(
         prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         warn_of_no_edits(this)
+        warn_of_idle(this, hands)
         this = use.enter_context(with_maps(this, scene, prints, store, hands.device, state is not None))
-        if recipe.partition is None and hands.workers != Inline():
-            emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
-        unfinished = state is None or state.index < recipe.pretrain.steps
-        fits = priors_of(this, scene, begun=state is not None) if unfinished else None
-        given = read_ahead(this.data, scene, recipe.pretrain.losses, store, fits) if unfinished else None
+        start = beginning(this, scene, store, state)
         claim(this, backend, prints, notes, scene.frame)
         with kept(out):
-            if given is not None:
+            if start is not None:
                 discard_results(this)
-                cloud = Beginning(this, scene, given, fits)
-                state = optimise(Job(this, scene, rasterizer, every, given, meter, cloud=cloud), state)
-                del given  # its memory is free for what comes
+                state = optimise(Job(this, scene, rasterizer, every, start.given, meter, cloud=start), state)
+                del start  # the memory of its photographs is free for what comes
             if recipe.partition is not None:
                 state = None  # it is in the folder
                 this, state = tuned(Site(this, scene, rasterizer, every, store), hands)
             this, state = refined(Site(this, scene, rasterizer, every, store), state)
-            if not unfinished and this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
-                say(f"{out} is finished; delete {this.metrics.name} in it to measure again")
-                return read_metrics(out)
-            if not this.cloud.exists():
-                export(this, state, scene)
-            if not meshed(this, state.index):
-                mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto"), recipe.mesh))
-            return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
+            return results(this, state, scene, rasterizer, meter)
+
+
+def refuse_unready(this: Run, hands: Hands, store: Store) -> None:
+    """BadInput for what can be told before anything is read or written."""
+    refuse_file(this.out)
+    store.bytes(), store.maps_bytes()
+    if this.recipe.partition is not None:
+        hands.workers.ready()
+    if this.recipe.mesh is not None:
+        this.recipe.mesh.ready()
+
+
+def beginning(this: Run, scene: Scene, store: Store, state: StageState | None) -> Beginning | None:
+    """Where pretraining begins and what it looks at, also where it goes on; None where it has all its steps."""
+    if state is not None and state.index >= this.recipe.pretrain.steps:
+        return None
+    known = priors_of(this, scene, begun=state is not None)
+    return Beginning(this, scene, read_ahead(this.data, scene, this.recipe.pretrain.losses, store, known), known)
+
+
+def results(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, meter: Meter) -> dict[str, Any]:
+    """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
+    if this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
+        say(f"{this.out} is finished; delete {this.metrics.name} in it to measure again")
+        return read_metrics(this.out)
+    if not this.cloud.exists():
+        export(this, state, scene)
+    if not meshed(this, state.index):
+        mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto"), this.recipe.mesh))
+    return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
 
 
 def export(this: Run, state: StageState, scene: Scene) -> None:
@@ -259,6 +273,12 @@ def warn_of_no_edits(this: Run) -> None:
                     f"steps; more steps, or a lower {run.setting}.densify.start and every, change that"
                 )
             )
+
+
+def warn_of_idle(this: Run, hands: Hands) -> None:
+    """Say that an executor was chosen for nothing."""
+    if this.recipe.partition is None and hands.workers != Inline():
+        emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
 
 
 def warn_of_gaps(scene: Scene, state: StageState | None) -> None:

@@ -8,15 +8,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
-from surfkit.depth.prepare import Preparation, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, torch_device
 from surfkit.folder import Run, read_data
+from surfkit.mesh.base import Mesher
 from surfkit.raster.select import Device
+from surfkit.scene.depth_files import FOLDER
 from surfkit.scene.depth_prior import prior_files
-from surfkit.scene.fingerprint import Fingerprint
+from surfkit.scene.fingerprint import Fingerprint, fingerprint
 from surfkit.scene.made_maps import is_there, located
 from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene
@@ -64,6 +67,35 @@ def with_maps(this: Run, scene: Scene, prints: Fingerprint, store: Store, device
 
 
 @contextmanager
+def with_maps_to_mesh(this: Run, mesher: Mesher, scene: Scene, store: Store, device: Device) -> Iterator[Run]:
+    """Within, a trained run has the depth maps that a mesher wants, as far as they can be had.
+
+    Those that it was trained with come first, then those of the data set. Where neither are there, they are made as the
+    recipe of the run says, or taken from the user's cache.
+
+    Raises:
+        BadInput: They may not be made, or cannot.
+    """
+    before, own = this.data.priors, replace(this, data=replace(this.data, priors=None))
+    if not mesher.needs_prior:
+        yield this
+    elif before is not None and is_there(before):
+        with used(located(before)):
+            yield this
+    elif prior_files(own.data, scene) or this.recipe.depth is None:
+        yield own
+    elif store.maps is None:
+        raise BadInput(
+            f"{this.out}: the mesh needs depth maps, and there are none; leave out --no-prepare to make them, or give "
+            f"`surfkit prepare depth {this.data.path}` first"
+        )
+    else:
+        prints = fingerprint(scene, read_json(this.inputs, Fingerprint) if this.inputs.exists() else None)
+        with made_for(own, scene, prints, store, device) as folder:
+            yield own if folder is None else given(own, folder)
+
+
+@contextmanager
 def made_for(this: Run, scene: Scene, prints: Fingerprint, store: Store, device: Device) -> Iterator[Path | None]:
     """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any."""
     preparation = Preparation(this.data, this.recipe.depth, torch_device(device))
@@ -76,10 +108,15 @@ def made_for(this: Run, scene: Scene, prints: Fingerprint, store: Store, device:
         return
     if notice := this.recipe.depth.notice():
         emit(Warned(notice))
+    if (folder := this.data.path / FOLDER).is_dir():
+        emit(Warned(f"{folder} has no map of these photographs, so others are made"))
     key = key_of(this.recipe.depth, scene, prints, tracks)
     with maps(preparation, scene, tracks, key, store.maps_bytes()) as (folder, made):
-        what, cost = f"depth maps of {made.maps} photographs", f"{made.cpu_seconds:.0f} s of CPU time"
+        count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
+        what, cost = f"depth maps of {count} photographs", f"{made.cpu_seconds:.0f} s of CPU time"
         emit(Warned(f"{what} made with {name_of(this.recipe.depth)} in {cost}, in {folder}"))
+        if made.without:
+            emit(Warned(f"the others give no depth: they are damaged, {WITHOUT_DEPTH}"))
         yield folder
 
 

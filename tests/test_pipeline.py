@@ -1,7 +1,9 @@
+import gc
 import json
 import os
 import shutil
 import signal
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -97,6 +99,25 @@ def test_the_seed_decides_the_draws(data, recipe, tmp_path):
 def test_training_beats_the_sparse_points(finished, data, recipe, tmp_path):
     start = run(with_steps(recipe, 1), data, tmp_path)
     assert finished[1]["images"]["psnr"] > start["images"]["psnr"] + 4
+
+
+def test_photographs_of_training_are_let_go_of_before_the_results_are_made(data, recipe, tmp_path, monkeypatch):
+    read_ahead, results, given, left = pipeline.read_ahead, pipeline.results, [], []
+
+    def watched(*args):
+        found = read_ahead(*args)
+        given.append(weakref.ref(found.photos))
+        return found
+
+    def looked(*args):
+        gc.collect()
+        left.extend(ref for ref in given if ref() is not None)
+        return results(*args)
+
+    monkeypatch.setattr(pipeline, "read_ahead", watched)
+    monkeypatch.setattr(pipeline, "results", looked)
+    run(with_steps(recipe, 2), data, tmp_path)
+    assert given and not left
 
 
 def test_a_finished_run_says_so_and_makes_only_what_is_missing(finished, data, recipe, monkeypatch, capsys):

@@ -20,7 +20,7 @@ from surfkit.core.lock import USED, held, is_used, used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.losses import DepthRegression
+from surfkit.losses import DepthRegression, NormalPrior
 from surfkit.partition import PictureShare, Pool, QuantileGrid
 from surfkit.pipeline import run
 from surfkit.recipe import Recipe
@@ -203,8 +203,21 @@ def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, re
     sparse = replace(recipe, start=Recipe().start)
     metrics = run(sparse, farm, tmp_path / "b", store=Store(maps=None))
     (note,) = record(tmp_path / "b")["notes"]
-    assert "has no depth priors, so the depth loss is off" in note and metrics["prepare_cpu_seconds"] is None
+    assert "has no depth priors, so what needs them is off" in note and metrics["prepare_cpu_seconds"] is None
     assert not seen and not (own_cache / "depth").exists()
+
+
+def test_a_loss_of_normals_that_the_maps_do_not_have_is_warned_of(farm, recipe, tmp_path):
+    recipe = evolve(recipe, "pretrain.losses.prior", NormalPrior())
+    tune = replace(recipe.pretrain, steps=6, sh_every=1)
+    recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
+    for _ in range(2):  # the second time, nothing is left to do
+        run(recipe, farm, tmp_path / "run")
+        made, without = record(tmp_path / "run")["notes"]
+        assert "made with plane-sweep" in made and without == (
+            "7 of 7 depth priors have no normals, and the loss normal-prior learns nothing from those; "
+            "depth:patch-match makes some that have"
+        )
 
 
 def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, own_cache):
@@ -367,3 +380,46 @@ def test_the_words_of_the_command_line(farm, tmp_path, own_cache, capsys):
     assert "depth maps" in out and "depth maps  7/7" in err
     assert main(words) == 0 and "is finished" in capsys.readouterr().err
     assert not map_path(farm.path, "view_001.png").exists() and len(maps(own_cache)) == 14
+
+
+WEIGHED = ["mesh:tsdf", "--mesh.least-views", "0.01"]
+WEIGHED += ["mesh.trust:agreement", "--mesh.trust.priors", "weigh", "--mesh.trust.tolerance", "0.5"]
+
+
+def test_a_mesh_of_a_run_without_maps_has_them_made(farm, recipe, tmp_path, own_cache, monkeypatch, capsys):
+    sparse = replace(recipe, start=Recipe().start, pretrain=replace(recipe.pretrain, losses=Stage().losses))
+    run(sparse, farm, tmp_path / "run")
+    seen, before, words = counting(monkeypatch), contents(farm.path), ["mesh", str(tmp_path / "run")]
+    assert main([*words, "mesh:tsdf"]) == 0 and not seen, "this one does not look at them"
+    capsys.readouterr()
+    for mesher in (["mesh:stereo"], WEIGHED):
+        assert main([*words, *mesher, "--no-prepare"]) == 2
+        told = capsys.readouterr().err.splitlines()
+        assert len(told) == 1 and "leave out --no-prepare" in told[0] and f"prepare depth {farm.path}`" in told[0]
+    assert not seen and not (own_cache / "depth").exists()
+    assert main([*words, "mesh:stereo"]) == 0 and len(seen) == 7 and contents(farm.path) == before
+    told = capsys.readouterr().err
+    assert "depth maps  7/7" in told and "note: depth maps of 7 photographs made with plane-sweep in" in told
+    assert main([*words, *WEIGHED]) == 0 and len(seen) == 7, "the maps are in the cache"
+    assert json.loads((tmp_path / "run/mesh.json").read_text())["mesher"]["trust"]["priors"] == "weigh"
+
+
+def test_a_mesh_has_maps_made_again_that_are_gone_and_looks_at_those_of_the_data_set(
+    farm, recipe, tmp_path, own_cache, monkeypatch, capsys
+):
+    run(recipe, farm, tmp_path / "run")
+    seen, words = counting(monkeypatch), ["mesh", str(tmp_path / "run"), "mesh:stereo"]
+    assert main([*words, "--no-prepare"]) == 0 and not seen, "those of the run are there"
+    (before,) = (own_cache / "depth").iterdir()
+    shutil.rmtree(own_cache / "depth")
+    assert main([*words, "--no-prepare"]) == 2 and main(words) == 0
+    assert len(seen) == 7 and list((own_cache / "depth").iterdir()) == [before]
+    shutil.copytree(before / "estimated_depths", farm.path / "estimated_depths")
+    shutil.rmtree(own_cache / "depth")
+    assert main(words) == 0 and len(seen) == 7 and not (own_cache / "depth").exists()
+    shutil.rmtree(farm.path / "estimated_depths")
+    run(replace(recipe, depth=None, start=Recipe().start), farm, tmp_path / "none")
+    capsys.readouterr()
+    assert main(["mesh", str(tmp_path / "none"), "mesh:stereo"]) == 2
+    note, error = capsys.readouterr().err.splitlines()
+    assert f"`surfkit prepare depth {farm.path}`" in note and "mesh:stereo fuses depth priors, and there" in error

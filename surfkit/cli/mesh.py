@@ -20,12 +20,14 @@ from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.notes import noted
 from surfkit.pipeline import drawer, load_run
+from surfkit.preparing import with_maps_to_mesh
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.scene.memory import cache_bytes
 from surfkit.surface import Delivery, deliver, subject
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
+from surfkit.train.material import Store
 
 
 def named_mesher() -> Mesher:
@@ -63,6 +65,13 @@ class MeshOf:
     device: Device = "auto"
     """Where to compute."""
 
+    prepare: bool = True
+    """Make the depth maps that the mesher wants as the recipe of the run says, where there are none; they are kept in
+    $SURFKIT_CACHE, or ~/.cache/surfkit."""
+
+    prepare_cache: str = "20GB"
+    """Disk for such depth maps, of all data sets together; those longest unused are deleted when there are more."""
+
     def __post_init__(self) -> None:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
@@ -70,13 +79,20 @@ class MeshOf:
     def run(self) -> None:
         """Mesh, and show what came out."""
         budget = cache_bytes(self.memory, "--memory")
+        store = Store(maps=self.prepare_cache if self.prepare else None)
+        store.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
         with noted(), bars():
             this, state, scene = load_run(self.run_folder)
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             rasterizer, _ = drawer(self.device)
-            with held(this.out), full_disk_in_one_line(this.out), kept(this.out):
+            with (
+                held(this.out),
+                full_disk_in_one_line(this.out),
+                with_maps_to_mesh(this, self.mesh, scene, store, self.device) as this,
+                kept(this.out),
+            ):
                 what = subject(this, state, scene, rasterizer, budget, self.mesh)
                 record = deliver(this, self.mesh, self.delivery, what, state.index)
         show(this, record)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -14,14 +14,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.files import sweep
+from surfkit.core.lock import held
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.prepare import Preparation, Prepared, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared, torch_device
 from surfkit.evaluate.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
 from surfkit.scene.data import Reading
-from surfkit.scene.depth_files import FOLDER, DepthFile, map_path
+from surfkit.scene.depth_files import FOLDER, RECORD, DepthFile, map_path
+from surfkit.scene.depth_prior import untrusted
 from surfkit.scene.photos import read_photo
 from surfkit.scene.read import read
 from surfkit.scene.scene import View
@@ -62,14 +66,17 @@ class Depth:
         if notice := self.estimator.notice():
             print(f"note: {notice}", file=sys.stderr)
         given = preparation.material(scene)
-        wanted, views = preparation.begin(scene, self.again), given.views
-        if there := len(views) - len(wanted):
-            print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
-        done = watched(preparation.run(scene, given, wanted), len(wanted))
-        path = self.data / FOLDER / "overview.png"
-        write_overview(path, self.data, views)
+        folder, views = self.data / FOLDER, given.views
+        with held(folder):
+            sweep(folder)
+            wanted = preparation.begin(scene, self.again)
+            if there := len(views) - len(wanted):
+                print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
+            done = watched(preparation.run(scene, given, wanted), len(wanted))
+            refuse_none(self.data, views)
+            write_overview(folder / "overview.png", self.data, views)
         show(done)
-        print(f"depth maps in {self.data / FOLDER}; look at {path}")
+        print(f"depth maps in {folder}; look at {folder / 'overview.png'}")
 
 
 def watched(steps: Iterable[Prepared], total: int) -> list[Prepared]:
@@ -103,6 +110,15 @@ def show(done: list[Prepared]) -> None:
     print_table(("photographs", "covered", "least covered", "seconds"), [row])
     if failed := [step.view.name for step in done if step.coverage is None]:
         print(f"too few sparse points or neighbours, no depth: {', '.join(failed)}")
+    if covered and (text := untrusted(sum(covered) / len(covered))):
+        print(f"note: {text}", file=sys.stderr)
+
+
+def refuse_none(root: Path, views: Sequence[View]) -> None:
+    """BadInput if no view has a map; then nothing says that there are some."""
+    if not any(map_path(root, view.name).exists() for view in views):
+        (root / FOLDER / RECORD).unlink(missing_ok=True)
+        raise BadInput(f"{root}: no depth can be estimated of any of {len(views)} photographs: they {WITHOUT_DEPTH}")
 
 
 def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:

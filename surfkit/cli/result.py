@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,28 +21,17 @@ LPIPS = {
 
 
 def show(this: Run, metrics: dict[str, Any]) -> None:
-    """Print a table of the metrics, and the paths of what was written."""
-    images = metrics["images"]
-    rows = [("views held out", str(len(images["per_image"])))]
-    if images["psnr"] is not None:
-        rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
-        rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
-    if lacking := images.get("lpips_not_measured"):
-        rows.append(("LPIPS", f"not measured: {lacking}"))
-    rows += zone_rows(images)
-    rows += [
-        ("points", f"{metrics['points']:,}"),
-        ("steps", f"{metrics['steps']:,}"),
-        ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of processor time)"),
-    ]
-    if metrics.get("prepare_cpu_seconds") is not None:
-        rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of processor time"))
-    if metrics.get("peak_memory_bytes"):
-        rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
-    if metrics.get("fps"):
-        rows.append(("frames a second", f"{metrics['fps']:.1f}"))
+    """Print a table of the metrics, and the paths of what was written.
+
+    Raises:
+        BadInput: An earlier process left the metrics, and they are damaged.
+    """
+    with sound(this.metrics, "damaged; delete it, and the surfkit train command of the run measures again"):
+        rows = result_rows(metrics)
     if "geometry" in metrics:
-        rows += sound_geometry_rows(this.metrics, metrics["geometry"])
+        remedy = "delete that part of it, and measure again with surfkit evaluate --gt"
+        with sound(this.metrics, f"geometry is damaged; {remedy}"):
+            rows += geometry_rows(metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
     written = [("metrics", this.metrics), ("points", this.cloud)]
@@ -89,14 +80,37 @@ def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> N
     print_table(("written",), [(str(path),) for path in written])
 
 
-def sound_geometry_rows(path: Path, found: Any) -> list[tuple[str, str]]:
-    """`geometry_rows` of what an earlier process has left in metrics.json, or BadInput if that is damaged."""
+@contextmanager
+def sound(path: Path, complaint: str) -> Iterator[None]:
+    """Within, values of a file that are not what they should be are BadInput, with a complaint."""
     try:
-        return geometry_rows(found)
+        yield
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BadInput(
-            f"{path}: geometry is damaged; delete that part of it, and measure again with surfkit evaluate --gt"
-        ) from error
+        raise BadInput(f"{path}: {complaint}") from error
+
+
+def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What metrics.json says of a run, without the geometry."""
+    images = metrics["images"]
+    rows = [("views held out", str(len(images["per_image"])))]
+    if images["psnr"] is not None:
+        rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
+        rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
+    if lacking := images.get("lpips_not_measured"):
+        rows.append(("LPIPS", f"not measured: {lacking}"))
+    rows += zone_rows(images)
+    rows += [
+        ("points", f"{metrics['points']:,}"),
+        ("steps", f"{metrics['steps']:,}"),
+        ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of processor time)"),
+    ]
+    if metrics.get("prepare_cpu_seconds") is not None:
+        rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of processor time"))
+    if metrics.get("peak_memory_bytes"):
+        rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
+    if metrics.get("fps"):
+        rows.append(("frames a second", f"{metrics['fps']:.1f}"))
+    return rows
 
 
 def zone_rows(images: dict[str, Any]) -> list[tuple[str, str]]:

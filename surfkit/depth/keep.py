@@ -14,6 +14,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
+from surfkit.core.files import sweep
 from surfkit.core.lock import USED, held, holder, is_used, used
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare import Preparation
@@ -69,6 +70,7 @@ def maps(
     folder = folder_of(key)
     with ExitStack() as use:
         with entered(folder, preparation.data.path):
+            sweep(folder)
             use.enter_context(used(folder))
             fresh, made = completed(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
         if fresh:

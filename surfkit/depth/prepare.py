@@ -27,12 +27,13 @@ from surfkit.scene.depth_files import (
     write_map,
     write_record,
 )
+from surfkit.scene.depth_prior import TRUSTED
 from surfkit.scene.observations import Observations
 from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene, View
 
-TRUSTED = 0.5
-"""Pixels of a higher confidence count as covered."""
+WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
+"""What photographs do that are compared and give no depth."""
 
 
 @dataclass(frozen=True)

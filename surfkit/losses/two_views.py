@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from surfkit.core.check import BadInput
+from surfkit.core.schedule import Steps
 from surfkit.losses.base import Neighbour
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -19,6 +21,36 @@ WHOLE = 0.999
 """A bilinear sample counts if at least this share of it comes from pixels that count."""
 TINY = 1e-4
 """Depths and inverse depths below this, in local units, are as good as none."""
+
+
+@dataclass(frozen=True)
+class TwoViews:
+    """What losses between two views have in common; each is a `Loss` too."""
+
+    needs_neighbour: ClassVar[bool] = True
+
+    weight: float
+    """Share in the objective of the steps that count."""
+
+    start: Steps = 7_000
+    """Steps without this term, as a surface must form first; 0 has it from the first step."""
+
+    every: int = 3
+    """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
+
+    limit: float = 1.0
+    """Pixels that come back from the neighbour with an error of more pixels do not count."""
+
+    depth: Literal["median", "expected"] = "expected"
+    """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
+
+    def __post_init__(self) -> None:
+        if self.weight < 0 or self.every < 1 or not self.limit > 0:
+            given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
+            raise BadInput(f"{type(self).__name__} has {given}; give 0 or more, 1 or more, and a limit above 0")
+
+    def weight_at(self, index: int, steps: int) -> float:
+        return self.weight if index > self.start and index % self.every == 0 else 0.0
 
 
 def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.schedule import Steps
 from surfkit.losses.base import Loss, Neighbour, Sample
 from surfkit.losses.two_views import (
     TINY,
     Opposite,
+    TwoViews,
     agreement,
     is_whole,
     motion,
@@ -36,7 +36,7 @@ TEXTURE = 0.01
 
 
 @dataclass(frozen=True)
-class WarpedPatches(Loss):
+class WarpedPatches(TwoViews, Loss):
     """One minus the normalised cross-correlation of patches and of what a neighbouring photograph shows in their place
     (PGSR, arXiv 2406.06521).
 
@@ -47,16 +47,8 @@ class WarpedPatches(Loss):
     """
 
     reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median", "normal")
-    needs_neighbour: ClassVar[bool] = True
 
     weight: float = 0.15
-    """Share in the objective of the steps that count."""
-
-    start: Steps = 7_000
-    """Steps without this term, as a surface must form first; 0 has it from the first step."""
-
-    every: int = 3
-    """Only steps that are a multiple of this count; 1 has all. Terms with the same number share the rendered view."""
 
     pixels: int = 4_096
     """Most patches in a step, spread evenly over the picture at random."""
@@ -64,22 +56,10 @@ class WarpedPatches(Loss):
     radius: int = 3
     """Pixels on each side of the central one: 3 compares patches of 7 x 7 pixels."""
 
-    limit: float = 1.0
-    """Patches whose central pixel comes back from the neighbour with an error of more pixels do not count."""
-
-    depth: Literal["median", "expected"] = "expected"
-    """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
-
     def __post_init__(self) -> None:
-        if self.weight < 0 or self.every < 1 or not self.limit > 0:
-            given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
-            raise BadInput(f"the loss of warped patches has {given}; give 0 or more, 1 or more, and a limit above 0")
+        super().__post_init__()
         if self.pixels < 1 or self.radius < 1:
-            given = f"pixels {self.pixels}, radius {self.radius}"
-            raise BadInput(f"the loss of warped patches has {given}; both must be 1 or more")
-
-    def weight_at(self, index: int, steps: int) -> float:
-        return self.weight if index > self.start and index % self.every == 0 else 0.0
+            raise BadInput(f"WarpedPatches has pixels {self.pixels}, radius {self.radius}; both must be 1 or more")
 
     def __call__(self, maps: Maps, sample: Sample) -> Tensor:
         depth, camera, neighbour = surface_depth(maps, self.depth), sample.view.camera, sample.neighbour

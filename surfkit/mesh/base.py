@@ -74,8 +74,6 @@ class Mesher(Component):
     Depth priors are only made for a run whose data set has none, and read, when it has `needs_prior`.
     """
 
-    needs_prior: ClassVar[bool] = False
-
     def ready(self) -> None:
         """Look, before hours are spent, whether it can work.
 

@@ -40,7 +40,8 @@ class Stereo(Mesher):
         """See `Mesher.mesh`."""
         if subject.priors is None:
             raise BadInput(
-                "mesh:stereo fuses depth priors and the data set has none; make them with `surfkit prepare depth`"
+                "mesh:stereo fuses depth priors, and there are none that can be used; "
+                "make some with `surfkit prepare depth DATA`"
             )
         places = {view.name: at for at, view in enumerate(subject.views)}
 

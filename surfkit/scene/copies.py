@@ -12,6 +12,7 @@ import numpy as np
 
 from surfkit.core.caches import cache_root
 from surfkit.core.files import replacing
+from surfkit.scene.arrays import mapped
 
 FOLDER = "resized"
 ENDS = 1 << 16
@@ -39,10 +40,10 @@ class Copies:
         """
         copy = place(self.root, FOLDER) / f"{path.stem}-{digest(self.root, key, [path])}.npy"
         try:
-            pixels = np.load(copy, allow_pickle=False)
+            pixels = mapped(copy)
             if pixels.shape == shape and pixels.dtype == np.uint8:
-                return pixels
-        except (OSError, ValueError, EOFError):  # it is not there, or damaged
+                return np.array(pixels)
+        except Exception:  # it is not there, or damaged, of which numpy raises whatever comes
             pass
         pixels = make()
         with replacing(copy) as file:

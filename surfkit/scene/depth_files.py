@@ -14,6 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
+from surfkit.scene.arrays import mapped
 from surfkit.scene.photos import opened
 
 EXR = ".exr"
@@ -184,11 +185,10 @@ def _stored(path: Path) -> np.ndarray:
 
 
 def _array(path: Path) -> np.ndarray:
-    """The numbers in a .npy file, mapped from disk: memory is not taken because a header says so."""
+    """The numbers in a .npy file, mapped from disk."""
     try:
-        with np.errstate(over="ignore"):
-            stored = np.lib.format.open_memmap(path, "r")
-    except Exception as error:  # the header is parsed as Python, of which anything may come; nothing is allocated here
+        stored = mapped(path)
+    except Exception as error:
         raise BadInput(f"cannot be read: {' '.join(str(error).split())}") from error
     if stored.dtype.kind not in "fiub" or not stored.size:
         raise BadInput(f"cannot be read: it holds {stored.size} times {stored.dtype}, not numbers")

@@ -16,7 +16,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
 from surfkit.scene.cache import Cache
 from surfkit.scene.data import Data
-from surfkit.scene.depth_files import DepthFile, find_maps, read_record
+from surfkit.scene.depth_files import DepthFile, find_maps, normal_path, read_record
 from surfkit.scene.made_maps import located
 from surfkit.scene.observations import Observations
 from surfkit.scene.read import model_folder, observations
@@ -26,6 +26,14 @@ UNITS = 1.25
 """A map in input units that is off by a larger factor from the sparse points is in other units."""
 EDGE = 0.05
 """Neighbours whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
+TRUSTED = 0.5
+"""Pixels of a higher confidence count as trusted."""
+HARDLY = 0.02
+"""Where a smaller share of all pixels is trusted, something is wrong with what the maps were made from."""
+OFF = "what needs them is off, such as the losses depth and normal-prior"
+"""What becomes of a run without depth priors."""
+WITH_NORMALS = "estimator:patch-match"
+"""Words that have normals estimated too."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +72,15 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Fit:
-    """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units."""
+    """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units.
+
+    `trusted` is the share of its pixels that are, if that was looked at.
+    """
 
     file: DepthFile
     scale: float
     offset: float
+    trusted: float = 1.0
 
 
 def prior_cache(
@@ -152,7 +164,7 @@ def read_priors(
         known: How they are aligned, where the scene has only some of the photographs; see `alignment` for None.
         normals: Whether to read their normals too, where there are any.
     """
-    known = known or alignment(data, scene)
+    known = known or alignment(data, scene, normals)
     if not any(view.name in known.fits for view in scene.train):
         return None
     maps = prior_files(data, scene)
@@ -164,14 +176,16 @@ def read_priors(
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
 
-def alignment(data: Data, scene: Scene) -> Alignment:
+def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
     """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
-    Photographs without a map, or with one that cannot be used, are listed in one warning.
+    Photographs without a map, or with one that cannot be used, are listed in one warning; where `normals` are wanted
+    too, another one tells that there are none.
     """
     maps = prior_files(data, scene)
     if not maps:
-        emit(Warned(f"{data.path} has no depth priors, so the depth loss is off; {_make(data)}"))
+        remedy = f"; {_make(data, normals)}" if data.priors is None else ""
+        emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)
     with ThreadPoolExecutor(4) as pool:
@@ -182,13 +196,25 @@ def alignment(data: Data, scene: Scene) -> Alignment:
         reasons[scene.train[at].name] = "its scale is far from that of the other images"
         fits[at] = None
     if not any(fits):
-        emit(Warned(f"no depth prior of {data.path} can be used, so the depth loss is off: {listed(reasons)}"))
+        emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {listed(reasons)}"))
         return Alignment(0.0, {})
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
     _warn_of_leaks(data, scene)
+    if text := untrusted(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
+        emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
+    if normals:
+        _warn_of_no_normals(data, [maps[name] for name in found])
     return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
+
+
+def untrusted(share: float) -> str | None:
+    """What to tell of depth maps of which a share of the pixels is trusted; None where that is enough."""
+    if share >= HARDLY:
+        return None
+    causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
+    return f"only {share:.1%} of the pixels of the depth maps are trusted; see whether the photographs {causes}"
 
 
 def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:
@@ -229,15 +255,16 @@ def _fit(view: View, file: DepthFile | None, observations: Observations, scene: 
         return "no map"
     try:
         values = file.read()
-        file.read_confidence()
-        file.read_normal()
+        confidence, normal = file.read_confidence(), file.read_normal()
         _check_map(values, view)
+        _check_beside(values, {"confidence": confidence, "normals": normal})
+        trusted = 1.0 if confidence is None else float((confidence > TRUSTED).mean())
         at, inverse = observations.of(view, MAX_ERROR_PX)
         values = sample(values, at)
         if not file.aligned:
-            return Fit(file, *align(values, inverse))
+            return Fit(file, *align(values, inverse), trusted)
         _check_units(values / scene.frame.scale, inverse)
-        return Fit(file, 1 / scene.frame.scale, 0.0)
+        return Fit(file, 1 / scene.frame.scale, 0.0, trusted)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
 
@@ -252,6 +279,14 @@ def _check_map(values: np.ndarray, view: View) -> None:
         raise BadInput("no value in it")
     if np.ptp(known) <= 1e-6 * np.abs(known).max():
         raise BadInput("constant")
+
+
+def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -> None:
+    height, width = values.shape
+    for what, array in beside.items():
+        if array is not None and array.shape[-2:] != values.shape:
+            size = f"{array.shape[-1]} x {array.shape[-2]} px"
+            raise BadInput(f"it has {width} x {height} px, and its {what} {size}")
 
 
 def _check_units(values: np.ndarray, inverse: np.ndarray) -> None:
@@ -282,5 +317,15 @@ def _warn_of_leaks(data: Data, scene: Scene) -> None:
         emit(Warned(text))
 
 
-def _make(data: Data) -> str:
-    return f"make them with `surfkit prepare depth {data.path}`"
+def _warn_of_no_normals(data: Data, files: Sequence[DepthFile]) -> None:
+    """Not every estimator finds normals, and a loss that is 0 throughout shows nowhere else."""
+    without = sum(not normal_path(file.path).exists() for file in files)
+    if without:
+        remedy = f"make others with `surfkit prepare depth {data.path} {WITH_NORMALS} --again`"
+        remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
+        what = f"{without} of {len(files)} depth priors have no normals"
+        emit(Warned(f"{what}, and the loss normal-prior learns nothing from those; {remedy}"))
+
+
+def _make(data: Data, normals: bool = False) -> str:
+    return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"

@@ -94,6 +94,26 @@ def test_geometry_that_is_damaged_in_the_metrics_is_one_line(made, capsys):
         path.write_text(whole)
 
 
+def test_figures_that_are_damaged_in_the_metrics_are_one_line(made, capsys):
+    path, part = made / "run" / "metrics.json", {"psnr": 20.0, "ssim": 0.5, "share": 0.5}
+    whole = json.loads(path.read_text())
+    seen, seams = {"depth": "", "by_views": {"3": part}}, {"depth": "", "distance": 1.0, "near": part}
+    damages = [{"seen": wrong} for wrong in (7, [1], "x", {"by_views": None}, {"by_views": {"3": None}})]
+    damages += [{"seen": {"by_views": {"3": part | {name: "x"}}}} for name in ("psnr", "share")]
+    damages += [{"seen": {"by_views": {"3": part | {"share": None}}}}, {"ssim": None}, {"lpips_vgg": None}]
+    damages += [{"seams": wrong} for wrong in (7, ["near"], "near", {"near": part}, seams | {"elsewhere": []})]
+    try:
+        for images in ({"seen": seen, "seams": seams}, {"seen": None, "seams": None}):
+            path.write_text(json.dumps(whole | {"images": whole["images"] | images}))
+            assert said(capsys, AGAIN.format(m=made)) == (0, [])
+        for damaged in [{"images": whole["images"] | images} for images in damages] + [{"prepare_cpu_seconds": "x"}]:
+            path.write_text(json.dumps(whole | damaged))
+            status, lines = said(capsys, AGAIN.format(m=made))
+            assert status == 2 and "metrics.json: damaged; delete it" in lines[0] and len(lines) == 1, damaged
+    finally:
+        path.write_text(json.dumps(whole))
+
+
 def test_links_to_themselves_and_folders_are_one_line(made, capsys, tmp_path):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for place in ("loop", "."):

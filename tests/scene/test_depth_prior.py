@@ -40,11 +40,11 @@ def farm(made, tmp_path):
     return data, scene, {name: np.where(truth.exact[name].depth > 0, inv, 0) for name, inv in exact.items()}
 
 
-def read(data, scene):
+def read(data, scene, normals=False):
     """The priors, and what was warned of."""
     with noted() as kept:
         notes = kept.texts
-        return read_priors(data, scene), notes
+        return read_priors(data, scene, normals=normals), notes
 
 
 def relative(data, exact, scale=0.02, offset=-0.4):
@@ -198,7 +198,7 @@ def test_what_cannot_be_used_is_listed_once(farm):
     assert f"constant: {names[2]}" in notes[0] and "cannot be read" in notes[0] and names[3] in notes[0]
     np.save(paths[4], np.full_like(good, np.nan))
     priors, notes = read(data, scene)
-    assert priors is None and "the depth loss is off" in notes[0] and f"no value in it: {names[4]}" in notes[0]
+    assert priors is None and "what needs them is off" in notes[0] and f"no value in it: {names[4]}" in notes[0]
 
 
 def test_a_scale_far_from_the_others_is_a_failure(farm):
@@ -215,10 +215,30 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
 
 def test_without_any_map_the_warning_says_what_to_run(farm):
     data, scene, _ = farm
-    priors, notes = read(data, scene)
-    assert priors is None and notes == [
-        f"{data.path} has no depth priors, so the depth loss is off; make them with `surfkit prepare depth {data.path}`"
+    off = "so what needs them is off, such as the losses depth and normal-prior"
+    for normals, more in ((False, ""), (True, " estimator:patch-match")):
+        priors, notes = read(data, scene, normals)
+        assert priors is None and notes == [
+            f"{data.path} has no depth priors, {off}; make them with `surfkit prepare depth {data.path}{more}`"
+        ]
+
+
+def test_priors_without_normals_are_warned_of_where_a_loss_wants_some(farm):
+    data, scene, exact = farm
+    relative(data, exact)
+    assert read(data, scene)[1] == []
+    priors, notes = read(data, scene, normals=True)
+    assert priors[0].normal is None and notes == [
+        "5 of 5 depth priors have no normals, and the loss normal-prior learns nothing from those; "
+        f"make others with `surfkit prepare depth {data.path} estimator:patch-match --again`"
     ]
+    up = np.stack([0 * exact[scene.train[0].name]] * 2 + [-np.ones_like(exact[scene.train[0].name])])
+    for view in scene.train[1:]:
+        write_map(data.path, view.name, np.load(map_path(data.path, view.name)), np.ones_like(up[0]), up)
+    (note,) = read(data, scene, normals=True)[1]
+    assert note.startswith("1 of 5 depth priors have no normals")
+    write_map(data.path, scene.train[0].name, np.load(map_path(data.path, scene.train[0].name)), up[0] + 1, up)
+    assert read(data, scene, normals=True)[1] == []
 
 
 def test_maps_that_saw_held_out_photographs_are_warned_of(farm):

@@ -1,0 +1,89 @@
+"""A run that SIGKILL ends while it makes depth maps goes on from those that are there, to the same bits."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from needs import needs_native
+
+from surfkit.cli import main
+from surfkit.scene.made_maps import read_made
+from surfkit.scene.synthetic import Flight, photograph, write_colmap
+
+pytestmark = needs_native
+DEADLY = """
+import os, signal, sys
+
+left, replace = int(sys.argv.pop(1)), os.replace
+
+
+def replaced(unfinished, path):
+    global left
+    left -= str(path).endswith(".npy")
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(unfinished, path)
+
+
+os.replace = replaced
+from surfkit.cli import main
+
+sys.exit(main())
+"""
+"""The command line, in a process that dies when so many arrays are written, but for the name of the last."""
+SETTINGS = "recipe:surface mesh:none --steps 4 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    """Seven photographs to train on; each is compared with all others."""
+    folder = tmp_path_factory.mktemp("farm")
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=48, height=36, points=300)), tracks=True)
+    return folder
+
+
+def words(data, folder):
+    """Of a run in a folder."""
+    return ["train", *SETTINGS, "--data", str(data), "--out", str(folder / "run")]
+
+
+def killed(data, folder, at):
+    """A run in a folder, whose maps are kept there too, in a process that dies at an array; never if that is -1."""
+    given = os.environ | {"SURFKIT_CACHE": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-c", DEADLY, str(at), *words(data, folder)]
+    done = subprocess.run(line, env=given, capture_output=True, check=False)
+    assert done.returncode == (0 if at == -1 else -signal.SIGKILL), done.stderr.decode()
+
+
+def arrays(folder):
+    """Every whole array in a folder, by where it is: when it was written, and what it is."""
+    paths = [path for path in folder.rglob("*.npy") if not path.name.startswith(".")]
+    return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in paths}
+
+
+def test_maps_that_are_there_are_not_made_again(farm, tmp_path, own_cache):
+    assert main(words(farm, tmp_path / "whole")) == 0
+    (made,) = (own_cache / "depth").iterdir()
+    here = tmp_path / "killed"
+    out, cache = here / "run", here / "cache/depth" / made.name
+    killed(farm, here, at=5)
+    matched = arrays(cache)
+    assert len(matched) == 4 and all("matching-photographs" in name for name in matched)
+    assert list(cache.rglob(".*.part")), "it died while it wrote"
+    killed(farm, here, at=10 + 3 * 3 + 2)  # ten more before the first map, each of which is three files
+    there, before = arrays(cache), read_made(cache)
+    assert there.items() >= matched.items() and before.maps == 3 and not (out / "recipe.json").exists()
+    killed(farm, here, at=-1)
+    found, wanted, after = arrays(cache), arrays(made), read_made(cache)
+    assert {name: content for name, (_, content) in found.items()} == {n: content for n, (_, content) in wanted.items()}
+    kept = [name for name in found if there.get(name) == found[name]]
+    assert len(kept) == 3 * 3 and after.maps == 7 and after.cpu_seconds > before.cpu_seconds > 0
+    whole = tmp_path / "whole/run"
+    assert (out / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    images = [json.loads((folder / "metrics.json").read_text())["images"] for folder in (out, whole)]
+    assert images[0] == images[1]
+    assert not [path for path in here.rglob("*") if path.name.startswith(".") or path.name == "lock"]
+    assert sorted(path.name for path in farm.iterdir()) == ["images", "sparse"]
