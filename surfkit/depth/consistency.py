@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,10 +30,26 @@ def at_edge(inverse: Tensor, radius: int, share: float) -> Tensor:
     return bend > inverse * share / 2
 
 
-def agreement(
-    camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float
-) -> tuple[Tensor, Tensor]:
-    """How many other maps agree with each pixel, and the mean of what they and the map itself say.
+class Agreement(NamedTuple):
+    """What other maps say of the pixels of a map.
+
+    Attributes:
+        count: (H, W) number of maps that agree.
+        shown: (H, W) number of maps that have a depth in the same place, whether it agrees or not.
+        fused: (H, W) inverse depth, the mean of what the maps that agree and the map itself say.
+    """
+
+    count: Tensor
+    shown: Tensor
+    fused: Tensor
+
+    def trust(self, enough: int) -> Tensor:
+        """(H, W) in [0, 1]: 1 where `enough` maps agree, or all that show the place if fewer do, but 2 at least."""
+        return (self.count / self.shown.clamp(2, max(2, enough))).clamp_max(1)
+
+
+def agreement(camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float) -> Agreement:
+    """How many other maps agree with each pixel.
 
     A pixel is carried into another photograph; the maps agree where the depth there differs by a share of less than
     `tolerance` from that in the other map.
@@ -42,18 +59,17 @@ def agreement(
         inverse: (H, W) inverse depth; 0 where there is none.
         others: Cameras and maps of other photographs.
         tolerance: Share of the depth.
-
-    Returns:
-        (H, W) number of maps that agree; (H, W) inverse depth.
     """
-    count, ratios = torch.zeros_like(inverse), torch.ones_like(inverse)
+    count, shown, ratios = torch.zeros_like(inverse), torch.zeros_like(inverse), torch.ones_like(inverse)
     for there, other in others:
         a, b = ray_map(camera, there, inverse.device)
         x, y, z = (a[i] + inverse * b[i] for i in range(3))
         grid = torch.stack([x / z * (2 / there.width) - 1, y / z * (2 / there.height) - 1], -1)
         found = grid_sample(other[None, None], grid[None], mode="nearest", align_corners=False)[0, 0]
         ratio = found * z / inverse.clamp_min(1e-20)  # depth carried over / depth found
-        agrees = (inverse > 0) & (z > 0) & (found > 0) & ((ratio - 1).abs() < tolerance)
+        known = (inverse > 0) & (z > 0) & (found > 0)
+        agrees = known & ((ratio - 1).abs() < tolerance)
+        shown += known
         count += agrees
         ratios += torch.where(agrees, ratio, 0)
-    return count, inverse * ratios / (count + 1)
+    return Agreement(count, shown, inverse * ratios / (count + 1))

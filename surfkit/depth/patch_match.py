@@ -65,8 +65,9 @@ class PatchMatch(DepthEstimator):
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
 
-    neighbours: int = 8
-    """Photographs that each one is compared with."""
+    neighbours: int = 16
+    """Photographs that each one is compared with; each pixel is matched in the `best` of them, so more cost little and
+    help where few see a place."""
 
     angle: float = 12.0
     """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
@@ -98,7 +99,7 @@ class PatchMatch(DepthEstimator):
     """Reprojection error, pixels, up to which the depth maps of two photographs agree."""
 
     agree: int = 3
-    """Photographs whose depth maps must agree with a depth to trust it fully."""
+    """Photographs whose depth maps must agree with a depth to trust it fully; all where fewer show the place."""
 
     edge: float = 0.01
     """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
@@ -128,10 +129,10 @@ class PatchMatch(DepthEstimator):
         camera = work.camera(at, 0)
         others = [(work.camera(near, 0), other.inverse) for near in work.pairs[at] if (other := work.consistent(near))]
         share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
-        count, fused = agreement(camera, found.inverse, others, share)
-        trust = (count / min(self.agree, max(1, len(others)))).clamp_max(1) * found.matched(self.best)
+        said = agreement(camera, found.inverse, others, share)
+        trust = said.trust(self.agree) * found.matched(self.best)
         trust[at_edge(found.inverse, self.window // 2, self.edge)] = 0
-        return Estimate(at, fused, trust, found.normals(camera))
+        return Estimate(at, said.fused, trust, found.normals(camera))
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,11 @@ class Map:
         return -away / away.norm(dim=0).clamp_min(1e-20)
 
 
+@dataclass(frozen=True)
 class Beginning(PlaneSweep):
-    """The sweep in which planes begin."""
+    """The sweep in which planes begin; it also looks for what is nearer or further than all sparse points."""
+
+    margin: float = 0.5
 
     def remedy(self, longest: int) -> str:
         """See `PlaneSweep.remedy`."""

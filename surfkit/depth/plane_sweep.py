@@ -126,10 +126,10 @@ class PlaneSweep(DepthEstimator):
                 continue
             inverse, matched = maps.pop(at)
             others = [(picture(near).camera, found) for near, (found, _) in maps.items()]
-            count, fused = agreement(picture(at).camera, inverse, others, self.tolerance)
-            trusted = (count / min(self.agree, max(1, len(others)))).clamp_max(1)
+            found = agreement(picture(at).camera, inverse, others, self.tolerance)
+            trusted = found.trust(self.agree)
             trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
-            yield Estimate(at, fused.cpu(), (trusted * matched).cpu())
+            yield Estimate(at, found.fused.cpu(), (trusted * matched).cpu())
 
     def picture(self, given: Material, at: int) -> Picture:
         """A photograph at the working size."""

@@ -189,7 +189,7 @@ def test_settings_that_make_no_sense_are_refused():
         {"window": 4},
         {"window": 19},
         {"neighbours": 17},
-        {"best": 9},
+        {"best": 17},
         {"passes": 0},
         {"spread": 0},
         {"tolerance_px": 0},

@@ -138,12 +138,12 @@ def test_maps_of_one_surface_agree_and_others_do_not(farm):
     scene, _, truth = farm
     cameras = [scene.train[at].camera for at in (6, 7, 11)]
     maps = [1 / truth.exact[scene.train[at].name].depth.float() for at in (6, 7, 11)]
-    count, fused = agreement(cameras[0], maps[0], [(cameras[1], maps[1]), (cameras[2], 1.2 * maps[2])], 0.01)
+    count, shown, fused = agreement(cameras[0], maps[0], [(cameras[1], maps[1]), (cameras[2], 1.2 * maps[2])], 0.01)
     assert (count == 1).float().mean() > 0.4 and (count == 2).float().mean() < 0.02
     assert ((fused / maps[0] - 1).abs() < 0.01).all()
     wrong = maps[0].clone()
     wrong[50:60, 60:80] *= 1.1
-    count, _ = agreement(cameras[0], wrong, [(cameras[1], maps[1])], 0.01)
+    count, _, _ = agreement(cameras[0], wrong, [(cameras[1], maps[1])], 0.01)
     assert not count[50:60, 60:80].any()
 
 

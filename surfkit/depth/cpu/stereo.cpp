@@ -273,6 +273,8 @@ struct Pixel {
         count = std::min(job.best, job.views);
         std::partial_sort(vote, vote + count, vote + job.views);
         for (int i = 0; i < count; i++) chosen[i] = vote[i] % kMostViews;
+        const int nothing = (2 + neighbours) * 255;  // views that show neither this pixel nor those around it say nothing
+        while (count > 1 && vote[count - 1] / kMostViews >= nothing) count--;
     }
 
     static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
