@@ -52,8 +52,8 @@ class StereoStart(Start):
     """Most points when their number is auto."""
 
     min_confidence: float = 0.25
-    """Pixels of a lower confidence are not used. Wrong points are soon moved or pruned, missing ones are hard to make up
-    for."""
+    """Pixels of a lower confidence are not used. Wrong points are soon moved or pruned, missing ones are hard to
+    make up for."""
 
     opacity: float = 0.5
     """Opacity to begin with; what depth maps show is there, so it may be higher than that of sparse points, 0.1."""

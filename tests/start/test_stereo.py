@@ -127,7 +127,7 @@ def test_sparse_points_only_where_depth_maps_have_none(farm):
         places = view.camera.rays(torch.float64) / prior.inverse
         shift = view.camera.world_to_camera[:3, 3:]
         world = (view.camera.world_to_camera[:3, :3].T @ (places.flatten(1) - shift)).view(3, *prior.inverse.shape)
-        return replace(prior, confidence=torch.where(world[1] < 0, prior.confidence, 0.4))
+        return replace(prior, confidence=torch.where(world[1] < 0, prior.confidence, 0.2))
 
     start = StereoStart(points=2_000)
     cloud, stereo = start.cloud(known(farm, spoilt=half)), start.fused(known(farm, spoilt=half))
