@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
@@ -25,7 +26,7 @@ from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 
-KEPT = 64
+KEPT = 48
 """Pictures and maps kept in memory."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
@@ -205,7 +206,8 @@ class Work:
         self.settings, self.given, self.pairs = settings, given, pairs
         self.sweep = Beginning(longest=settings.coarsest)
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
-        self.grey = lru_cache(3 * KEPT)(self.read)
+        self.value = lru_cache(2 * KEPT)(self.read)
+        self.grey = lru_cache(KEPT)(self.halved)
         self.photometric = lru_cache(KEPT)(lambda at: self.kept("matching photographs", at, self.match))
         reconciled = lru_cache(KEPT)(lambda at: self.kept("comparing depth maps", at, self.reconcile))
         self.consistent = reconciled if settings.consistency else self.photometric
@@ -220,11 +222,17 @@ class Work:
         camera = self.camera(at, 0)
         return max(0, round(math.log2(max(camera.width, camera.height) / (2 * self.settings.coarsest))))
 
-    def read(self, at: int, level: int) -> Grey:
-        """A photograph at a level."""
-        camera = self.camera(at, level)
+    def read(self, at: int) -> Tensor:
+        """(H, W) uint8, a photograph at full size."""
+        camera = self.camera(at, 0)
         rgb = read_photo(self.given.views[at].path, (camera.width, camera.height)).to(torch.float32)
-        return Grey(camera, rgb.mean(0).round().to(torch.uint8).numpy())
+        return rgb.mean(0).round().to(torch.uint8)
+
+    def halved(self, at: int, level: int) -> Grey:
+        """A photograph at a level; files are decoded once."""
+        camera = self.camera(at, level)
+        small = adaptive_avg_pool2d(self.value(at).to(torch.float32)[None], (camera.height, camera.width))[0]
+        return Grey(camera, small.round().to(torch.uint8).numpy())
 
     def kept(self, what: str, at: int, make: Callable[[int], Map | None]) -> Map | None:
         """A map from the folder for work, where it is put if it is not there."""
