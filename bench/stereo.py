@@ -36,7 +36,7 @@ from surfkit.scene.scene import Frame, Scene, View
 PACK = Path(__file__).resolve().parents[1].parent / "shared/data/shibuya-synth"
 NATIVE, TORCH = "patch-match", "plane-sweep"
 ENGINES = {NATIVE: PatchMatch, TORCH: PlaneSweep}
-SWEPT = 960
+SWEPT = 480
 """Longest side up to which the sweep is measured: its time grows with the third power."""
 CORE = 110.0
 """Metres in x and y, from the origin, that the exact mesh covers on all sides."""

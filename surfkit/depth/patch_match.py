@@ -128,7 +128,8 @@ class PatchMatch(DepthEstimator):
     def trusted(self, work: Work, at: int, found: Map) -> Estimate:
         """What the maps of other photographs agree with, and the mean of what they say."""
         camera = work.camera(at, 0)
-        others = [(work.camera(near, 0), other.inverse) for near in work.pairs[at] if (other := work.consistent(near))]
+        depths = ((near, work.consistent_depth(near)) for near in work.pairs[at])
+        others = [(work.camera(near, 0), depth) for near, depth in depths if depth is not None]
         share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
         said = agreement(camera, found.inverse, others, share)
         trust = said.trust(self.agree) * found.matched(self.best)
@@ -208,9 +209,12 @@ class Work:
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * KEPT)(self.read)
         self.grey = lru_cache(KEPT)(self.halved)
-        self.photometric = lru_cache(KEPT)(lambda at: self.kept("matching photographs", at, self.match))
-        reconciled = lru_cache(KEPT)(lambda at: self.kept("comparing depth maps", at, self.reconcile))
+        # Of maps of other photographs, the depth alone is kept: a seventh of the whole.
+        self.photometric = lru_cache(1)(lambda at: self.kept("matching photographs", at, self.match))
+        self.depth = lru_cache(KEPT)(lambda at: inverse_of(self.photometric(at)))
+        reconciled = lru_cache(1)(lambda at: self.kept("comparing depth maps", at, self.reconcile))
         self.consistent = reconciled if settings.consistency else self.photometric
+        self.consistent_depth = lru_cache(KEPT)(lambda at: inverse_of(self.consistent(at)))
 
     def camera(self, at: int, level: int) -> Camera:
         """Of a photograph whose sides are halved `level` times."""
@@ -282,9 +286,7 @@ class Work:
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         if found is None or span is None:
             return None
-        known = [
-            None if (other := self.photometric(near)) is None else other.inverse.numpy() for near in self.pairs[at]
-        ]
+        known = [None if (depth := self.depth(near)) is None else depth.numpy() for near in self.pairs[at]]
         planes = Planes.at(found.value[..., 0], len(known))
         planes.value[:], planes.each[:] = found.value, found.each
         terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
@@ -308,6 +310,11 @@ class Work:
             window=settings.window,
             survey=False,
         )
+
+
+def inverse_of(found: Map | None) -> Tensor | None:
+    """(H, W) inverse depth of a map."""
+    return None if found is None else found.inverse
 
 
 def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:
