@@ -12,6 +12,7 @@ from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
+from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
@@ -112,9 +113,9 @@ SURFACE = Table(
         Row("+ stereo depth as a loss", DEPTH | {"depth": BEST.depth}),
         Row("+ dense start", {"start": BEST.start, "pretrain.densify": BEST.pretrain.densify}),
         Row("+ constant depth weight", {"pretrain.losses.depth": BEST.pretrain.losses["depth"]}),
-        Row("+ stereo normals", {"pretrain.losses.prior": BEST.pretrain.losses["prior"]}),
         Row("+ normals of depth", {"pretrain.losses.normal": BEST.pretrain.losses["normal"]}),
         Row("+ fusion by agreement", {"mesh": BEST.mesh}),
+        Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
         Row("stereo alone (mesh:stereo)", {"mesh": Stereo(fusion=BEST.mesh), "pretrain.steps": 1}, kept=False),

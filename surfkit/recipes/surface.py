@@ -8,7 +8,6 @@ from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
-from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.agreement import Agreement
@@ -30,7 +29,6 @@ SURFACE = Recipe(
             "ssim": SSIM(),
             "normal": NormalConsistency(weight=0.05, start=3_000, depth="median"),
             "depth": DepthRegression(start=10.0, end=10.0),
-            "prior": NormalPrior(start=0.05, end=0.05),
         },
         # Stereo leaves holes, which few views see or which show no texture: points multiply there. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
