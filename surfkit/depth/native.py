@@ -91,7 +91,6 @@ class Terms:
         best: Views that count for a pixel.
         window: Side of the windows compared, pixels; odd.
         survey: Look at all views anew, to choose those that count.
-        same_px: Parallax by which planes must differ to be tried both.
     """
 
     low: float
@@ -105,7 +104,6 @@ class Terms:
     best: int
     window: int
     survey: bool
-    same_px: float = 0.06
 
 
 def improve(
@@ -138,16 +136,7 @@ def improve(
         planes.value,
         planes.cost,
         planes.each,
-        [
-            terms.low,
-            terms.high,
-            terms.parallax,
-            terms.jitter_px,
-            terms.smoothness,
-            terms.consistency,
-            terms.spread,
-            terms.same_px,
-        ],
+        [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread],
         terms.samples,
         terms.best,
         terms.survey,

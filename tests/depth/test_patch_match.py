@@ -86,7 +86,7 @@ def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms:
     height, width = here.value.shape
     middle = float(here.value[y, x])
     weights, ours, theirs = [], [], []
-    for dx, dy, near in pattern(terms.window).T.astype(float):
+    for dx, dy, near in pattern(terms.window).T[: terms.samples].astype(float):
         if near == 0:
             continue
         value = float(here.value[int(np.clip(y + dy, 0, height - 1)), int(np.clip(x + dx, 0, width - 1))])
@@ -105,13 +105,15 @@ def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms:
     return float(np.clip(1 - (w * a) @ b / np.sqrt((w @ a**2 + 1) * (w @ b**2 + 1)), 0, 1))
 
 
-def test_the_kernel_is_the_weighted_correlation_of_windows():
+@pytest.mark.parametrize("samples", [16, 32])
+def test_the_kernel_is_the_weighted_correlation_of_windows(samples):
     here, there = two_pictures(0)
+    still = replace(STILL, samples=samples)
     planes = Planes.at(np.full((24, 32), 0.5, np.float32), 1)
     planes.value[..., 1], planes.value[..., 2] = 0.004, -0.006
-    improve(here, [there], planes, STILL, seed=0)
+    improve(here, [there], planes, still, seed=0)
     for x, y in ((16, 12), (10, 8), (20, 15), (1, 1)):
-        wanted = slow_cost(here, there, x, y, planes.value[y, x].astype(float), STILL)
+        wanted = slow_cost(here, there, x, y, planes.value[y, x].astype(float), still)
         assert planes.cost[y, x] == pytest.approx(
             wanted, abs=5e-3
         )  # positions are rounded to a 64th of a pixel, in noise

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.depth.base import Material
-from surfkit.depth.consistency import agreement, at_edge
+from surfkit.depth.consistency import Agreement, agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -145,6 +145,13 @@ def test_maps_of_one_surface_agree_and_others_do_not(farm):
     wrong[50:60, 60:80] *= 1.1
     count, _, _ = agreement(cameras[0], wrong, [(cameras[1], maps[1])], 0.01)
     assert not count[50:60, 60:80].any()
+
+
+def test_trust_asks_for_two_maps_at_least_and_for_no_more_than_show_the_place():
+    count = torch.tensor([0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 4.0])
+    shown = torch.tensor([0.0, 1.0, 2.0, 2.0, 5.0, 5.0, 4.0])
+    wanted = torch.tensor([0, 1 / 2, 1 / 2, 1, 2 / 3, 1, 1])
+    torch.testing.assert_close(Agreement(count, shown, count).trust(3), wanted)
 
 
 def test_edges_are_told_from_slopes():

@@ -71,7 +71,6 @@ void add_stereo(nb::module_& m) {
             job.low = (float)settings.at(0), job.high = (float)settings.at(1);
             job.parallax = (float)settings.at(2);
             job.jitter_px = (float)settings.at(3);
-            job.same_px = (float)settings.at(7);
             job.smoothness = (float)settings.at(4);
             job.consistency = (float)settings.at(5);
             job.spread = (float)settings.at(6);

@@ -21,6 +21,7 @@ constexpr float kNothing = 2.0f;     // cost of a plane that a view does not sho
 constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
 constexpr float kMostError = 3.0f;   // pixels of reprojection
 constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
+constexpr float kSame = 0.06f;       // pixels of parallax by which planes must differ to be tried both
 constexpr float kNever = 1e9f;       // cost of a plane that is not tried
 constexpr int kTrials = 16;          // room for planes that are tried together
 constexpr int kFraction = 6, kOne = 1 << kFraction;  // of a pixel, to which positions are rounded
@@ -292,7 +293,7 @@ struct Pixel {
     void screen(bool known) {
         trials.fill();
         const float rx = ((float)x + 0.5f - job.cx) / job.fx, ry = ((float)y + 0.5f - job.cy) / job.fy;
-        const float away = kOblique * kOblique * (rx * rx + ry * ry + 1.0f), same = job.same_px / job.parallax;
+        const float away = kOblique * kOblique * (rx * rx + ry * ry + 1.0f), same = kSame / job.parallax;
         for (int i = 0; i < trials.count; i += kLanes) {
             const Floats w = load(trials.w + i), gx = load(trials.gx + i), gy = load(trials.gy + i);
             const Floats nx = gx * job.fx, ny = gy * job.fy, nz = w - nx * rx - ny * ry;

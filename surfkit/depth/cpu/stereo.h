@@ -39,7 +39,6 @@ struct StereoJob {
     float low, high;     // inverse depths
     float parallax;      // pixels by which a picture moves, a unit of inverse depth
     float jitter_px;     // by which planes are changed at random
-    float same_px;       // planes that differ by less parallax need not be tried
     float smoothness;    // cost of a difference of one pixel of parallax from the neighbours
     float consistency;   // cost of a reprojection error of one pixel
     float spread;        // difference of grey values at which a pixel of the window counts 1 / e
