@@ -24,6 +24,8 @@ constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; m
 constexpr float kSame = 0.06f;       // pixels of parallax by which planes must differ to be tried both
 constexpr float kNever = 1e9f;       // cost of a plane that is not tried
 constexpr int kTrials = 16;          // room for planes that are tried together
+constexpr int kLooked = 2;           // views that are looked at, for each one that counts
+constexpr int kKept = 4;             // planes that are looked at in all of these views, after the first half of them
 constexpr int kFraction = 6, kOne = 1 << kFraction;  // of a pixel, to which positions are rounded
 
 struct Window {
@@ -107,6 +109,7 @@ struct Trials {
 
     void add(const Plane& p) { w[count] = p.w, gx[count] = p.gx, gy[count] = p.gy, count++; }
     Plane at(int i) const { return {w[i], gx[i], gy[i]}; }
+    void move(int from, int to) { w[to] = w[from], gx[to] = gx[from], gy[to] = gy[from], cost[to] = cost[from]; }
 
     void fill() {  // lanes that are not used
         for (int i = count; i % kLanes; i++) w[i] = gx[i] = gy[i] = 0;
@@ -214,8 +217,8 @@ struct Pixel {
     const StereoJob& job;
     const int x, y;
     Window window;
-    int chosen[kMostViews];
-    int count = 0;         // of the chosen
+    int chosen[kMostViews];  // views that are looked at
+    int count = 0;
     float around[4];       // inverse depths of the four neighbours
     float offset[4][2];
     float alike[4];        // how far their grey values are those of this pixel
@@ -250,7 +253,7 @@ struct Pixel {
         }
     }
 
-    // The views that count: those that match best here and around.
+    // The views to look at: those that match best here and around.
     void choose() {
         uint8_t* here = job.each + ((int64_t)y * job.width + x) * job.views;
         if (job.survey) {
@@ -271,11 +274,44 @@ struct Pixel {
             }
             vote[view] = vote[view] * kMostViews + view;  // equal ones in their order
         }
-        count = std::min(job.best, job.views);
+        count = std::min(kLooked * job.best, job.views);
         std::partial_sort(vote, vote + count, vote + job.views);
         for (int i = 0; i < count; i++) chosen[i] = vote[i] % kMostViews;
         const int nothing = (2 + neighbours) * 255;  // views that show neither this pixel nor those around it say nothing
         while (count > 1 && vote[count - 1] / kMostViews >= nothing) count--;
+    }
+
+    // Keep the planes that cost least in the views looked at so far.
+    void drop_worst(float (*match)[kMostViews], int seen) {
+        if (trials.count <= kKept) return;
+        float so_far[kTrials], sorted[kTrials];
+        for (int i = 0; i < trials.count; i++) {
+            float sum = 0;
+            for (int j = 0; j < seen; j++) sum += std::min(match[i][j], 1.0f);
+            so_far[i] = sorted[i] = trials.cost[i] + sum / (float)seen;
+        }
+        std::nth_element(sorted, sorted + kKept - 1, sorted + trials.count);
+        int left = 0;
+        for (int i = 0; i < trials.count && left < kKept; i++) {
+            if (so_far[i] > sorted[kKept - 1]) continue;
+            trials.move(i, left);
+            for (int j = 0; j < seen; j++) match[left][j] = match[i][j];
+            left++;
+        }
+        trials.count = left;
+        trials.fill();
+    }
+
+    // The mean of the least costs, of as many views as count; views that show nothing count only where all others do too.
+    float least_of(const float* match) const {
+        float sorted[kMostViews];
+        std::copy(match, match + count, sorted);
+        const int most = std::min(job.best, count);
+        std::partial_sort(sorted, sorted + most, sorted + count);
+        float sum = sorted[0];
+        int used = 1;
+        for (; used < most && sorted[used] < kNothing; used++) sum += sorted[used];
+        return sum / (float)used;
     }
 
     static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
@@ -313,33 +349,32 @@ struct Pixel {
             }
         int left = known ? 0 : 1;
         for (int i = 1; i < trials.count; i++) {
-            trials.w[left] = trials.w[i], trials.gx[left] = trials.gx[i], trials.gy[left] = trials.gy[i];
-            trials.cost[left] = trials.cost[i];
+            trials.move(i, left);
             left += trials.cost[i] < kNever;
         }
         trials.count = left;
         trials.fill();
     }
 
-    // Take the best of the trials, of which the first is the present plane; its cost may be known already.
+    // Take the best of the trials, of which the first is the present plane; its cost may be known already. Each counts in the
+    // views that match it best: a plane that lies far behind another is seen by other views.
     void attempt(bool known) {
         screen(known);
-        float match[kMostViews][kTrials];
-        const float share = 1.0f / (float)count;
+        float match[kTrials][kMostViews];
         for (int at = 0; at < count; at++) {
+            if (at == job.best) drop_worst(match, at);
             see(chosen[at]);
-            for (int i = 0; i < trials.count; i++) {
-                match[at][i] = trials.match[i];
-                trials.cost[i] += share * trials.match[i];
-            }
+            for (int i = 0; i < trials.count; i++) match[i][at] = trials.match[i];
         }
         int best = -1;
         float least = known ? cost : kNever;
-        for (int i = 0; i < trials.count; i++)
-            if (trials.cost[i] < least) best = i, least = trials.cost[i];
+        for (int i = 0; i < trials.count; i++) {
+            const float c = trials.cost[i] + least_of(match[i]);
+            if (c < least) best = i, least = c;
+        }
         if (best >= 0) {
             uint8_t* here = job.each + ((int64_t)y * job.width + x) * job.views;
-            for (int at = 0; at < count; at++) here[chosen[at]] = told(match[at][best]);
+            for (int at = 0; at < count; at++) here[chosen[at]] = told(match[best][at]);
             plane = trials.at(best);
         }
         cost = least;
