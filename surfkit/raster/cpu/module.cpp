@@ -5,6 +5,10 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
 #include <algorithm>
 #include <optional>
 #include <string>
@@ -60,6 +64,15 @@ splat::CameraModel<double> camera(const std::vector<double>& pose, const std::ve
     return c;
 }
 
+// Every step frees and takes the same buffers of some 10 to 100 MB. By default glibc gives each back to the system, which
+// clears its pages anew: a sixth of the CPU time of a training.
+void keep_freed_memory() {
+#if defined(__GLIBC__)
+    if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 32 << 20);
+    mallopt(M_TRIM_THRESHOLD, 256 << 20);
+#endif
+}
+
 }  // namespace
 
 const Kernels& kernels() { return *active; }
@@ -83,6 +96,7 @@ std::vector<const Kernels*> runnable_kernels() {
 NB_MODULE(_native, m) {
     using namespace surfkit;
     use_kernels(*runnable_kernels().front());
+    keep_freed_memory();
 
     nb::class_<Pass>(m, "Pass")
         .def("__init__",
