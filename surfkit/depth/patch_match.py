@@ -25,6 +25,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
+from surfkit.scene.vectors import unit
 
 KEPT = 48
 """Pictures and maps kept in memory."""
@@ -182,7 +183,7 @@ class Map:
         rays = camera.rays()
         nx, ny = gx * camera.fx, gy * camera.fy
         away = torch.stack([nx, ny, w - nx * rays[0] - ny * rays[1]])
-        return -away / away.norm(dim=0).clamp_min(1e-20)
+        return -unit(away)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from surfkit.scene.made_maps import located
 from surfkit.scene.observations import Observations
 from surfkit.scene.read import model_folder, observations
 from surfkit.scene.scene import Scene, View
+from surfkit.scene.vectors import unit
 
 UNITS = 1.25
 """A map in input units that is off by a larger factor from the sparse points is in other units."""
@@ -110,7 +111,7 @@ def _unpacked(prior: DepthPrior | None) -> DepthPrior | None:
     """A prior whose normals are unit vectors again."""
     if prior is None or prior.normal is None:
         return prior
-    return replace(prior, normal=torch.nn.functional.normalize(prior.normal.to(torch.float32), dim=0))
+    return replace(prior, normal=unit(prior.normal.to(torch.float32)))
 
 
 def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:

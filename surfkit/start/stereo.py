@@ -9,7 +9,6 @@ from typing import ClassVar, Literal
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
@@ -17,6 +16,7 @@ from surfkit.primitives.init import gaps
 from surfkit.scene.camera import Camera
 from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
+from surfkit.scene.vectors import unit
 from surfkit.start.base import Known, Start
 from surfkit.start.voxels import Collected, Samples, Thinned, lonely, thinned_to
 
@@ -136,7 +136,7 @@ def samples(camera: Camera, prior: DepthPrior, photo: Tensor, there: Tensor) -> 
     slopes = normals_of(camera, prior.inverse)
     given = slopes if prior.normal is None else torch.where(prior.normal.abs().sum(0) > 0, prior.normal, slopes)
     normal = given[:, there].double()
-    normal = torch.where(normal.abs().sum(0) > 0, normal, -normalize(rays, dim=0))
+    normal = torch.where(normal.abs().sum(0) > 0, normal, -unit(rays))
     turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3:]
     return Samples(
         xyz=(turn.T @ (rays * depth - shift)).T.numpy(),
@@ -163,7 +163,7 @@ def normals_of(camera: Camera, inverse: Tensor) -> Tensor:
     nx, ny = camera.fx * across, camera.fy * along
     normal = torch.stack([nx, ny, c - rays[0] * nx - rays[1] * ny])
     known = (across.isfinite() & along.isfinite() & (c > 0))[None]
-    return torch.where(known, -normalize(normal.nan_to_num(), dim=0), 0).to(inverse.dtype)
+    return torch.where(known, -unit(normal.nan_to_num()), 0).to(inverse.dtype)
 
 
 def _slope(values: Tensor, dim: int) -> Tensor:
@@ -188,7 +188,7 @@ def filled(stereo: Thinned, known: Known, start: StereoStart) -> Cloud:
     return Cloud(
         xyz=xyz,
         rgb=torch.cat([torch.from_numpy(stereo.rgb.round().clip(0, 255)).to(torch.uint8), sparse.rgb[more]]),
-        normals=torch.cat([torch.from_numpy(stereo.normals).float(), normalize(anyhow, dim=1)]),
+        normals=torch.cat([torch.from_numpy(stereo.normals).float(), unit(anyhow, 1)]),
         opacity=torch.tensor([start.opacity, SPARSE_OPACITY]).repeat_interleave(counts),
-        size=gaps(xyz) * torch.tensor([start.size, 1.0]).repeat_interleave(counts),
+        size=torch.cat([start.size * gaps(xyz[: len(stereo)]), gaps(xyz[len(stereo) :])]),
     )
