@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from surfkit.core.check import BadInput
+from surfkit.core.sets import is_among
 
 CELLS = 8
 """Points closer than a radius over this, or than the extent over the next, are one: the triangulation stays small."""
@@ -83,7 +84,7 @@ def _longest_ring(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     triangles = np.where(turn[:, None] < 0, triangles[:, ::-1], triangles)
     begin, end = triangles[:, [0, 1, 2]].ravel(), triangles[:, [1, 2, 0]].ravel()
-    single = ~np.isin(begin.astype(np.int64) * len(points) + end, end.astype(np.int64) * len(points) + begin)
+    single = ~is_among(begin.astype(np.int64) * len(points) + end, end.astype(np.int64) * len(points) + begin)
     border: dict[int, list[int]] = {}
     for u, v in zip(begin[single].tolist(), end[single].tolist(), strict=True):
         border.setdefault(u, []).append(v)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from surfkit.core.sets import distinct, is_among
 from surfkit.mesh.base import Mesh
 
 RIM = 0.25
@@ -23,7 +24,7 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
             fill it is more than `RIM` of the part.
     """
     sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    known = np.unique(sides[:, 0] << 32 | sides[:, 1])
+    known = distinct(sides[:, 0] << 32 | sides[:, 1])
     parts = _parts(mesh)
     areas = np.bincount(parts[mesh.faces[:, 0]], _areas(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
     made = []
@@ -44,7 +45,7 @@ def rings(mesh: Mesh) -> list[np.ndarray]:
     """
     sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     names, back = sides[:, 0] << 32 | sides[:, 1], sides[:, 1] << 32 | sides[:, 0]
-    free = sides[~np.isin(names, back)]
+    free = sides[~is_among(names, back)]
     _, at, counts = np.unique(free, return_inverse=True, return_counts=True)
     once = (counts[at.reshape(-1, 2)] == 2).all(1)  # one edge comes, one goes
     return _rings({b: a for a, b in free[once].tolist()})
@@ -55,8 +56,7 @@ def _across(faces: np.ndarray, ring: np.ndarray, known: np.ndarray) -> bool:
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     around = np.sort(np.stack([ring, np.roll(ring, -1)], 1), axis=1)
     names, own = (pairs[:, 0] << 32 | pairs[:, 1] for pairs in (sides, around))
-    fresh = np.setdiff1d(names, own)
-    return bool((known[np.searchsorted(known, fresh).clip(max=len(known) - 1)] == fresh).any())
+    return bool(is_among(names[~is_among(names, own)], known).any())
 
 
 def _rings(follows: dict[int, int]) -> list[np.ndarray]:

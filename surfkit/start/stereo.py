@@ -59,7 +59,8 @@ class StereoStart(Start):
     """Opacity to begin with; what depth maps show is there, so it may be higher than that of sparse points, 0.1."""
 
     size: float = 0.65
-    """Standard deviation of a splat to begin with, as a share of the gaps between points; sparse points have all."""
+    """Standard deviation of a splat to begin with, as a share of the gaps between points; that of sparse points is the
+    whole gap between them."""
 
     def __post_init__(self) -> None:
         if self.points != "auto" and self.points < 1:

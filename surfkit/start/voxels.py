@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from surfkit.core.sets import is_among
+
 BITS = 19
 """Of the index of a voxel along each axis."""
 LEVELS = 31
@@ -225,7 +227,7 @@ def _seen_finer(voxels: Voxels) -> np.ndarray:
     for each in np.unique(level)[1:]:
         finer, here = level < each, level == each
         inside, _ = _encoded(voxels.side, place[finer], np.full(int(finer.sum()), float(each)), place[finer])
-        seen[here] = np.isin(voxels.keys[here], inside)
+        seen[here] = is_among(voxels.keys[here], inside)
     return seen
 
 

@@ -1,0 +1,23 @@
+"""Sets of numbers in large arrays, by sorting: numpy's own, by hashing, take up to 20 times as long from 2.3 on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def distinct(values: np.ndarray) -> np.ndarray:
+    """(D,) the values of an array of any shape, each once, in order."""
+    ordered = np.sort(values, axis=None)
+    first = np.ones(len(ordered), bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=first[1:])
+    return ordered[first]
+
+
+def is_among(values: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(N,) bool, which of (N,) values are among (M,) others."""
+    order, ordered = np.argsort(values), np.sort(others)
+    inside = values[order]  # in order, so that looking up goes through memory in order too
+    found = np.zeros(len(values), bool)
+    if len(ordered):
+        found[order] = ordered[np.searchsorted(ordered, inside).clip(max=len(ordered) - 1)] == inside
+    return found
