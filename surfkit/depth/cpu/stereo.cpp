@@ -25,7 +25,7 @@ constexpr float kSame = 0.06f;       // pixels of parallax by which planes must 
 constexpr float kNever = 1e9f;       // cost of a plane that is not tried
 constexpr int kTrials = 16;          // room for planes that are tried together
 constexpr int kLooked = 2;           // views that are looked at, for each one that counts
-constexpr int kKept = 4;             // planes that are looked at in all of these views, after the first half of them
+constexpr int kKept = 6;             // planes that are looked at in all of these views, after the first half of them
 constexpr int kFraction = 6, kOne = 1 << kFraction;  // of a pixel, to which positions are rounded
 
 struct Window {
