@@ -28,6 +28,7 @@ from surfkit.scene.capture import Shot
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import find_maps
 from surfkit.scene.depth_prior import how_to_make, lacking_normals
+from surfkit.scene.groups import apart
 from surfkit.scene.read import RANDOM_POINTS, check_size, model_folder
 from surfkit.scene.undistort import cache_folder, is_pinhole
 from surfkit.start.plain import SparseStart
@@ -108,6 +109,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_sizes(gathered, known),
         *_masks(gathered, known),
         *_split(gathered),
+        *_groups(gathered),
         *_exposure(gathered, known, recipe),
         *_priors(data, gathered, recipe),
     ]
@@ -220,6 +222,13 @@ def _split(gathered: Gathered) -> list[Finding]:
         text = f"there are no sparse points: training would start from {RANDOM_POINTS:,} random ones; triangulate some"
         found.append(Finding("warning", "no-points", text))
     return found
+
+
+def _groups(gathered: Gathered) -> list[Finding]:
+    """Photographs that no sparse points connect."""
+    largest, *others = gathered.capture.groups or [()]
+    text = apart(gathered.capture.groups)
+    return [Finding("warning", "unconnected", text, tuple(name for names in others for name in names))] if text else []
 
 
 def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:
