@@ -34,13 +34,13 @@ from surfkit.folder import (
     refuse_no_run,
     refuse_other,
 )
-from surfkit.mesh.base import Subject
 from surfkit.notes import noted
 from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
 from surfkit.partition.executor import Inline
-from surfkit.preparing import with_maps
+from surfkit.preparing import with_maps, with_maps_to_mesh
 from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.refining import refined, seen_by
 from surfkit.scene.cameras import write_cameras
@@ -122,7 +122,7 @@ def run(
                 state = None  # it is in the folder
                 this, state = tuned(Site(this, scene, rasterizer, every, store), hands)
             this, state = refined(Site(this, scene, rasterizer, every, store), state)
-            return results(this, state, scene, rasterizer, meter)
+            return results(Site(this, scene, rasterizer, every, store), state, hands.device, meter)
 
 
 def refuse_unready(this: Run, hands: Hands, store: Store) -> None:
@@ -143,15 +143,16 @@ def beginning(this: Run, scene: Scene, store: Store, state: StageState | None) -
     return Beginning(this, scene, read_ahead(this.data, scene, this.recipe.pretrain.losses, store, known), known)
 
 
-def results(this: Run, state: StageState, scene: Scene, rasterizer: Rasterizer, meter: Meter) -> dict[str, Any]:
+def results(site: Site, state: StageState, device: Device, meter: Meter) -> dict[str, Any]:
     """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
+    this, scene, rasterizer = site.this, site.scene, site.rasterizer
     if this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
         say(f"{this.out} is finished; delete {this.metrics.name} in it to measure again")
         return read_metrics(this.out)
     if not this.cloud.exists():
         export(this, state, scene)
     if not meshed(this, state.index):
-        mesh(this, state, subject(this, state, scene, rasterizer, cache_bytes("auto"), this.recipe.mesh))
+        mesh(site, state, device)
     return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
 
 
@@ -164,12 +165,18 @@ def export(this: Run, state: StageState, scene: Scene) -> None:
     emit(FileWritten(this.cloud, "points"))
 
 
-def mesh(this: Run, state: StageState, what: Subject) -> None:
-    """Make the mesh that the recipe wants; a surface that cannot be had is told, and costs no measurements."""
+def mesh(site: Site, state: StageState, device: Device) -> None:
+    """Make the mesh that the recipe wants, with depth maps if it wants some, also for a run that was trained without.
+
+    A surface that cannot be had is told, and costs no measurements.
+    """
+    mesher, out = site.this.recipe.mesh, site.this.out
     try:
-        deliver(this, this.recipe.mesh, Delivery(), what, state.index)
+        with with_maps_to_mesh(site.this, mesher, site.scene, site.store, device) as this:
+            what = subject(this, state, site.scene, site.rasterizer, cache_bytes("auto"), mesher)
+            deliver(this, mesher, Delivery(), what, state.index)
     except BadInput as error:
-        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {this.out}` tries again with other settings"))
+        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
 
 
 def evaluate(

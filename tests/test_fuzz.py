@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from needs import needs, needs_native
@@ -21,25 +22,23 @@ TARGETS = (
 
 @pytest.fixture(scope="module")
 def bench():
-    """The modules of the bench."""
+    """The modules of the bench: of cases, damage, limits and targets."""
     sys.path.insert(0, str(BENCH))
     try:
-        import damage
-        import fuzz
+        from fuzzing import case, damage, limits, targets
 
-        yield fuzz, damage
+        yield SimpleNamespace(case=case, damage=damage, limits=limits, targets=targets)
     finally:
         sys.path.remove(str(BENCH))
 
 
 def test_every_target_is_here(bench):
-    assert tuple(bench[0].TARGETS) == TARGETS
+    assert tuple(bench.targets.TARGETS) == TARGETS
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_damage_is_one_line(bench, name, tmp_path):
-    fuzz, damage = bench
-    case = fuzz.Fuzz(name, tmp_path)
+    case = bench.case.Fuzz(name, tmp_path)
     assert case.case([]) is None and case.files, "what is whole is taken"
 
     @hypothesis.settings(
@@ -50,7 +49,7 @@ def test_damage_is_one_line(bench, name, tmp_path):
         phases=[hypothesis.Phase.generate],
         suppress_health_check=list(hypothesis.HealthCheck),
     )
-    @hypothesis.given(damage.damages(case.files))
+    @hypothesis.given(bench.damage.damages(case.files))
     def check(listed):
         assert (found := case.case(listed)) is None, found
 
@@ -59,8 +58,7 @@ def test_damage_is_one_line(bench, name, tmp_path):
 
 def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
     """A crash, a write elsewhere and an endless loop."""
-    fuzz, _ = bench
-    case = fuzz.Fuzz("points-as-text", tmp_path)
+    case = bench.case.Fuzz("points-as-text", tmp_path)
 
     def found(read):
         with monkeypatch.context() as patch:
@@ -77,5 +75,5 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
 
     assert found(lambda path: 1 // 0) == "ZeroDivisionError in transforms.py points"
     assert found(writing).startswith("wrote outside the run folder: ['open ")
-    monkeypatch.setattr(fuzz, "SECONDS", 1)
+    monkeypatch.setattr(bench.limits, "SECONDS", 1)
     assert found(looping).startswith("TimeoutError")

@@ -423,3 +423,19 @@ def test_a_mesh_has_maps_made_again_that_are_gone_and_looks_at_those_of_the_data
     assert main(["mesh", str(tmp_path / "none"), "mesh:stereo"]) == 2
     note, error = capsys.readouterr().err.splitlines()
     assert f"`surfkit prepare depth {farm.path}`" in note and "mesh:stereo fuses depth priors, and there" in error
+
+
+def test_training_given_again_with_another_mesher_has_its_maps_made(farm, tmp_path, own_cache, monkeypatch, capsys):
+    out, seen = tmp_path / "run", counting(monkeypatch)
+    sweep = ["depth:plane-sweep", "--depth.longest", "32", "--depth.neighbours", "2", "--depth.max-planes", "16"]
+    words = ["train", "recipe:2dgs", *sweep, "--data", str(farm.path), "--steps", "5", "--out", str(out)]
+    assert main([*words, "mesh:none"]) == 0 and not seen
+    points = (out / "point_cloud.ply").read_bytes()
+    assert main([*words, "mesh:stereo", "--no-prepare"]) == 0 and not seen
+    (note,) = record(out)["notes"]
+    assert note.startswith("there is no mesh: ") and "leave out --no-prepare to make them" in note
+    assert main([*words, "mesh:stereo"]) == 0 and len(seen) == 7 and (out / "point_cloud.ply").read_bytes() == points
+    made = (out / "mesh.ply").read_bytes()
+    capsys.readouterr()
+    assert main([*words, "mesh:stereo"]) == 0 and "is finished" in capsys.readouterr().err and len(seen) == 7
+    assert main(["mesh", str(out), "mesh:stereo"]) == 0 and (out / "mesh.ply").read_bytes() == made

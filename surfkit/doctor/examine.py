@@ -16,6 +16,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
@@ -26,10 +27,12 @@ from surfkit.recipe import Recipe
 from surfkit.scene.capture import Shot
 from surfkit.scene.data import Data
 from surfkit.scene.depth_files import find_maps
+from surfkit.scene.depth_prior import how_to_make, lacking_normals
+from surfkit.scene.groups import apart
 from surfkit.scene.read import RANDOM_POINTS, check_size, model_folder
 from surfkit.scene.undistort import cache_folder, is_pinhole
 from surfkit.start.plain import SparseStart
-from surfkit.train.material import needs_priors
+from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -106,6 +109,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_sizes(gathered, known),
         *_masks(gathered, known),
         *_split(gathered),
+        *_groups(gathered),
         *_exposure(gathered, known, recipe),
         *_priors(data, gathered, recipe),
     ]
@@ -220,6 +224,13 @@ def _split(gathered: Gathered) -> list[Finding]:
     return found
 
 
+def _groups(gathered: Gathered) -> list[Finding]:
+    """Photographs that no sparse points connect."""
+    largest, *others = gathered.capture.groups or [()]
+    text = apart(gathered.capture.groups)
+    return [Finding("warning", "unconnected", text, tuple(name for names in others for name in names))] if text else []
+
+
 def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:
     """Photographs that show the same places differently bright."""
     names = [name for name, look in known.items() if look.brightness is not None and not look.flat]
@@ -242,26 +253,41 @@ def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) 
 
 def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     """Depth priors, where the recipe uses them."""
-    train, stereo = gathered.train, recipe.start.needs_prior
-    if not train or not (stereo or needs_priors(recipe.pretrain.losses)):
+    train, stereo, losses = gathered.train, recipe.start.needs_prior, recipe.pretrain.losses
+    if not train or not (stereo or needs_priors(losses)):
         return []
-    make = f"make them with `surfkit prepare depth {data.path}`"
+    normals = needs_normals(losses)
+    make = how_to_make(data, normals)
     try:
         maps = find_maps(data.path, model_folder(data), [shot.name for shot in train])
     except BadInput as error:
         return from_errors("depth-priors", [error])
     if not maps and recipe.depth is not None:
         text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
-        return [Finding("note", "depth-priors", text)]
+        return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
     if not maps and stereo:
         return [Finding("error", "depth-priors", f"the run begins at depth maps, and there are none; {make}")]
     if not maps:
         text = f"the recipe has a depth loss, and there are no depth priors, so it will be off; {make}"
         return [Finding("warning", "depth-priors", text)]
+    found = []
     if missing := [shot.name for shot in train if shot.name not in maps]:
         text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
-        return [Finding("warning", "depth-priors", text, tuple(missing))]
-    return []
+        found.append(Finding("warning", "depth-priors", text, tuple(missing)))
+    if normals and (text := lacking_normals(data, list(maps.values()))):
+        found.append(Finding("warning", "prior-normals", text))
+    return found
+
+
+def _normals_to_come(recipe: Recipe) -> list[Finding]:
+    """Maps that the run makes may have no normals: only of one estimator it is known that they will."""
+    if isinstance(recipe.depth, PatchMatch):
+        return []
+    text = (
+        "the loss normal-prior learns nothing from depth priors without normals, and not every estimator finds them; "
+        "depth:patch-match does"
+    )
+    return [Finding("warning", "prior-normals", text)]
 
 
 def _found(data: Data, gathered: Gathered, geometry: Geometry, looks: dict[Path, Photograph]) -> dict[str, str]:

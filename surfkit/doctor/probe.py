@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import random
 import signal
 import statistics
 import tempfile
@@ -34,13 +35,16 @@ from surfkit.scene.photos import view_photo
 from surfkit.scene.ply import write_splats
 from surfkit.scene.scene import Scene, View
 from surfkit.train import checkpoint
-from surfkit.train.stage import StageState, Trainer
+from surfkit.train.material import needs_normals
+from surfkit.train.stage import Stage, StageState, Trainer
 
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""
 EDITED = 0.05
 """Share of the points that go, and of those that come, in the edit of each part: an edit holds the points several times
 over."""
+DRAWN = 2_000
+"""Steps of a part that are looked at to tell how many of them take a second view."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ class Taken:
 
     Attributes:
         points: How many there were.
-        seconds: Of the median step.
+        seconds: Of a step: the median one, or the mean of the medians where some take a second view.
         peak_bytes: Most memory that the process has held by its end.
     """
 
@@ -219,42 +223,73 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     photos = [view_photo(view) for view in views]
     photo_seconds = (time.perf_counter() - start) / len(views)
     masks = [view_mask(view) for view in views]
-    priors = [_made_up_prior(view) for view in views] if job.priors else None
+    normals = needs_normals(recipe.pretrain.losses)
+    priors = [_made_up_prior(view, normals) for view in views] if job.priors else None
     held = sum(photo.numel() for photo in photos) + sum(mask.numel() for mask in masks if mask is not None)
-    held += sum(8 * prior.inverse.numel() for prior in priors or ())
+    held += sum((20 if normals else 8) * prior.inverse.numel() for prior in priors or ())
     generator, start = torch.Generator().manual_seed(recipe.seed), time.perf_counter()
     points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator))
     yield Started(photo_seconds, time.perf_counter() - start, held)
     churn = Churn(tuple(part.index + 1 for part in job.parts))
     stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
-    trainer = Trainer(stage, recipe.primitive, views, photos, select(job.device)[0], priors, masks)
+    trainer = Trainer(
+        stage, recipe.primitive, views, photos, select(job.device)[0], priors, masks, beside=_next_of(len(views))
+    )
     state = trainer.begin(points, generator)
     del points
+    done = 0.0
     for part in job.parts:
-        yield _taken(trainer, state, part, job)
+        first, done = round(done * stage.steps), done + part.share
+        own = range(first + 1, max(first + 1, round(done * stage.steps)) + 1)
+        yield _taken(trainer, state, part, job, by_kind(stage, own))
     yield _written(trainer, state)
 
 
-def _made_up_prior(view: View) -> DepthPrior:
+def _next_of(count: int) -> Callable[[int, torch.Tensor], list[int]]:
+    """The next view is the second one of each: points that are not trained show no surface to choose it by."""
+    return lambda at, depth: [(at + 1) % count] if count > 1 else []
+
+
+def by_kind(stage: Stage, own: range) -> dict[bool, list[int]]:
+    """Some steps of a part, evenly drawn, by whether they take a second view."""
+    drawn = sorted(random.Random(0).sample(own, min(DRAWN, len(own))))
+    kinds = {paired: [index for index in drawn if stage.is_paired(index) == paired] for paired in (False, True)}
+    return {paired: indices for paired, indices in kinds.items() if indices}
+
+
+def _made_up_prior(view: View, normals: bool) -> DepthPrior:
     """As large as a real one, which takes the sparse points of all photographs to read."""
     ones = torch.ones(view.camera.height, view.camera.width)
-    return DepthPrior(ones, ones.clone(), 1.0)
+    towards = -torch.nn.functional.normalize(view.camera.rays(), dim=0) if normals else None
+    return DepthPrior(ones, ones.clone(), 1.0, towards)
 
 
-def _taken(trainer: Trainer, state: StageState, part: Part, job: Job) -> Taken:
-    """Take the steps of a part, with an edit in the first."""
+def _taken(trainer: Trainer, state: StageState, part: Part, job: Job, kinds: dict[bool, list[int]]) -> Taken:
+    """Take steps of a part, with an edit in the first, and then of the kind (`by_kind`) that was not among them."""
     state.points = with_count(trainer.primitive, state.points, part.points, state.generator)
     state.index = part.index
     wanted = max(WARM + 1, job.steps // len(job.parts))
     times, begun = [], time.perf_counter()
     while len(times) < wanted and state.index < trainer.stage.steps:
-        start = time.perf_counter()
-        trainer.step(state)
-        times.append(time.perf_counter() - start)
+        times.append(_timed(trainer, state))
         if time.perf_counter() - begun > job.seconds / len(job.parts) and len(times) > WARM:
             break
     counted = times[WARM:] or times
-    return Taken(len(state.points), statistics.median(counted), peak_memory_bytes())
+    seconds = 0.0
+    for paired, indices in kinds.items():
+        own = [taken for kind, taken in counted if kind == paired]
+        for index in [] if own else indices[: WARM + 1]:
+            state.index = index - 1
+            own = [_timed(trainer, state)[1]]
+        seconds += statistics.median(own) * len(indices) / sum(map(len, kinds.values()))
+    return Taken(len(state.points), seconds, peak_memory_bytes())
+
+
+def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:
+    """Take a step: whether it has a second view, and the seconds."""
+    start = time.perf_counter()
+    trainer.step(state)
+    return trainer.stage.is_paired(state.index), time.perf_counter() - start
 
 
 def _written(trainer: Trainer, state: StageState) -> Written:

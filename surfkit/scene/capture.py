@@ -46,6 +46,8 @@ class Capture:
         metres: Metres per unit of the input frame; None where the data set does not say.
         crs: Coordinate reference system of the input frame; None where there is none.
         shift: What files of these coordinates are to leave out; None leaves it to `Frame.around`.
+        groups: Names of photographs that sparse points connect, the largest group first; none where the layout keeps no
+            observations.
     """
 
     shots: Sequence[Shot]
@@ -55,6 +57,7 @@ class Capture:
     metres: float | None = None
     crs: str | None = None
     shift: tuple[float, float, float] | None = None
+    groups: Sequence[Sequence[str]] = ()
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.scene.capture import Capture, Reader, Shot, Tracked, Tracks, library
 from surfkit.scene.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.scene.data import Data, nearest
+from surfkit.scene.groups import connected
 from surfkit.scene.names import find_files
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
@@ -42,10 +43,10 @@ class COLMAP(Reader, Tracked):
                     f"{folder.relative_to(data.path)} is used, choose another with --model"
                 )
             )
-        images, xyz, rgb = _model(folder)
+        images, xyz, rgb, groups = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
         shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
-        return Capture(shots, xyz, rgb)
+        return Capture(shots, xyz, rgb, groups=groups)
 
     def model_folder(self, data: Data) -> Path:
         return _largest(data.path) if data.model is None else _named(data.path / data.model)
@@ -130,8 +131,8 @@ def _lacking(folder: Path, end: str) -> list[str]:
     return [f"{part}{end}" for part in PARTS if not (folder / f"{part}{end}").is_file()]
 
 
-def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
-    """Images in the order of their numbers, (P, 3) float64 points in the input frame, (P, 3) uint8 colours."""
+def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray, list[list[str]]]:
+    """Images in the order of their numbers, (P, 3) float64 points in the input frame, (P, 3) uint8 colours, groups."""
     model = _reconstruction(folder)
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
@@ -145,7 +146,16 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray]:
         reject(BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again"))
     elif not finite.all():
         emit(Warned(f"{folder}: {(~finite).sum()} of {len(xyz)} points without finite coordinates are left out"))
-    return shots, xyz[finite], rgb[finite]
+    return shots, xyz[finite], rgb[finite], _groups(model, points)
+
+
+def _groups(model: Any, points: Sequence[Any]) -> list[list[str]]:
+    """Names of the images that points connect, as `Capture` has them."""
+    observed = [(number, image.name) for number, image in sorted(model.images.items()) if image.num_points3D]
+    place = {number: at for at, (number, _) in enumerate(observed)}
+    shuffled = (points[at] for at in np.random.default_rng(0).permutation(len(points)))  # their order is that of images
+    tracks = ([place[e.image_id] for e in point.track.elements if e.image_id in place] for point in shuffled)
+    return [[observed[at][1] for at in group] for group in connected(len(observed), tracks)]
 
 
 def _reconstruction(folder: Path) -> Any:

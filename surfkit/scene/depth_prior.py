@@ -185,7 +185,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
     """
     maps = prior_files(data, scene)
     if not maps:
-        remedy = f"; {_make(data, normals)}" if data.priors is None else ""
+        remedy = f"; {how_to_make(data, normals)}" if data.priors is None else ""
         emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)
@@ -205,8 +205,8 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
     if text := untrusted(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
         emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
-    if normals:
-        _warn_of_no_normals(data, [maps[name] for name in found])
+    if normals and (text := lacking_normals(data, [maps[name] for name in found])):
+        emit(Warned(text))
     return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
 
 
@@ -313,20 +313,26 @@ def _warn_of_leaks(data: Data, scene: Scene) -> None:
     if seen:
         text = (
             f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs kept from training, "
-            f"{seen[0]} for one, so the quality will look better than it is; {_make(data)} --again, with the same split"
+            f"{seen[0]} for one, so the quality will look better than it is; "
+            f"{how_to_make(data)} --again, with the same split"
         )
         emit(Warned(text))
 
 
-def _warn_of_no_normals(data: Data, files: Sequence[DepthFile]) -> None:
-    """Not every estimator finds normals, and a loss that is 0 throughout shows nowhere else."""
+def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
+    """What to tell of maps that a loss of normals looks at; None where all have normals.
+
+    Not every estimator finds normals, and a loss that is 0 throughout shows nowhere else.
+    """
     without = sum(not normal_path(file.path).exists() for file in files)
-    if without:
-        remedy = f"make others with `surfkit prepare depth {data.path} {WITH_NORMALS} --again`"
-        remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
-        what = f"{without} of {len(files)} depth priors have no normals"
-        emit(Warned(f"{what}, and the loss normal-prior learns nothing from those; {remedy}"))
+    if not without:
+        return None
+    remedy = f"make others with `surfkit prepare depth {data.path} {WITH_NORMALS} --again`"
+    remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
+    what = f"{without} of {len(files)} depth priors have no normals"
+    return f"{what}, and the loss normal-prior learns nothing from those; {remedy}"
 
 
-def _make(data: Data, normals: bool = False) -> str:
+def how_to_make(data: Data, normals: bool = False) -> str:
+    """Which command makes depth priors, with normals if a loss looks at them."""
     return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"

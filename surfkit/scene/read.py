@@ -18,6 +18,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.capture import Capture, Reader, Shot, Tracked
 from surfkit.scene.colmap import COLMAP, MODELS
 from surfkit.scene.data import Data
+from surfkit.scene.groups import apart
 from surfkit.scene.masks import check_mask, find_masks
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
@@ -39,7 +40,10 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
-    return assembled(data, captured(data, reader))
+    capture = captured(data, reader)
+    if text := apart(capture.groups):
+        emit(Warned(text))
+    return assembled(data, capture)
 
 
 def captured(data: Data, reader: Reader) -> Capture:

@@ -93,6 +93,15 @@ class Stage:
         if unknown := set(self.signal.terms or ()) - set(self.losses):
             raise BadInput(f"signal.terms names {', '.join(sorted(unknown))}; the losses are {', '.join(self.losses)}")
 
+    def weights_at(self, index: int) -> dict[str, float]:
+        """Weights of the losses that count in step `index` of 1..`steps`, by key."""
+        weights = {name: loss.weight_at(index, self.steps) for name, loss in self.losses.items()}
+        return {name: weight for name, weight in weights.items() if weight > 0}
+
+    def is_paired(self, index: int) -> bool:
+        """Whether step `index` looks at a second view."""
+        return any(self.losses[name].needs_neighbour for name in self.weights_at(index))
+
     @property
     def policies(self) -> tuple[Policy, ...]:
         """Everything that adds or removes points."""
@@ -171,6 +180,8 @@ class Trainer:
         masks: Which pixels count, by position, (H, W) bool or None; None if all do.
         expect: Told the positions in the order in which they will be asked for, whenever a new order begins.
         owns: (N, 3) positions to (N,) bool: points elsewhere are neither copied nor split; None if all points may be.
+        beside: Gives the positions of the views that may be second ones, best first, from the position of a view and
+            the depth that is rendered there; None finds them by the cameras (`Rig.neighbours`).
     """
 
     stage: Stage
@@ -182,6 +193,7 @@ class Trainer:
     masks: Sequence[Tensor | None] | None = None
     expect: Callable[[Sequence[int]], None] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
+    beside: Callable[[int, Tensor], list[int]] | None = None
 
     def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
         """The state before the first step; `frozen` as in `StageState`."""
@@ -214,14 +226,14 @@ class Trainer:
         """Show one photograph, and let points and policies learn from it."""
         stage, index = self.stage, state.index + 1
         shown, sample = self.sample(state)
-        active = {n: w for n, loss in stage.losses.items() if (w := loss.weight_at(index, stage.steps)) > 0}
+        active = stage.weights_at(index)
         reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
         shape = self.primitive.shape(leaves, state.sh_degree)
         splats = self.drawn(state, shape)
 
-        paired = any(stage.losses[loss].needs_neighbour for loss in active)
+        paired = stage.is_paired(index)
         geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
         render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry, distortion)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
@@ -285,7 +297,7 @@ class Trainer:
         Which one depends on what is rendered now and on the seed and number of the step, and on nothing else, so that
         a run which goes on has the same ones.
         """
-        found = self.rig.neighbours(shown, maps.median)
+        found = (self.beside or self.rig.neighbours)(shown, maps.median)
         generator = torch.Generator().manual_seed(state.seed)
         first = int(torch.randint(max(1, len(found)), (), generator=generator))
         for at in (*found[first:], *found[:first]):

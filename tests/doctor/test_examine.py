@@ -12,9 +12,13 @@ from PIL import Image
 from surfkit.appearance.exposure import Exposure
 from surfkit.cli.recipes import recipes
 from surfkit.core.tree import evolve
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.doctor.examine import examine
+from surfkit.losses import NormalPrior
 from surfkit.scene.capture import library
 from surfkit.scene.data import Data
+from surfkit.scene.depth_files import write_map
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[2] / "examples" / "boruszyn"
@@ -362,6 +366,27 @@ def test_what_depends_on_the_recipe(farm):
     assert priors.text.startswith("13 of 14 photographs have no depth prior") and len(priors.names) == 13
     near = evolve(recipes()["2dgs"], "pretrain.near", 10.0)
     assert "nearer to the camera than the near plane" in told(farm, near)["near-plane"][0].text
+
+
+def test_depth_priors_without_the_normals_that_a_loss_wants(farm):
+    wanting = evolve(recipes()["2dgs"], "pretrain.losses.more", NormalPrior())
+    assert "estimator:patch-match" in told(farm, wanting)["depth-priors"][0].text
+    sweeping, matching = (told(farm, evolve(wanting, "depth", estimator)) for estimator in (PlaneSweep(), PatchMatch()))
+    assert "depth:patch-match does" in sweeping["prior-normals"][0].text
+    assert "prior-normals" not in matching
+    ones, normal = np.ones((3, 4), np.float32), np.zeros((3, 3, 4), np.float32)
+    names = [path.name for path in sorted((farm / "images").iterdir())]
+    for at, name in enumerate(names):
+        write_map(farm, name, ones, ones, normal if at < 5 else None)
+    (lacking,) = told(farm, wanting)["prior-normals"]
+    assert lacking.level == "warning" and lacking.text == (
+        "10 of 14 depth priors have no normals, and the loss normal-prior learns nothing from those; "
+        f"make others with `surfkit prepare depth {farm} estimator:patch-match --again`"
+    )
+    assert told(farm, "citygs2-coarse") == {}, "its loss looks at depth alone"
+    for name in names:
+        write_map(farm, name, ones, ones, normal)
+    assert told(farm, wanting) == {}
 
 
 def test_cameras_in_one_place(farm):

@@ -6,6 +6,7 @@ import signal
 from dataclasses import replace
 from multiprocessing import active_children
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,11 +21,14 @@ from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, beyond, forecast, schedule, within
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, Started, Taken, Written, measure, probe, some, with_count
+from surfkit.losses import NormalPrior, Reprojection
 from surfkit.pipeline import Every, run, with_steps
 from surfkit.primitives.points import Points
+from surfkit.raster.select import select
 from surfkit.scene.data import Data
 from surfkit.scene.read import read
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.train.stage import Trainer
 
 STARTED = Started(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)
 WRITTEN = Written(700.0, 250.0, 10_000, 1.0, 5.0, 2_000_000_000)
@@ -175,6 +179,51 @@ def test_what_a_probe_measures(farm, tmp_path):
     assert all(one.seconds > 0 for one in taken) and taken[0].peak_bytes <= taken[1].peak_bytes <= written.peak_bytes
     columns = 3 + 2 + 4 + 1 + 4 * 3  # each with two moments, and a few statistics
     assert 3 * 4 * columns <= written.checkpoint_bytes < 3 * 4 * columns + 40  # and the header of the file
+
+
+def with_loss(job, loss):
+    return replace(job, recipe=evolve(job.recipe, "pretrain.losses.more", loss))
+
+
+def test_made_up_priors_have_normals_where_a_loss_looks_at_them(farm, tmp_path):
+    job = tiny(farm, tmp_path)
+    plain, more = (next(measure(asked)).held_bytes for asked in (job, with_loss(job, NormalPrior())))
+    pixels = sum(view.camera.width * view.camera.height for view in job.scene.train)
+    assert more - plain == 3 * 4 * pixels, "float32 of three components"
+
+
+def test_the_second_view_of_a_step_is_drawn_too(farm, tmp_path, monkeypatch):
+    rasterizer, drawn = select("cpu")[0], []
+
+    class Counting:
+        def render(self, *words):
+            drawn.append(1)
+            return rasterizer.render(*words)
+
+    monkeypatch.setattr("surfkit.doctor.probe.select", lambda device: (Counting(), ""))
+    job = tiny(farm, tmp_path)
+    counts = []
+    for asked in (job, with_loss(job, Reprojection(start=0, every=1)), with_loss(job, Reprojection(start=0, every=2))):
+        drawn.clear()
+        list(measure(asked))
+        counts.append(len(drawn))
+    assert counts == [8 + 1, 16 + 1, 12 + 1]  # the last one is a picture
+
+
+@pytest.mark.parametrize(("every", "seconds"), [(4, (1.25, 1.5)), (100, (1.01, 1.02))])
+def test_steps_with_a_second_view_count_by_how_many_there_are(farm, tmp_path, monkeypatch, every, seconds):
+    """Of 400, those above 100 that are a multiple of `every` take 3 s, and all others 1 s."""
+    now = [0.0]
+
+    def step(self, state):
+        state.index += 1
+        now[0] += 3 if state.index > 100 and state.index % every == 0 else 1
+
+    monkeypatch.setattr(Trainer, "step", step)
+    monkeypatch.setattr("surfkit.doctor.probe.time", SimpleNamespace(perf_counter=lambda: now[0]))
+    job = with_loss(tiny(farm, tmp_path), Reprojection(start=100, every=every))
+    _, *taken, _ = measure(replace(job, steps=24))
+    assert [one.seconds for one in taken] == pytest.approx(seconds)
 
 
 def test_a_probe_that_is_killed_says_so(farm, tmp_path):
