@@ -1,5 +1,6 @@
 """A small world of components and recipes for the tests of core and cli: no built-in folder, no plugin, no torch."""
 
+import os
 import sys
 import types
 from dataclasses import dataclass, field
@@ -12,6 +13,9 @@ from surfkit.cli.recipes import chosen_recipe
 from surfkit.core import registry
 from surfkit.core.registry import Component, choice, hookimpl
 from surfkit.core.schedule import Interval, StepCount, Steps
+
+# As in the command, and before torch is loaded: threads that wait for others do not spin.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 class Loss(Component):

@@ -7,6 +7,7 @@ import resource
 import shutil
 import signal
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,6 +57,20 @@ def recipe(whole_recipe):
     return with_steps(whole_recipe, STEPS)
 
 
+@pytest.fixture(scope="module")
+def finished(source, recipe, tmp_path_factory):
+    """A data set that stays as it is, and a run of it: to be copied by whoever changes it."""
+    out = tmp_path_factory.mktemp("finished") / "run"
+    run(recipe, Data(source), out)
+    return Data(source), out
+
+
+@pytest.fixture
+def done(finished, tmp_path):
+    """A finished run of one's own, and its data, which are others' too."""
+    return finished[0], Path(shutil.copytree(finished[1], tmp_path / "run"))
+
+
 def notes(out):
     return json.loads((out / "run.json").read_text())["notes"]
 
@@ -78,9 +93,8 @@ def interrupted(recipe, data, out, at, monkeypatch, **settings):
             run(recipe, data, out, **settings)
 
 
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(data, recipe, tmp_path, monkeypatch, capsys):
-    whole, out = tmp_path / "whole", tmp_path / "run"
-    run(recipe, data, whole)
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(finished, recipe, tmp_path, monkeypatch, capsys):
+    (data, whole), out = finished, tmp_path / "run"
     interrupted(recipe, data, out, 17, monkeypatch, every=Every(8))
     path = out / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-40])
@@ -100,12 +114,12 @@ def test_a_damaged_checkpoint_does_not_push_out_the_good_one(data, recipe, tmp_p
 
 
 @pytest.mark.parametrize("stopped", [None, 13])
-def test_a_run_is_made_longer(data, recipe, whole_recipe, tmp_path, monkeypatch, stopped):
-    out, long = tmp_path / "run", with_steps(whole_recipe, 40)
+def test_a_run_is_made_longer(finished, recipe, whole_recipe, tmp_path, monkeypatch, stopped):
+    (data, whole), out, long = finished, tmp_path / "run", with_steps(whole_recipe, 40)
     if stopped:
         interrupted(recipe, data, out, stopped, monkeypatch)
     else:
-        run(recipe, data, out)
+        shutil.copytree(whole, out)
     metrics = run(long, data, out)
     assert metrics["steps"] == 40 and load_run(out)[0].recipe == long and steps(out) == list(range(1, 41))
     assert len(notes(out)) == 1 and notes(out)[0].startswith("the run is made longer, from 24 steps to 40")
@@ -114,9 +128,8 @@ def test_a_run_is_made_longer(data, recipe, whole_recipe, tmp_path, monkeypatch,
         run(recipe, data, out)
 
 
-def test_a_run_is_made_longer_under_its_old_schedule(data, recipe, tmp_path):
-    run(recipe, data, tmp_path / "run")
-    assert run(evolve(recipe, "pretrain.steps", 30), data, tmp_path / "run")["steps"] == 30
+def test_a_run_is_made_longer_under_its_old_schedule(done, recipe):
+    assert run(evolve(recipe, "pretrain.steps", 30), *done)["steps"] == 30
 
 
 @pytest.mark.parametrize(
@@ -127,10 +140,9 @@ def test_a_run_is_made_longer_under_its_old_schedule(data, recipe, tmp_path):
         ("seed", 3, "seed 0, and this one has 3"),
     ],
 )
-def test_a_longer_run_of_another_recipe_is_refused(data, recipe, whole_recipe, tmp_path, path, value, message):
-    run(recipe, data, tmp_path / "run")
+def test_a_longer_run_of_another_recipe_is_refused(done, whole_recipe, path, value, message):
     with pytest.raises(BadInput, match=message):
-        run(evolve(with_steps(whole_recipe, 40), path, value), data, tmp_path / "run")
+        run(evolve(with_steps(whole_recipe, 40), path, value), *done)
 
 
 def test_a_folder_in_use_is_refused(data, recipe, tmp_path, monkeypatch):
@@ -337,10 +349,9 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
 
 
 @pytest.mark.parametrize("photographs", [3, 1])
-def test_out_of_memory_lowers_the_cache_first(data, recipe, tmp_path, monkeypatch, photographs):
+def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkeypatch, photographs):
     """As long as more photographs than some are kept, memory is short, in the middle of a step; nothing is lost."""
-    whole, out, update = tmp_path / "whole", tmp_path / "run", stage.adam_step
-    run(recipe, data, whole)
+    (data, whole), out, update = finished, tmp_path / "run", stage.adam_step
     kept = []
 
     def short(points, grads, rates, index):
@@ -369,9 +380,8 @@ def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkey
 
 
 @pytest.mark.parametrize("name", ["point_cloud.ply", "metrics.json", "view_000.png.png", "run.json"])
-def test_a_disk_that_is_full_at_the_end(data, recipe, tmp_path, monkeypatch, name):
-    out, replace = tmp_path / "run", os.replace
-    run(recipe, data, out)
+def test_a_disk_that_is_full_at_the_end(done, recipe, monkeypatch, name):
+    (data, out), replace = done, os.replace
     wanted = {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()}
     (out / "metrics.json").unlink()
     (out / "point_cloud.ply").unlink()
@@ -391,10 +401,9 @@ def test_a_disk_that_is_full_at_the_end(data, recipe, tmp_path, monkeypatch, nam
     assert {path.name: path.read_bytes() for path in out.rglob("*.p*") if path.is_file()} == wanted
 
 
-def test_commands_on_a_run_folder_take_its_lock(data, recipe, tmp_path, monkeypatch, capsys):
+def test_commands_on_a_run_folder_take_its_lock(done, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
-    out = tmp_path / "run"
-    run(recipe, data, out)
+    _, out = done
     with held(out):
         for words in (["evaluate", str(out)], ["export", str(out)]):
             assert main(words) == 2 and f"process {os.getpid()} on" in capsys.readouterr().err

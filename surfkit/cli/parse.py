@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import tyro
 
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import WHOLE, choices_first, explain_choice, slots
+from surfkit.cli.slots import WHOLE, choices_first, explain_choice, owners, slots
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.recipe import Recipe
@@ -133,9 +133,9 @@ def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequ
         return f"no option {flag}; perhaps you meant {' or '.join(plain)}"
     similar = [line.strip() for section in more if _about(flag, section[0].strip()) for line in section[1:]]
     near = list(dict.fromkeys(found[0] for line in similar if (found := _FLAG.match(line))))
-    owners = dict.fromkeys(re.findall(r"(\S+:\S+) --help", " ".join(_entry(flag, similar))))
-    if owners:
-        return f"{flag} does not apply here; it belongs to {' or '.join(list(owners)[:3])}, which is not chosen"
+    bringing = list(dict.fromkeys(re.findall(r"(\S+:\S+) --help", " ".join(_entry(flag, similar)))))
+    if bringing := bringing or owners(command, flag, argv):
+        return f"{flag} does not apply here; it belongs to {' or '.join(bringing[:3])}, which is not chosen"
     return f"no option {flag}; " + (f"perhaps you meant {' or '.join(near[:3])}" if near else f"see {prog} --help")
 
 

@@ -54,10 +54,16 @@ def chosen_name(argv: Sequence[str]) -> str | None:
 
 
 def recipe_choice(argv: Sequence[str] = ()) -> Any:
-    """The union of all recipes as tyro subcommands `recipe:NAME`, whose values are the defaults of the flags."""
+    """The union of recipes as tyro subcommands `recipe:NAME`, whose values are the defaults of the flags.
+
+    All of them for help and for no words; otherwise the chosen one and one more, without which tyro sees no choice. It
+    would search every part of all of them for what a wrong word might have meant, which takes seconds.
+    """
     known = recipes(argv)
     if not known:
         raise BadInput("no plugin in use offers a recipe; name a file instead: recipe:FILE.json")
+    if argv and not {"-h", "--help"} & set(argv):
+        known = dict(sorted(known.items(), key=lambda item: item[0] != chosen_name(argv))[:2])
     members = tuple(_subcommand(name, recipe) for name, recipe in known.items())
     return Union[members]  # noqa: UP007 (made at run time)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from surfkit.cli.parts import open_places, with_parts
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
-from surfkit.core.registry import Component, components, kebab, unknown
+from surfkit.core.registry import Component, components, kebab, offered, unknown
 
 Slots = dict[str, tuple[str, ...]]
 WHOLE = ("recipe:", "table:")
@@ -73,6 +73,14 @@ def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
         files = "; or name a file, recipe:FILE.json" if slot == "recipe" else ""
         return unknown(slot, name, known[slot]) + files
     return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
+
+
+def owners(command: type, flag: str, argv: Sequence[str]) -> list[str]:
+    """The choices `SLOT:NAME` that would bring a flag, at a slot of the recipe that `argv` chooses."""
+    slot, _, name = flag.removeprefix("--").rpartition(".")
+    names = slots(command, argv).get(slot, ())
+    parts = [(part, cls) for _, part, cls in offered("surfkit_components") if part in names]
+    return sorted(f"{slot}:{part}" for part, cls in parts if name in (_flag(field.name) for field in fields(cls)))
 
 
 def _below(hint: Any, value: Any, path: str) -> Slots:

@@ -22,6 +22,15 @@ from surfkit.scene.synthetic import Flight, photograph, write_colmap
 trimesh = needs("trimesh")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("errors", "geometry", "class_pictures"):
+            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A data set, the ground that it shows, and a finished run whose mesh is that ground, 1 cm too high."""

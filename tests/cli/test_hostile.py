@@ -19,6 +19,15 @@ CUT = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 SHAPES = ("null", "[1]", "7", '"x"', "{}", "[" * 100_000 + "]" * 100_000, '{"a":' * 500 + "1" + "}" * 500)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("errors", "geometry", "class_pictures"):
+            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
+        yield
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A data set with depth maps, a finished run of it, and one in blocks."""

@@ -62,6 +62,7 @@ def test_entries_of_a_dict_come_change_and_go():
         (["pretrain.losses.foo:none"], "no pretrain.losses.foo named 'none'"),
         (["pretrain.prune.0:trim", "pretrain.prune.0:opacity"], "pretrain.prune.0 is chosen twice"),
         (["pretrain.prune.0:trim", "--pretrain.prune.0.rat", "1"], "--pretrain.prune.0.ratio"),
+        (["--pretrain.prune.0.ratio", "1"], "belongs to pretrain.prune.0:importance or pretrain.prune.0:trim, which"),
     ],
 )
 def test_words_that_do_not_fit_are_explained_in_a_line(words, said):
