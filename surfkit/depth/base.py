@@ -56,12 +56,14 @@ class DepthEstimator(Component):
     """A way to estimate the depth of photographs with known cameras.
 
     `aligned` estimators give inverse depth in the units of the scene, others up to scale and offset. The ones that are
-    `matched` compare photographs with one another, so they must not see those that are kept to measure with. The
-    `version` is raised when the same settings give other maps: what is kept of earlier ones is not used again.
+    `matched` compare photographs with one another, so they must not see those that are kept to measure with; those that
+    are `oriented` give normals too. The `version` is raised when the same settings give other maps: what is kept of
+    earlier ones is not used again.
     """
 
     aligned: ClassVar[bool] = False
     matched: ClassVar[bool] = False
+    oriented: ClassVar[bool] = False
     version: ClassVar[int] = 1
 
     @abstractmethod

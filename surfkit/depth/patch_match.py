@@ -63,6 +63,8 @@ class PatchMatch(DepthEstimator):
 
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
+    oriented: ClassVar[bool] = True
+    version: ClassVar[int] = 2
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""

@@ -16,7 +16,6 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
-from surfkit.depth.patch_match import PatchMatch
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
@@ -280,12 +279,12 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
 
 
 def _normals_to_come(recipe: Recipe) -> list[Finding]:
-    """Maps that the run makes may have no normals: only of one estimator it is known that they will."""
-    if isinstance(recipe.depth, PatchMatch):
+    """Maps that the run makes have no normals if its estimator gives none."""
+    if recipe.depth is not None and recipe.depth.oriented:
         return []
     text = (
-        "the loss normal-prior learns nothing from depth priors without normals, and not every estimator finds them; "
-        "depth:patch-match does"
+        f"the loss normal-prior learns nothing from depth priors without normals, and {name_of(recipe.depth)} gives "
+        "none; depth:patch-match does"
     )
     return [Finding("warning", "prior-normals", text)]
 

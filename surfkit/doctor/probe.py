@@ -34,6 +34,7 @@ from surfkit.scene.masks import view_mask
 from surfkit.scene.photos import view_photo
 from surfkit.scene.ply import write_splats
 from surfkit.scene.scene import Scene, View
+from surfkit.scene.vectors import unit
 from surfkit.train import checkpoint
 from surfkit.train.material import needs_normals
 from surfkit.train.stage import Stage, StageState, Trainer
@@ -260,7 +261,7 @@ def by_kind(stage: Stage, own: range) -> dict[bool, list[int]]:
 def _made_up_prior(view: View, normals: bool) -> DepthPrior:
     """As large as a real one, which takes the sparse points of all photographs to read."""
     ones = torch.ones(view.camera.height, view.camera.width)
-    towards = -torch.nn.functional.normalize(view.camera.rays(), dim=0) if normals else None
+    towards = -unit(view.camera.rays()) if normals else None
     return DepthPrior(ones, ones.clone(), 1.0, towards)
 
 

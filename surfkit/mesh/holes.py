@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from surfkit.core.sets import distinct, is_among
 from surfkit.mesh.base import Mesh
+from surfkit.scene.sets import distinct, is_among
 
 RIM = 0.25
 """Share of the area of a connected part from which what would fill a ring shows that the ring is no hole."""

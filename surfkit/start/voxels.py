@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from surfkit.core.sets import is_among
+from surfkit.scene.sets import is_among
 
 BITS = 19
 """Of the index of a voxel along each axis."""

@@ -1,6 +1,6 @@
 import numpy as np
 
-from surfkit.core.sets import distinct, is_among
+from surfkit.scene.sets import distinct, is_among
 
 
 def test_as_the_sets_of_python() -> None:
