@@ -17,8 +17,6 @@ SAMPLED = 16
 """Views that automatic lengths are taken from."""
 PIXELS = 1.0
 """Automatic voxels are this many pixels wide, at the median depth of the median view, or larger: see tsdf.py."""
-VOXELS = 4.0
-"""Automatic truncation."""
 DEPTHS = 2.0
 """Automatic limit of the depth, in median depths."""
 
@@ -38,8 +36,10 @@ def check_length(name: str, value: Length) -> None:
         raise BadInput(f"{name} is {value:g}; it must be more than 0 metres, or auto")
 
 
-def resolve(voxel: Length, truncation: Length, limit: Length, subject: Subject, which: Which) -> Lengths:
-    """The lengths in local units; automatic ones follow from what the views see.
+def resolve(
+    voxel: Length, truncation: Length, limit: Length, subject: Subject, which: Which, truncation_voxels: float = 4.0
+) -> Lengths:
+    """The lengths in local units; automatic ones follow from what the views see, the truncation from the voxel.
 
     Raises:
         BadInput: There is no depth in any view, or lengths are in metres and nobody knows how long a unit is.
@@ -50,7 +50,7 @@ def resolve(voxel: Length, truncation: Length, limit: Length, subject: Subject, 
         given[0] = given[0] or PIXELS * pixel
         given[2] = given[2] or DEPTHS * depth
     size, cut, far = given
-    cut = cut or VOXELS * size
+    cut = cut or truncation_voxels * size
     if cut < 2 * size:
         raise BadInput(
             f"mesh.truncation is {told(cut, subject.frame)} with voxels of {told(size, subject.frame)}; it must be at "

@@ -15,7 +15,7 @@ from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import VOXELS, Length, Lengths, check_length, resolve, told
+from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, told
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
@@ -35,8 +35,11 @@ class TSDF(Mesher):
     ten million triangles."""
 
     truncation: Length = "auto"
-    """Distance from a surface over which it is averaged, metres; auto is four voxels. Walls thinner than this may get
-    lost."""
+    """Distance from a surface over which it is averaged, metres; auto is `truncation_voxels`. Walls thinner than this
+    may get lost."""
+
+    truncation_voxels: float = 4.0
+    """Automatic truncation, voxels: less averages less noise, and keeps apart what lies close together."""
 
     depth_limit: Length = "auto"
     """Depth from which a view no longer counts, metres; auto is twice the median depth."""
@@ -60,6 +63,8 @@ class TSDF(Mesher):
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
             check_length(f"mesh.{name}", getattr(self, name))
+        if not 2 <= self.truncation_voxels <= 100:
+            raise BadInput(f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from 2 to 100")
         if not 0 <= self.floaters <= 1000:
             raise BadInput(f"mesh.floaters is {self.floaters:g}; it must be from 0 to 1000")
         if not 0 < self.least_views <= 1000:
@@ -119,7 +124,7 @@ class TSDF(Mesher):
 
     def _lengths(self, subject: Subject) -> tuple[Lengths, Estimate]:
         """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
-        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth)
+        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth, self.truncation_voxels)
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
         found = estimate(subject.splats, lengths.voxel, within)
@@ -133,7 +138,8 @@ class TSDF(Mesher):
             )
         while self.voxel == "auto" and found.total > most:
             coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
-            cut = VOXELS * coarser if self.truncation == "auto" else max(lengths.truncation, 2 * coarser)
+            auto = self.truncation == "auto"
+            cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, 2 * coarser)
             lengths = Lengths(coarser, cut, lengths.limit)
             found = estimate(subject.splats, coarser, within)
         refuse_too_fine(lengths, subject, np.abs(within).max())

@@ -34,7 +34,8 @@ SURFACE = Recipe(
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
     ),
-    mesh=TSDF(least_views=0.1, trust=Agreement(alone=0.1)),
+    # Depth that other views confirm is averaged over less: neither side of a wall takes from the other.
+    mesh=TSDF(truncation_voxels=2.5, least_views=0.1, trust=Agreement(alone=0.1)),
 )
 
 SURFACE_BLOCKS = replace(

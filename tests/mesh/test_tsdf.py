@@ -49,6 +49,7 @@ def test_automatic_lengths_are_those_of_the_pixels():
     assert facts["voxel_m"] == pytest.approx(np.median(depths) / 90 / 0.1, rel=1e-5)
     assert facts["truncation_m"] == pytest.approx(4 * facts["voxel_m"])
     assert facts["depth_limit_m"] == pytest.approx(2 * np.median(depths) / 0.1, rel=1e-5)
+    assert TSDF(truncation_voxels=2.5).mesh(given).facts["truncation_m"] == pytest.approx(2.5 * facts["voxel_m"])
     unknown = TSDF().mesh(replace(given, frame=replace(given.frame, metres=None))).facts
     assert unknown["voxel"] == pytest.approx(facts["voxel"]) and "voxel_m" not in unknown
 
@@ -57,9 +58,9 @@ def test_an_automatic_voxel_grows_with_what_would_be_too_many_triangles(monkeypa
     given = subject(around(8), sphere)
     fine = TSDF().mesh(given)
     monkeypatch.setattr(tsdf, "AUTO_TRIANGLES", len(fine.faces) // 2)
-    coarse = TSDF().mesh(given)
+    coarse = TSDF(truncation_voxels=3).mesh(given)
     assert 1.1 * fine.facts["voxel"] < coarse.facts["voxel"]
-    assert coarse.facts["truncation"] == pytest.approx(4 * coarse.facts["voxel"])
+    assert coarse.facts["truncation"] == pytest.approx(3 * coarse.facts["voxel"])
 
 
 def test_a_depth_limit_and_masks_leave_pixels_out():
@@ -200,7 +201,13 @@ def test_what_cannot_be_meshed_is_said():
         TSDF().mesh(replace(given, budget_bytes=1_000_000))
     with pytest.raises(BadInput, match="no splats or no views"):
         TSDF().mesh(replace(given, views=[]))
-    for wrong in ({"voxel": 0.0}, {"truncation": -1.0}, {"depth_limit": float("inf")}, {"least_views": 0.0}):
+    for wrong in (
+        {"truncation_voxels": 1.0},
+        {"voxel": 0.0},
+        {"truncation": -1.0},
+        {"depth_limit": float("inf")},
+        {"least_views": 0.0},
+    ):
         with pytest.raises(BadInput, match=next(iter(wrong))):
             TSDF(**wrong)
 
