@@ -228,3 +228,12 @@ def crowd():
         seed=1,
     )
     return Points.fresh(params), step
+
+
+@pytest.fixture(scope="module")
+def small_pictures():
+    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter to some tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("errors", "geometry", "class_pictures"):
+            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
+        yield

@@ -20,15 +20,7 @@ from surfkit.scene.ply import write_points
 from surfkit.scene.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter here."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("errors", "geometry", "class_pictures"):
-            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
-        yield
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 @pytest.fixture(scope="module")

@@ -17,15 +17,7 @@ from surfkit.scene.synthetic import Flight, photograph, write_colmap
 RUN = "--steps 2 --device cpu --pictures-every 1 --primitive.sh-degree 1 --cache 1MB"
 CUT = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 SHAPES = ("null", "[1]", "7", '"x"', "{}", "[" * 100_000 + "]" * 100_000, '{"a":' * 500 + "1" + "}" * 500)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small_pictures():
-    """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter here."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("errors", "geometry", "class_pictures"):
-            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
-        yield
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 @pytest.fixture(scope="module")
