@@ -77,7 +77,8 @@ class PatchMatch(DepthEstimator):
     """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
 
     best: int = 3
-    """Photographs, of those compared, that count for a pixel: the ones that match best at it and around it."""
+    """Photographs that count for a plane: those that match it best, of twice as many that match best at and around the
+    pixel."""
 
     window: int = 7
     """Side of the windows compared, pixels; odd. Smaller ones keep edges sharp, larger ones stand noise."""
