@@ -48,6 +48,8 @@ def gaps(xyz: Tensor) -> Tensor:
     """(N,) root mean square distance to the 3 nearest points at other places, local units, at least SMALLEST."""
     from scipy.spatial import cKDTree
 
+    if not len(xyz):
+        return torch.zeros(0)
     places, back = np.unique(xyz.double().cpu().numpy(), axis=0, return_inverse=True)
     near = min(3, len(places) - 1)
     if near == 0:

@@ -191,5 +191,5 @@ def filled(stereo: Thinned, known: Known, start: StereoStart) -> Cloud:
         rgb=torch.cat([torch.from_numpy(stereo.rgb.round().clip(0, 255)).to(torch.uint8), sparse.rgb[more]]),
         normals=torch.cat([torch.from_numpy(stereo.normals).float(), unit(anyhow, 1)]),
         opacity=torch.tensor([start.opacity, SPARSE_OPACITY]).repeat_interleave(counts),
-        size=torch.cat([start.size * gaps(xyz[: len(stereo)]), gaps(xyz[len(stereo) :])]),
+        size=torch.cat([start.size * gaps(xyz[: len(stereo)]), gaps(sparse.xyz[more])]),
     )

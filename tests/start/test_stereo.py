@@ -146,6 +146,16 @@ def test_sparse_points_only_where_depth_maps_have_none(farm):
     assert all(torch.equal(a, b) for a, b in zip(vars(cloud).values(), vars(again).values(), strict=True))
 
 
+def test_maps_may_show_all_sparse_points(farm):
+    given = known(farm)
+    stereo = StereoStart(points=2_000).fused(given)
+    some = torch.from_numpy(stereo.xyz[:5]).float()
+    for count in (5, 0):
+        cloud = Cloud(some[:count], torch.zeros(count, 3, dtype=torch.uint8))
+        begun = StereoStart(points=2_000).cloud(replace(given, scene=replace(given.scene, cloud=cloud)))
+        assert len(begun.xyz) == len(begun.size) == len(stereo)
+
+
 def test_masked_damaged_and_missing_ones_give_no_points(farm):
     class Photos(list):
         def __getitem__(self, at):
