@@ -32,22 +32,22 @@ MAKE = """
 import sys, torch
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks import Record, extract_views
+from surfkit.blocks.schedule import Record, extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
-from surfkit.folder import Run
-from surfkit.optimise import Every
+from surfkit.run.folder import Run
+from surfkit.run.stage import Every
 from surfkit.partition import QuantileGrid, Sight
 from surfkit.partition.plan import Plan, blocks_of
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.train import checkpoint
 from surfkit.train.material import Store
 from surfkit.train.stage import Stage, StageState
 from surfkit.train.views import Order
-from surfkit.tuning import Site
+from surfkit.run.context import Site
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 data = Data(Path(sys.argv[1]), test_every=0)
@@ -71,19 +71,20 @@ FINISH = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks import Record
+from surfkit.blocks.schedule import Record
 from surfkit.core.codec import read_json
-from surfkit.partition.state import write_state
+from surfkit.execute.state import write_state
 from surfkit.pipeline import opened
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.scene.read import read
+from surfkit.readers.read import read
 from surfkit.train import checkpoint
 from surfkit.train.material import Store
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
-from surfkit.optimise import Every
-from surfkit.tuning import Site, Start
+from surfkit.run.stage import Every
+from surfkit.blocks.worker import Start
+from surfkit.run.context import Site
 import torch
 
 this = opened(Path(sys.argv[1]))
@@ -156,14 +157,15 @@ def measured(tiles: int, points: int, steps: int) -> dict[str, float]:
 
 def merge(out: Path) -> None:
     """Put the blocks of a run together, as its driver does."""
-    from surfkit.blocks import Record, put_together
+    from surfkit.blocks.schedule import Record, put_together
+    from surfkit.blocks.worker import coarse_model
     from surfkit.core.codec import read_json
-    from surfkit.optimise import Every
     from surfkit.pipeline import opened
     from surfkit.raster.select import select
-    from surfkit.scene import extract
+    from surfkit.readers import extract
+    from surfkit.run.context import Site, views_file
+    from surfkit.run.stage import Every
     from surfkit.train.material import Store
-    from surfkit.tuning import Site, coarse_model, views_file
 
     this = opened(out)
     scene = extract.load(views_file(out, 0)).scene  # the driver has read the data set for other reasons

@@ -18,23 +18,25 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks import Hands, extract_views, planned, work
+from surfkit.blocks.schedule import Hands, extract_views, planned, work
+from surfkit.blocks.worker import coarse_model
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
-from surfkit.folder import Run
-from surfkit.optimise import Every
-from surfkit.partition import Balanced, ContractedGrid, Partition, PictureShare, Pool, QuantileGrid, Sight
+from surfkit.execute import Pool
+from surfkit.partition import Balanced, ContractedGrid, Partition, PictureShare, QuantileGrid, Sight
 from surfkit.partition.plan import Fewest, plan
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.run.context import Site
+from surfkit.run.folder import Run
+from surfkit.run.stage import Every
 from surfkit.scene.camera import Camera
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
 from surfkit.scene.scene import View
 from surfkit.train.material import Store
-from surfkit.tuning import Site, coarse_model
 
 
 def tuning(steps: int) -> dict[str, float]:

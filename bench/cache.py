@@ -20,11 +20,11 @@ from pathlib import Path
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.pipeline import Every, run, with_steps
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.train.material import Store
 
 TIMES = ("seconds", "cpu_seconds")

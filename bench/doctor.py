@@ -16,14 +16,14 @@ from pathlib import Path
 
 from trained import EXAMPLE
 
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, forecast
-from surfkit.optimise import Every
 from surfkit.pipeline import run, with_steps
-from surfkit.scene.data import Data
+from surfkit.readers.data import Data
+from surfkit.run.stage import Every
 
 
 def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:

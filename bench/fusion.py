@@ -19,10 +19,10 @@ import torch
 from machine import save
 from scipy.ndimage import gaussian_filter
 
-from surfkit.evaluate.comparison import Comparison, sided, truth_side, volume
-from surfkit.evaluate.measurement import Measurement
-from surfkit.evaluate.scores import nearest, shares, tree
-from surfkit.evaluate.surface import read_surface
+from surfkit.evaluate.geometry.comparison import Comparison, sided, truth_side, volume
+from surfkit.evaluate.geometry.repetition import Measurement
+from surfkit.evaluate.geometry.scores import nearest, shares, tree
+from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh, Subject
 from surfkit.mesh.clean import clean
@@ -31,8 +31,8 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.stereo import points
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.scene.scene import Frame, Scene, View
 
 ROWS = {

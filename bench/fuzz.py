@@ -41,7 +41,7 @@ def main() -> int:
 
     from surfkit import pipeline  # noqa: F401
     from surfkit.cli.recipes import recipes
-    from surfkit.scene.capture import library
+    from surfkit.readers.capture import library
 
     recipes(), library()
     found: dict[tuple[str, str], Finding] = {}

@@ -220,7 +220,7 @@ def main() -> int:
 
     from surfkit import pipeline  # noqa: F401
     from surfkit.cli.recipes import recipes
-    from surfkit.scene.synthetic import Flight, photograph, write_colmap
+    from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
     recipes()
     with tempfile.TemporaryDirectory() as folder:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from surfkit.raster import native
+from surfkit import native
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -10,10 +10,10 @@ import torch
 from surfkit.pipeline import with_steps
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Data
 from surfkit.scene.photos import photo_cache
-from surfkit.scene.read import read
 from surfkit.train.stage import StageState, Trainer
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "boruszyn"

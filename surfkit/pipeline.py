@@ -9,20 +9,29 @@ from typing import Any
 
 from torch import Tensor
 
-from surfkit.beginning import Beginning, priors_of
-from surfkit.blocks import Hands, tuned
+from surfkit.blocks.schedule import Hands, tuned
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
 from surfkit.core.files import sweep
-from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.schedule import rescale
-from surfkit.evaluate.images import evaluate_views, frames_per_second
-from surfkit.evaluate.lpips import networks
+from surfkit.evaluate.images.lpips import networks
+from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
+from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
 from surfkit.evaluate.metrics import read_metrics
-from surfkit.evaluate.pictures import panel, picture_path, write_picture
-from surfkit.folder import (
+from surfkit.execute.base import Inline
+from surfkit.export.cameras import write_cameras
+from surfkit.export.ply import write_splats
+from surfkit.primitives.base import to_table
+from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.select import Device
+from surfkit.readers.data import Data
+from surfkit.readers.masks import mask_cache
+from surfkit.readers.read import read
+from surfkit.recipe import Recipe
+from surfkit.run.context import Site
+from surfkit.run.folder import (
     Run,
     claim,
     discard_results,
@@ -34,30 +43,21 @@ from surfkit.folder import (
     refuse_no_run,
     refuse_other,
 )
-from surfkit.notes import noted
-from surfkit.optimise import Every, Job, drawer, drawing, optimise, saved
-from surfkit.partition.executor import Inline
-from surfkit.preparing import with_maps, with_maps_to_mesh
-from surfkit.primitives.base import to_table
-from surfkit.raster.api import Maps, Rasterizer
-from surfkit.raster.select import Device
-from surfkit.recipe import Recipe
-from surfkit.refining import refined, seen_by
-from surfkit.scene.cameras import write_cameras
-from surfkit.scene.data import Data
-from surfkit.scene.masks import mask_cache
+from surfkit.run.journal import kept
+from surfkit.run.mesh import Delivery, deliver, meshed, subject
+from surfkit.run.notes import noted
+from surfkit.run.prepare import with_maps, with_maps_to_mesh
+from surfkit.run.refine import refined, seen_by
+from surfkit.run.stage import Every, Job, drawer, drawing, optimise, saved
+from surfkit.run.start import Beginning, priors_of
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
-from surfkit.scene.ply import write_splats
-from surfkit.scene.read import read
 from surfkit.scene.scene import Scene, View
-from surfkit.surface import Delivery, deliver, meshed, subject
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import MOST_STEPS, StageState
-from surfkit.tuning import Site
 
 AHEAD = 8
 """Photographs in memory while held-out ones are measured: each is needed once."""
@@ -195,7 +195,7 @@ def evaluate(
         scene: Its data.
         rasterizer: What draws.
         meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
-        lpips_weights: See `surfkit.evaluate.lpips.networks`.
+        lpips_weights: See `surfkit.evaluate.images.lpips.networks`.
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)

@@ -234,6 +234,6 @@ def crowd():
 def small_pictures():
     """What is drawn of errors is a quarter as wide: that takes most of a comparison, and is no matter to some tests."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("errors", "geometry", "class_pictures"):
-            patch.setattr(f"surfkit.evaluate.{module}.LONGEST_PX", 180)
+        for module in ("errors", "measure", "class_pictures"):
+            patch.setattr(f"surfkit.evaluate.geometry.{module}.LONGEST_PX", 180)
         yield

@@ -14,27 +14,30 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit import blocks, foresight, tuning
-from surfkit.blocks import Hands, Unfinished
+from surfkit.blocks import forecast as foresight
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks import worker as tuning
+from surfkit.blocks.oom_retry import ANEW, BARE, HELD, capped, following
+from surfkit.blocks.schedule import Hands, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
-from surfkit.folder import Run
-from surfkit.ladder import ANEW, BARE, HELD, capped, following
+from surfkit.execute import Pool
+from surfkit.execute.base import Ended, Job
+from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.losses.depth import DepthRegression
-from surfkit.optimise import Every
-from surfkit.partition import PictureShare, Pool, QuantileGrid
-from surfkit.partition.executor import Ended, Job
-from surfkit.partition.state import BlockState, read_state, write_state
+from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import run
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import map_path, write_map, write_record
+from surfkit.readers.depth_prior import alignment
+from surfkit.readers.read import read as read_scene
 from surfkit.recipe import Recipe
+from surfkit.run.folder import Run
+from surfkit.run.stage import Every
 from surfkit.scene import memory
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import map_path, write_map, write_record
-from surfkit.scene.depth_prior import alignment
-from surfkit.scene.read import read as read_scene
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
 from surfkit.train.stage import Stage, Trainer
@@ -287,7 +290,7 @@ def test_two_drivers_in_one_folder(undisturbed, data, tmp_path, capsys):
     words = ["train", f"recipe:{undisturbed / 'recipe.json'}", "--data", str(data.path), "--out", str(out)]
     words += ["--device", "cpu", "--checkpoint-every", "3", "--pictures-every", "0"]
     slowly = (
-        "import sys, time, surfkit.optimise as o\nD = o.Display\n"
+        "import sys, time, surfkit.run.stage as o\nD = o.Display\n"
         "class Slow(D):\n    def show(self, done):\n        super().show(done)\n        time.sleep(0.05)\n"
         f"o.Display = Slow\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )

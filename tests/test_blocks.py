@@ -13,21 +13,26 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit import blocks, foresight, pipeline, tuning
+from surfkit import pipeline
 from surfkit.appearance.exposure import Exposure
-from surfkit.blocks import Hands, Unfinished
+from surfkit.blocks import forecast as foresight
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks import worker as tuning
+from surfkit.blocks.schedule import Hands, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
-from surfkit.optimise import Every
-from surfkit.partition import Inline, PictureShare, Pool, QuantileGrid
-from surfkit.partition.state import read_state, write_state
+from surfkit.execute import Inline, Pool
+from surfkit.execute.state import read_state, write_state
+from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
+from surfkit.readers.data import Data
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Data
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint, pieces
+from surfkit.run.stage import Every
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train import streaming as pieces
 from surfkit.train.material import Store
 from surfkit.train.stage import Stage
 
@@ -135,7 +140,7 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
 
 def stop_after(optimise, step):
     """An `optimise` during which SIGINT comes after a step."""
-    from surfkit import optimise as module
+    from surfkit.run import stage as module
 
     def stopping(job, state):
         display = module.Display
@@ -163,7 +168,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
         job = command(site, plan, index, hands)
         if index == 0 and not (tmp_path / "killed").exists():
             code = (
-                "import os, sys, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(tmp_path / 'killed')!r}).touch(); os.kill(os.getpid(), 9)\n"
                 f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"

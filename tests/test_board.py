@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from surfkit.board import Board, Standing, state_since, table
+from surfkit.blocks.display import Board, Standing, state_since, table
+from surfkit.blocks.eta import all_left, in_words, pace, seconds_left, so_far
 from surfkit.cli.status import rows
-from surfkit.outlook import all_left, in_words, pace, seconds_left, so_far
-from surfkit.partition.state import BlockState, write_state
+from surfkit.execute.state import BlockState, write_state
 from surfkit.report.status import KNOWN, Block, Status
 from surfkit.train import progress
 
@@ -47,7 +47,7 @@ def test_time_left_of_all_blocks():
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch):
-    monkeypatch.setattr("surfkit.board.PLAIN_EVERY_S", 0.02)
+    monkeypatch.setattr("surfkit.blocks.display.PLAIN_EVERY_S", 0.02)
     text = io.StringIO()
     with Board(lambda: Standing(STATES, 300, 2), Console(file=text)):
         time.sleep(0.3)
@@ -66,7 +66,7 @@ def test_a_table_on_a_terminal():
 
 
 def test_a_larger_display_gets_the_sum(monkeypatch):
-    monkeypatch.setattr("surfkit.board.DRAW_EVERY_S", 0.01)
+    monkeypatch.setattr("surfkit.blocks.display.DRAW_EVERY_S", 0.01)
     seen = []
     with progress.outer(lambda *line: seen.append(line)), Board(lambda: Standing(STATES, 300)):
         time.sleep(0.2)

@@ -8,22 +8,25 @@ import pytest
 import torch
 from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F401 (fixtures)
 
-from surfkit import blocks, foresight, tuning
-from surfkit.blocks import Hands
+from surfkit.blocks import forecast as foresight
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks import worker as tuning
+from surfkit.blocks.forecast import Begun, begun, memory_of, need
+from surfkit.blocks.schedule import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.densify import ADC
 from surfkit.densify.trim import Trim
-from surfkit.foresight import Begun, begun, memory_of, need
+from surfkit.execute import Pool
+from surfkit.execute.state import read_state, write_state
 from surfkit.losses.depth import DepthRegression
-from surfkit.partition import PictureShare, Pool
-from surfkit.partition.state import read_state, write_state
+from surfkit.partition import PictureShare
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import confidence_path, map_path, write_map, write_record
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import confidence_path, map_path, write_map, write_record
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.material import Store
 
@@ -122,7 +125,7 @@ def killed_in_block_1(monkeypatch):
         mark = site.this.out / "killed"
         if index == 1 and not mark.exists():
             code = (
-                "import os, sys, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+                "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
                 f"            Path({str(mark)!r}).touch(); os.kill(os.getpid(), 9)\n"
                 f"o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({list(job.command[2:])!r}))"

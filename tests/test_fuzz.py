@@ -62,7 +62,7 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
 
     def found(read):
         with monkeypatch.context() as patch:
-            patch.setattr("surfkit.scene.transforms.read_points", read)
+            patch.setattr("surfkit.readers.transforms.read_points", read)
             return case.case([]).what
 
     def writing(path):

@@ -10,8 +10,8 @@ import pytest
 from needs import needs_native
 
 from surfkit.cli import main
-from surfkit.scene.made_maps import read_made
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.made_maps import read_made
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 DEADLY = """

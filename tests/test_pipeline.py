@@ -11,20 +11,22 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import optimise, pipeline
-from surfkit.blocks import Hands
+from surfkit import pipeline
+from surfkit.blocks.schedule import Hands
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
-from surfkit.folder import Run
-from surfkit.partition import Pool, QuantileGrid
+from surfkit.execute import Pool
+from surfkit.export.ply import read_splats
+from surfkit.partition import QuantileGrid
 from surfkit.pipeline import Every, load_run, run, with_steps
 from surfkit.primitives import Flat3D, Surfel2D
-from surfkit.scene.data import Data
-from surfkit.scene.ply import read_splats
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.run import stage as optimise
+from surfkit.run.folder import Run
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import Store
 
 STEPS = 60

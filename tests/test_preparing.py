@@ -13,22 +13,23 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.lock import USED, held, is_used, used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.execute import Pool
 from surfkit.losses import DepthRegression, NormalPrior
-from surfkit.partition import PictureShare, Pool, QuantileGrid
+from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import run
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import map_path
+from surfkit.readers.made_maps import folder_of, located, read_made
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import map_path
-from surfkit.scene.made_maps import folder_of, located, read_made
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
 from surfkit.start.stereo import StereoStart
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import Store
 from surfkit.train.stage import Stage
 
@@ -162,7 +163,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
     farm, recipe, tmp_path, own_cache, monkeypatch
 ):
     run(recipe, farm, tmp_path / "whole")
-    from surfkit import optimise
+    from surfkit.run import stage as optimise
 
     take, steps = optimise.Trainer.step, []
 
@@ -172,7 +173,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
             raise KeyboardInterrupt
         return take(self, state)
 
-    from surfkit.optimise import Every
+    from surfkit.run.stage import Every
 
     with monkeypatch.context() as patch:
         patch.setattr(optimise.Trainer, "step", stopped)

@@ -14,12 +14,13 @@ import pytest
 from needs import needs
 from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # noqa: F401 (fixtures)
 
-from surfkit import blocks, tuning
-from surfkit.blocks import Hands, Unfinished
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks import worker as tuning
+from surfkit.blocks.schedule import Hands, Unfinished
 from surfkit.core.check import BadInput
-from surfkit.partition import Ray
-from surfkit.partition.executor import LOG, Job
-from surfkit.partition.state import read_state
+from surfkit.execute import Ray
+from surfkit.execute.base import LOG, Job
+from surfkit.execute.state import read_state
 from surfkit.pipeline import run
 
 ray = needs("ray", "executor:ray")
@@ -113,7 +114,7 @@ def test_the_driver_is_killed(cluster, tmp_path):
     here, folder = str(Path(__file__).parent), str(tmp_path)
     code = (
         f"import sys; sys.path.insert(0, {here!r})\nfrom pathlib import Path\nfrom test_ray import SAVING, job\n"
-        "from surfkit.partition import Ray\n"
+        "from surfkit.execute import Ray\n"
         f"list(Ray(address={cluster.address!r}, cpus=1, memory_gb=0.1).run([job(Path({folder!r}), 0, SAVING)]))"
     )
     driver = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -160,7 +161,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     agent = node.all_processes["raylet"][0].process.pid
     reached, gone, command = tmp_path / "reached", tmp_path / "gone", blocks.job_of
     code = (
-        "import os, psutil, sys, time, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+        "import os, psutil, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
         f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if there and done.index == 7:\n"
         f"            Path({str(reached)!r}).touch()\n"

@@ -14,20 +14,22 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import optimise, pipeline
+from surfkit import pipeline
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.core import journal, lock
+from surfkit.core import lock
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.lock import held
 from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
-from surfkit.evaluate import images
+from surfkit.evaluate.images import measure as images
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import Every, load_run, run, with_steps
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import confidence_path, map_path, normal_path, write_map, write_record
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
+from surfkit.run import journal
+from surfkit.run import stage as optimise
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint, stage
 
 STEPS = 24

@@ -13,13 +13,13 @@ import pytest
 from needs import needs
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
 
-from surfkit import blocks
-from surfkit.blocks import Hands, Unfinished
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks.schedule import Hands, Unfinished
 from surfkit.core.check import BadInput
-from surfkit.core.errand import Errand
-from surfkit.partition import Slurm, slurm
-from surfkit.partition.executor import LOG, Job
-from surfkit.partition.state import read_state
+from surfkit.execute import Slurm, slurm
+from surfkit.execute.base import LOG, Job
+from surfkit.execute.remote import Errand
+from surfkit.execute.state import read_state
 from surfkit.pipeline import run
 
 submitit = needs("submitit", "executor:slurm")
@@ -125,7 +125,7 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
     """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
     reached, command = tmp_path / "reached", blocks.job_of
     code = (
-        "import os, sys, time, surfkit.optimise as o\nfrom pathlib import Path\nD = o.Display\n"
+        "import os, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
         f"            Path({str(reached)!r}).write_text(str(os.getppid())); time.sleep(1)\n"
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"

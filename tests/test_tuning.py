@@ -10,15 +10,16 @@ from types import SimpleNamespace
 import pytest
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
 
-from surfkit import blocks, tuning
-from surfkit.blocks import Hands
+from surfkit.blocks import schedule as blocks
+from surfkit.blocks import worker as tuning
+from surfkit.blocks.schedule import Hands
+from surfkit.blocks.worker import signs
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.core.errand import DRIVER
-from surfkit.partition.executor import Ended, Job
-from surfkit.partition.state import STALE_S, read_state, write_state
+from surfkit.execute.base import Ended, Job
+from surfkit.execute.remote import DRIVER
+from surfkit.execute.state import STALE_S, read_state, write_state
 from surfkit.pipeline import run
-from surfkit.tuning import signs
 
 
 def test_signs_of_life_while_no_step_is_made(tmp_path, monkeypatch):

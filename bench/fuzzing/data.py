@@ -13,14 +13,14 @@ import numpy as np
 
 def truth() -> Any:
     """A scene of six photographs."""
-    from surfkit.scene.synthetic import Flight, photograph
+    from surfkit.testing.synthetic import Flight, photograph
 
     return photograph(Flight(views=6, width=24, height=18, points=60, test_every=3))
 
 
 def colmap(here: Path, binary: bool = False) -> Any:
     """A sparse model with tracks."""
-    from surfkit.scene.synthetic import write_colmap
+    from surfkit.testing.synthetic import write_colmap
 
     made = truth()
     write_colmap(here / "data", made, binary=binary, tracks=True)
@@ -57,7 +57,7 @@ def inverse(made: Any, name: str) -> np.ndarray:
 
 def arrays(here: Path) -> None:
     """Depth priors of surfkit and CityGaussianV2."""
-    from surfkit.scene.depth_files import write_map, write_record
+    from surfkit.readers.depth_files import write_map, write_record
 
     made = colmap(here)
     for view in made.scene.train:
@@ -102,7 +102,7 @@ def parts(made: Any) -> dict[str, Any]:
 
 def sparse(made: Any, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Write the sparse points, in the input frame; positions and colours."""
-    from surfkit.scene.ply import write_points
+    from surfkit.export.ply import write_points
 
     xyz, rgb = made.scene.frame.to_input(made.scene.cloud.xyz.numpy()), made.scene.cloud.rgb.numpy()
     write_points(path, xyz, rgb)

@@ -40,8 +40,8 @@ class Target:
 
 def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     """A run that is finished, or stopped after the first step of a stage, such as "pretrain" or "block 1"."""
-    from surfkit import optimise
     from surfkit.cli import main
+    from surfkit.run import stage as optimise
 
     colmap(here)
     display = optimise.Display
@@ -61,7 +61,7 @@ def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
 
 def compared(here: Path) -> None:
     """A finished run, and what its mesh is compared with and in."""
-    from surfkit.evaluate.transform import write_transform
+    from surfkit.evaluate.geometry.transform import write_transform
     from surfkit.scene.crop import box, write_crop
 
     run_folder(here)

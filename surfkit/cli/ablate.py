@@ -13,12 +13,12 @@ from surfkit.cli.table import print_table
 from surfkit.cli.tables import chosen_table
 from surfkit.core.check import BadInput
 from surfkit.raster.select import Device
+from surfkit.readers.data import Data
 from surfkit.report.ablation import Table
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate
 from surfkit.report.table import LEGEND, STACKED, drawing, failures, lines
 from surfkit.report.truth import Truth
-from surfkit.scene.data import Data
 
 
 @dataclass(frozen=True)

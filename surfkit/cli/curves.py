@@ -10,7 +10,7 @@ import tyro
 
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.evaluate.chart import write_lines
+from surfkit.evaluate.geometry.chart import write_lines
 from surfkit.report.curves import Place, What, lines
 
 TITLES = {"points": "points", "loss": "sum of the weighted losses", "memory": "most memory held so far, GB"}

@@ -25,8 +25,8 @@ from surfkit.doctor.finding import LEVELS
 from surfkit.doctor.forecast import Plan, forecast
 from surfkit.pipeline import with_steps
 from surfkit.raster.select import Device
+from surfkit.readers.data import Reading
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Reading
 
 MOST_PROBED, MOST_POINTS = 10_000, 2**31 - 1
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}

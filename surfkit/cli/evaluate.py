@@ -11,20 +11,20 @@ import tyro
 from surfkit.cli.result import show, show_geometry
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
-from surfkit.evaluate.comparison import Comparison
-from surfkit.evaluate.geometry import measure_geometry
-from surfkit.evaluate.surface import Surface, read_surface
-from surfkit.folder import Run, note_metrics, refuse_no_run
-from surfkit.notes import noted
-from surfkit.optimise import drawing
+from surfkit.evaluate.geometry.comparison import Comparison
+from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.pipeline import drawer, evaluate, load_run, opened
 from surfkit.raster.select import Device
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
+from surfkit.run.folder import Run, note_metrics, refuse_no_run
+from surfkit.run.notes import noted
+from surfkit.run.stage import drawing
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
-from surfkit.zones import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 
 
 @dataclass(frozen=True)

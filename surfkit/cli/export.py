@@ -11,10 +11,10 @@ import tyro
 
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
-from surfkit.folder import refuse_no_run
+from surfkit.export.ply import write_splats
 from surfkit.pipeline import load_run
 from surfkit.primitives.base import to_table
-from surfkit.scene.ply import write_splats
+from surfkit.run.folder import refuse_no_run
 from surfkit.train.faults import full_disk_in_one_line
 
 

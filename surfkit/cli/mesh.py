@@ -12,19 +12,19 @@ from surfkit.cli.recipes import ARGV
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.journal import kept
 from surfkit.core.lock import held
 from surfkit.core.registry import choice
-from surfkit.folder import Run
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
-from surfkit.notes import noted
 from surfkit.pipeline import drawer, load_run
-from surfkit.preparing import with_maps_to_mesh
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
+from surfkit.run.folder import Run
+from surfkit.run.journal import kept
+from surfkit.run.mesh import Delivery, deliver, subject
+from surfkit.run.notes import noted
+from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.scene.memory import cache_bytes
-from surfkit.surface import Delivery, deliver, subject
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
 from surfkit.train.material import Store

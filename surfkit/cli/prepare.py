@@ -21,13 +21,13 @@ from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared, torch_device
-from surfkit.evaluate.pictures import colour_depth, write_picture
+from surfkit.evaluate.images.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
-from surfkit.scene.data import Reading
-from surfkit.scene.depth_files import FOLDER, RECORD, DepthFile, map_path
-from surfkit.scene.depth_prior import untrusted
+from surfkit.readers.data import Reading
+from surfkit.readers.depth_files import FOLDER, RECORD, DepthFile, map_path
+from surfkit.readers.depth_prior import untrusted
+from surfkit.readers.read import read
 from surfkit.scene.photos import read_photo
-from surfkit.scene.read import read
 from surfkit.scene.scene import View
 
 SHOWN = 4

@@ -9,7 +9,7 @@ from typing import Any
 
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.folder import Run
+from surfkit.run.folder import Run
 
 LPIPS = {
     "lpips_vgg": "LPIPS VGG",

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from surfkit.blocks.eta import seconds_left, so_far
 from surfkit.cli.table import print_table
 from surfkit.core.clock import clock
-from surfkit.outlook import seconds_left, so_far
 from surfkit.report.status import Block, Status, as_json, status
 
 UNFINISHED = 3

@@ -12,19 +12,19 @@ from typing import Annotated
 import tyro
 
 import surfkit
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
-from surfkit.folder import Run
-from surfkit.optimise import CHECKPOINT_EVERY, Every
-from surfkit.partition.executor import Executor, Inline
+from surfkit.execute.base import Executor, Inline
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
+from surfkit.readers.data import Reading
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
-from surfkit.scene.data import Reading
+from surfkit.run.folder import Run
+from surfkit.run.stage import CHECKPOINT_EVERY, Every
 from surfkit.train.material import Store
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"

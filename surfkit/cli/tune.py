@@ -9,19 +9,20 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.blocks import Record
+from surfkit.blocks.schedule import Record
+from surfkit.blocks.worker import guarded
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.notes import noted
-from surfkit.optimise import CHECKPOINT_EVERY, Every, drawer
 from surfkit.pipeline import opened
 from surfkit.raster.select import Device
+from surfkit.readers import extract
 from surfkit.report.tensorboard import tensorboard
-from surfkit.scene import extract
+from surfkit.run.context import Site, views_file
+from surfkit.run.notes import noted
+from surfkit.run.stage import CHECKPOINT_EVERY, Every, drawer
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import Store
-from surfkit.tuning import Site, guarded, views_file
 
 
 @dataclass(frozen=True)

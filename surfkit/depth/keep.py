@@ -18,8 +18,8 @@ from surfkit.core.files import sweep
 from surfkit.core.lock import USED, held, holder, is_used, used
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare import Preparation
-from surfkit.scene.fingerprint import Fingerprint, digest
-from surfkit.scene.made_maps import Made, folder_of, read_made, write_made
+from surfkit.readers.fingerprint import Fingerprint, digest
+from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View

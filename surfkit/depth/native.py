@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.native import module
+from surfkit.native import module
 from surfkit.scene.camera import Camera
 
 

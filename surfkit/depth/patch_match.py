@@ -21,8 +21,8 @@ from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
+from surfkit.readers.depth_files import save_array
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_files import save_array
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 from surfkit.scene.vectors import unit

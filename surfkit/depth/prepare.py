@@ -17,8 +17,8 @@ from surfkit.core.codec import dump
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, Estimate, Material
 from surfkit.raster.select import Device
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import (
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import (
     FOLDER,
     confidence_path,
     map_path,
@@ -27,9 +27,9 @@ from surfkit.scene.depth_files import (
     write_map,
     write_record,
 )
-from surfkit.scene.depth_prior import TRUSTED
+from surfkit.readers.depth_prior import TRUSTED
+from surfkit.readers.read import observations
 from surfkit.scene.observations import Observations
-from surfkit.scene.read import observations
 from surfkit.scene.scene import Scene, View
 
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"

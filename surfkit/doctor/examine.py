@@ -22,14 +22,14 @@ from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
 from surfkit.doctor.gather import Gathered, gather
 from surfkit.doctor.geometry import Geometry, seen_by, survey
 from surfkit.doctor.photographs import Photograph, Wanted, look_at
+from surfkit.readers.capture import Shot
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import find_maps
+from surfkit.readers.depth_prior import how_to_make, lacking_normals
+from surfkit.readers.read import RANDOM_POINTS, check_size, model_folder
+from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
-from surfkit.scene.capture import Shot
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import find_maps
-from surfkit.scene.depth_prior import how_to_make, lacking_normals
 from surfkit.scene.groups import apart
-from surfkit.scene.read import RANDOM_POINTS, check_size, model_folder
-from surfkit.scene.undistort import cache_folder, is_pinhole
 from surfkit.start.plain import SparseStart
 from surfkit.train.material import needs_normals, needs_priors
 

@@ -17,16 +17,16 @@ from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.gather import heard
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, probe
-from surfkit.optimise import CHECKPOINT_EVERY
 from surfkit.raster.select import Device
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import find_maps
+from surfkit.readers.depth_prior import prior_bytes
+from surfkit.readers.read import assembled, model_folder
+from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import find_maps
-from surfkit.scene.depth_prior import prior_bytes
+from surfkit.run.stage import CHECKPOINT_EVERY
 from surfkit.scene.memory import cache_bytes, free_bytes
-from surfkit.scene.read import assembled, model_folder
 from surfkit.scene.scene import Scene
-from surfkit.scene.undistort import cache_folder, is_pinhole
 from surfkit.train.material import needs_normals, needs_priors
 
 VIEWS = 10

@@ -14,11 +14,11 @@ from surfkit.core.check import BadInput, collecting
 from surfkit.core.events import Warned
 from surfkit.core.registry import components, hookimpl, plugins
 from surfkit.doctor.finding import Finding, from_errors
-from surfkit.scene.capture import Capture, Reader, Shot
-from surfkit.scene.data import Data
-from surfkit.scene.masks import FOLDER, MARKS, find_masks
+from surfkit.readers.capture import Capture, Reader, Shot
+from surfkit.readers.data import Data
+from surfkit.readers.masks import FOLDER, MARKS, find_masks
+from surfkit.readers.read import captured, reader_of
 from surfkit.scene.names import PICTURES
-from surfkit.scene.read import captured, reader_of
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 

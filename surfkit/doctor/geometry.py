@@ -11,9 +11,9 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.holes import holes
-from surfkit.scene.capture import Shot
+from surfkit.readers.capture import Shot
+from surfkit.readers.undistort import check_camera
 from surfkit.scene.scene import Frame
-from surfkit.scene.undistort import check_camera
 
 SAMPLE = 4_000
 """Sparse points, evenly drawn, that stand for all of them."""

@@ -14,7 +14,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.doctor.exposure import luminance
-from surfkit.scene.masks import check_mask, read_mask
+from surfkit.readers.masks import check_mask, read_mask
 from surfkit.scene.photos import opened, read_draft
 
 DRAFT = 256

@@ -23,16 +23,16 @@ import torch
 
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.densify.base import Prune, Step
-from surfkit.evaluate.pictures import panel, write_picture
+from surfkit.evaluate.images.pictures import panel, write_picture
+from surfkit.export.ply import write_splats
 from surfkit.primitives.base import Primitive, apply, to_table
 from surfkit.primitives.points import Edit, Points
 from surfkit.raster.select import Device, select
+from surfkit.readers.capture import library
+from surfkit.readers.depth_prior import DepthPrior
+from surfkit.readers.masks import view_mask
 from surfkit.recipe import Recipe
-from surfkit.scene.capture import library
-from surfkit.scene.depth_prior import DepthPrior
-from surfkit.scene.masks import view_mask
 from surfkit.scene.photos import view_photo
-from surfkit.scene.ply import write_splats
 from surfkit.scene.scene import Scene, View
 from surfkit.scene.vectors import unit
 from surfkit.train import checkpoint

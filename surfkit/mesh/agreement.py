@@ -13,8 +13,8 @@ from surfkit.depth.matching import ray_map
 from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.trust import Trust
 from surfkit.raster.api import Maps
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_prior import DepthPrior
 
 CONFIDENT = 0.375
 """Confidence of a prior from which it may contradict."""

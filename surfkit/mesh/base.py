@@ -14,7 +14,7 @@ from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Rasterizer, Splats
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
 
 

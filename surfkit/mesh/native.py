@@ -9,7 +9,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.mesh.cubes import EDGES, triangles
 from surfkit.mesh.lattice import MOST, REACH, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.reference import ReferenceGrid
-from surfkit.raster.native import module
+from surfkit.native import module
 
 
 class NativeGrid(Grid):

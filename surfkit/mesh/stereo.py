@@ -13,7 +13,7 @@ from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh, Mesher, Subject
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 
 POINTS = 2_000_000

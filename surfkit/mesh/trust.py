@@ -10,7 +10,7 @@ from torch import Tensor
 from surfkit.core.registry import Component
 from surfkit.mesh.overlap import Depths
 from surfkit.raster.api import Maps
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 
 
 class Trust(Component):

@@ -8,10 +8,7 @@ from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
 from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, Partition, Sight
 from surfkit.partition.camera_grid import CameraGrid
-from surfkit.partition.executor import Executor, Inline, Pool
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
-from surfkit.partition.ray import Ray
-from surfkit.partition.slurm import Slurm
 
 
 @hookimpl
@@ -25,10 +22,6 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "ssim-difference": SSIMDifference,
         "picture-share": PictureShare,
         "airspace": Airspace,
-        "inline": Inline,
-        "pool": Pool,
-        "ray": Ray,
-        "slurm": Slurm,
     }
 
 
@@ -39,14 +32,9 @@ __all__ = [
     "CameraGrid",
     "Cells",
     "ContractedGrid",
-    "Executor",
-    "Inline",
     "Partition",
     "PictureShare",
-    "Pool",
     "QuantileGrid",
-    "Ray",
     "SSIMDifference",
     "Sight",
-    "Slurm",
 ]

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
+from surfkit.export.ply import SplatTable
 from surfkit.primitives.points import Columns, Edit, Points
 from surfkit.raster.api import Splats
-from surfkit.scene.ply import SplatTable
 from surfkit.scene.scene import Cloud
 
 SHRINK = 1.6

@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from functools import cache, cached_property
-from types import ModuleType
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.native import module
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
 MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
 """In the order of `api.Maps`; the kernels make the first 2, the first 5 or all of them."""
-
-
-@cache
-def module() -> ModuleType | None:
-    """The compiled extension, or None where surfkit was installed without a compiler.
-
-    SURFKIT_KERNELS=avx512|avx2|baseline picks one compilation of the kernels; by default the best that runs is used.
-    """
-    try:
-        from surfkit.raster.cpu import _native
-    except ImportError:
-        return None
-    if wanted := os.environ.get("SURFKIT_KERNELS"):
-        if wanted not in _native.kernels():
-            raise BadInput(f"SURFKIT_KERNELS={wanted}: this machine can run {', '.join(_native.kernels())}")
-        _native.use_kernels(wanted)
-    return _native
 
 
 class NativeRasterizer(Rasterizer):

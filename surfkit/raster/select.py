@@ -7,9 +7,10 @@ from typing import Literal
 
 import torch
 
+from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster import native
 from surfkit.raster.api import Rasterizer
+from surfkit.raster.native import NativeRasterizer
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -19,7 +20,7 @@ def select(device: Device = "auto") -> tuple[Rasterizer, str]:
     if device == "cuda":
         raise BadInput("--device cuda: the CUDA rasterizer is not part of this version; use --device cpu")
     if native.module() is not None:
-        return native.NativeRasterizer(), f"cpu {native.module().kernels_in_use()}"
+        return NativeRasterizer(), f"cpu {native.module().kernels_in_use()}"
     from surfkit.raster.reference import Reference
 
     warnings.warn(

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from surfkit.raster import native
+from surfkit import native
 
 C1, C2 = 0.01**2, 0.03**2
 RADIUS, SIGMA = 5, 1.5

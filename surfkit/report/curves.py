@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from surfkit.core import journal
 from surfkit.core.check import BadInput
-from surfkit.evaluate.chart import COLORS, Line
+from surfkit.evaluate.geometry.chart import COLORS, Line
+from surfkit.run import journal
 
 What = Literal["points", "loss", "memory"]
 DOTS = 300

@@ -8,12 +8,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from surfkit.core import journal
+from surfkit.blocks.eta import all_left
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
 from surfkit.core.lock import holder
 from surfkit.evaluate.metrics import read_metrics
-from surfkit.outlook import all_left
+from surfkit.run import journal
 
 NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
 """What lines of the journal may have, and of what kind it is."""

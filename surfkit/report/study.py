@@ -14,20 +14,20 @@ from typing import Any, Protocol
 import torch
 
 from surfkit import pipeline
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
 from surfkit.mesh.tsdf import TSDF
-from surfkit.notes import noted
 from surfkit.raster.select import Device
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.report.ablation import Table, build, capped, pick, scaled
 from surfkit.report.compare import compare, figures
 from surfkit.report.table import markdown
 from surfkit.report.truth import Truth
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
+from surfkit.run.notes import noted
 
 TRACE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""

@@ -10,12 +10,12 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
-from surfkit.evaluate.comparison import Comparison, truth_side
-from surfkit.evaluate.geometry import measure_geometry
-from surfkit.evaluate.surface import read_surface
-from surfkit.folder import note_metrics
+from surfkit.evaluate.geometry.comparison import Comparison, truth_side
+from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.pipeline import opened
-from surfkit.scene.read import read
+from surfkit.readers.read import read
+from surfkit.run.folder import note_metrics
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
 from surfkit.primitives.points import Columns, Points
-from surfkit.raster import native
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 

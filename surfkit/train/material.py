@@ -10,11 +10,11 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
 from surfkit.losses.base import Loss
+from surfkit.readers.data import Data
+from surfkit.readers.depth_prior import Alignment, Priors, prior_bytes, read_priors
+from surfkit.readers.masks import mask_cache, mask_sizes
 from surfkit.scene.cache import Cache, share
 from surfkit.scene.copies import Copies
-from surfkit.scene.data import Data
-from surfkit.scene.depth_prior import Alignment, Priors, prior_bytes, read_priors
-from surfkit.scene.masks import mask_cache, mask_sizes
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene

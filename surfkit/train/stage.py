@@ -25,8 +25,8 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge, withheld
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.cache import Cache
-from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.train.adam import Rate, adam_step
 from surfkit.train.cotangents import added, gradient, pulled

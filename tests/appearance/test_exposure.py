@@ -3,7 +3,7 @@ import torch
 
 from surfkit.appearance import Exposure
 from surfkit.core.check import BadInput
-from surfkit.evaluate.images import color_corrected, evaluate_views, psnr
+from surfkit.evaluate.images.measure import color_corrected, evaluate_views, psnr
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.raster.footprints import colors

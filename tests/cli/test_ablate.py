@@ -8,10 +8,11 @@ import signal
 import pytest
 import torch
 
-from surfkit import optimise, pipeline
+from surfkit import pipeline
 from surfkit.cli import main
 from surfkit.recipes.ablations import TABLES
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.run import stage as optimise
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module")

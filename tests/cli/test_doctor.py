@@ -8,7 +8,7 @@ from surfkit.cli import doctor, main
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.finding import Finding
 from surfkit.doctor.forecast import Room
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture

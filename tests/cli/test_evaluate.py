@@ -8,16 +8,16 @@ import pytest
 import torch
 from needs import needs
 
-from surfkit.blocks import Record
+from surfkit.blocks.schedule import Record
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
+from surfkit.export.ply import write_points
 from surfkit.partition.base import Cells, Ground
 from surfkit.partition.plan import Block, Plan
 from surfkit.pipeline import run, with_steps
-from surfkit.scene.data import Data
-from surfkit.scene.ply import write_points
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")
 pytestmark = pytest.mark.usefixtures("small_pictures")

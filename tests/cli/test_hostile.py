@@ -12,7 +12,7 @@ import torch
 import surfkit
 from surfkit.cli import main
 from surfkit.scene.crop import box, write_crop
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 RUN = "--steps 2 --device cpu --pictures-every 1 --primitive.sh-degree 1 --cache 1MB"
 CUT = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share"

@@ -8,7 +8,7 @@ from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 trimesh = needs("trimesh")
 TRAIN = ["recipe:2dgs", "--steps", "60", "--pictures-every", "0", "--primitive.sh-degree", "0"]

@@ -10,8 +10,8 @@ from needs import needs_native
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.scene.depth_files import confidence_path, map_path
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.depth_files import confidence_path, map_path
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 SETTINGS = "recipe:surface mesh:none --steps 1 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()

@@ -7,7 +7,6 @@ import pytest
 import torch
 from PIL import Image
 
-from surfkit import optimise
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.lock import held
@@ -15,9 +14,10 @@ from surfkit.core.tree import evolve
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.losses import DepthRegression
 from surfkit.pipeline import run, with_steps
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import map_path
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import map_path
+from surfkit.run import stage as optimise
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 SMALL = ("--test-every", "4", "--estimator.longest", "48")
 

@@ -1,7 +1,7 @@
 import json
 
 from surfkit.core.events import FileWritten, StageBegan, StepDone, Warned, emit
-from surfkit.core.journal import kept, read
+from surfkit.run.journal import kept, read
 
 
 def steps(path):

@@ -11,10 +11,10 @@ from surfkit.core.check import BadInput
 from surfkit.depth.base import Material
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.patch_match import PatchMatch
+from surfkit.readers.data import Data
+from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
-from surfkit.scene.data import Data
-from surfkit.scene.read import observations, read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 CPU = torch.device("cpu")

@@ -13,10 +13,10 @@ from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smoothed
+from surfkit.readers.data import Data
+from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
-from surfkit.scene.data import Data
-from surfkit.scene.read import observations, read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 CPU = torch.device("cpu")
 

@@ -16,10 +16,10 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.doctor.examine import examine
 from surfkit.losses import NormalPrior
-from surfkit.scene.capture import library
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import write_map
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.capture import library
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import write_map
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[2] / "examples" / "boruszyn"
 FLIGHT = Flight(kind="grid", views=16, width=64, height=48, points=1_500)

@@ -25,9 +25,9 @@ from surfkit.losses import NormalPrior, Reprojection
 from surfkit.pipeline import Every, run, with_steps
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.stage import Trainer
 
 STARTED = Started(photo_seconds=0.4, init_seconds=3.0, held_bytes=1_000)

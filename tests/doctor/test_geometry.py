@@ -7,7 +7,7 @@ import pytest
 
 from surfkit.doctor.exposure import exposures, luminance
 from surfkit.doctor.geometry import places
-from surfkit.scene.capture import Shot, library
+from surfkit.readers.capture import Shot, library
 
 
 def shot(model, *params):

@@ -9,21 +9,21 @@ from needs import needs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from surfkit.evaluate.class_pictures import write_classes
-from surfkit.evaluate.classes import SEEN_FROM, class_figures, classify
-from surfkit.evaluate.comparison import Comparison, compare
-from surfkit.evaluate.measurement import Side
-from surfkit.evaluate.normals import normals_at
-from surfkit.evaluate.seams import Seams
-from surfkit.evaluate.sightings import near_edges, sightings
-from surfkit.evaluate.surface import Surface, read_surface
-from surfkit.evaluate.terrain import terrain
-from surfkit.evaluate.transform import apply
-from surfkit.evaluate.upright import upward
+from surfkit.evaluate.geometry.class_pictures import write_classes
+from surfkit.evaluate.geometry.classes import SEEN_FROM, class_figures, classify
+from surfkit.evaluate.geometry.comparison import Comparison, compare
+from surfkit.evaluate.geometry.normals import normals_at
+from surfkit.evaluate.geometry.repetition import Side
+from surfkit.evaluate.geometry.sightings import near_edges, sightings
+from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.terrain import terrain
+from surfkit.evaluate.geometry.transform import apply
+from surfkit.evaluate.geometry.upright import upward
+from surfkit.evaluate.images.seams import Seams
+from surfkit.export.ply import read_vertices
 from surfkit.scene.camera import Camera
-from surfkit.scene.ply import read_vertices
 from surfkit.scene.scene import Frame, View
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 from .test_crop_volume import exact_visible, overhead, synthetic_points
 

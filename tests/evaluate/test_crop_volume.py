@@ -9,14 +9,14 @@ from needs import needs
 from scipy.spatial import Delaunay
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.outline import outline
-from surfkit.evaluate.scores import surface_gap, tree
-from surfkit.evaluate.visibility import visible, visible_counts
-from surfkit.evaluate.volume import Enough, visible_crop
+from surfkit.evaluate.geometry.outline import outline
+from surfkit.evaluate.geometry.scores import surface_gap, tree
+from surfkit.evaluate.geometry.visibility import visible, visible_counts
+from surfkit.evaluate.geometry.volume import Enough, visible_crop
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import Crop, read_crop, within, write_crop
 from surfkit.scene.scene import Frame, View
-from surfkit.scene.synthetic import SURFACES, Flight, photograph
+from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
 STAR = np.array([[0, 0], [4, 1], [8, 0], [6, 3], [8, 7], [4, 5], [0, 7], [2, 3]], float)
 

@@ -9,17 +9,17 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate import measurement
-from surfkit.evaluate.comparison import Comparison, compare
-from surfkit.evaluate.errors import coloured
-from surfkit.evaluate.geometry import measure_geometry
-from surfkit.evaluate.measurement import cloud_side
-from surfkit.evaluate.scores import shares
-from surfkit.evaluate.surface import Surface, read_surface
-from surfkit.evaluate.transform import apply, write_transform
+from surfkit.evaluate.geometry import repetition as measurement
+from surfkit.evaluate.geometry.comparison import Comparison, compare
+from surfkit.evaluate.geometry.errors import coloured
+from surfkit.evaluate.geometry.measure import measure_geometry
+from surfkit.evaluate.geometry.repetition import cloud_side
+from surfkit.evaluate.geometry.scores import shares
+from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.transform import apply, write_transform
+from surfkit.export.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop
-from surfkit.scene.ply import read_vertices, write_points
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 trimesh = needs("trimesh")
 

@@ -9,13 +9,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate import thinning
-from surfkit.evaluate.registration import align
-from surfkit.evaluate.sampling import sample_surface
-from surfkit.evaluate.scores import Distances, chamfer, curve, nearest, shares, spacing, surface_gap, tree
-from surfkit.evaluate.surface import Surface
-from surfkit.evaluate.thinning import thin, voxel_for
-from surfkit.evaluate.transform import apply, fitted, read_transform, scale_of, write_transform
+from surfkit.evaluate.geometry import thinning
+from surfkit.evaluate.geometry.registration import align
+from surfkit.evaluate.geometry.sampling import sample_surface
+from surfkit.evaluate.geometry.scores import Distances, chamfer, curve, nearest, shares, spacing, surface_gap, tree
+from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.thinning import thin, voxel_for
+from surfkit.evaluate.geometry.transform import apply, fitted, read_transform, scale_of, write_transform
 
 trimesh = needs("trimesh")
 
@@ -173,7 +173,7 @@ def test_icp_as_open3d_does_one_round():
     criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, 20)
     way = registration.TransformationEstimationPointToPoint(True)
     theirs = registration.registration_icp(source, target, 0.3, similarity(1.02), way, criteria)
-    from surfkit.evaluate.registration import Alignment, icp
+    from surfkit.evaluate.geometry.registration import Alignment, icp
 
     points = np.asarray(target.points)
     start = Alignment(similarity(1.02), 0, None)

@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 
-from surfkit.evaluate.images import evaluate_views, frames_per_second, psnr
+from surfkit.evaluate.images.measure import evaluate_views, frames_per_second, psnr
 from surfkit.raster.api import Maps
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 SYNTHETIC = photograph(Flight(views=5, width=32, height=24, points=20))
 VIEWS = (*SYNTHETIC.scene.train, *SYNTHETIC.scene.held_out)

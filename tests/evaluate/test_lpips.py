@@ -10,11 +10,11 @@ import torch
 from torch import nn
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate import lpips
-from surfkit.evaluate.images import evaluate_views
-from surfkit.evaluate.lpips import BACKBONES, CARRIED, PLANS, POSITIONS, NoWeights, load_perceptual, networks
+from surfkit.evaluate.images import lpips
+from surfkit.evaluate.images.lpips import BACKBONES, CARRIED, PLANS, POSITIONS, NoWeights, load_perceptual, networks
+from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.raster.api import Maps
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 # Channels of the real networks, so that the layers of torch's own modules can be built from them.
 LAYERS = {

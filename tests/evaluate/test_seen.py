@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.evaluate import seen
-from surfkit.evaluate.parts import by_views, measure_parts
-from surfkit.evaluate.seen import Depths, sights
+from surfkit.evaluate.images import seen
+from surfkit.evaluate.images.parts import by_views, measure_parts
+from surfkit.evaluate.images.seen import Depths, sights
 from surfkit.raster.api import Maps
-from surfkit.scene.synthetic import SURFACES, Flight, photograph
+from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
 SYNTHETIC = photograph(Flight(views=12, width=320, height=240, points=20, test_every=4))
 SCENE = SYNTHETIC.scene

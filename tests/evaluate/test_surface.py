@@ -5,9 +5,9 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate import surface
-from surfkit.evaluate.surface import read_surface
-from surfkit.scene.ply import write_points
+from surfkit.evaluate.geometry import surface
+from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.export.ply import write_points
 
 trimesh = needs("trimesh")
 BOX = trimesh.creation.box((1, 2, 3))

@@ -11,8 +11,8 @@ from surfkit.losses import DepthRegression
 from surfkit.losses.base import Sample
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim_map
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 from surfkit.testing import check_loss
 

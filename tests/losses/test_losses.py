@@ -5,10 +5,10 @@ import pytest
 import torch
 from needs import needs_native
 
+from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.losses.base import Sample
-from surfkit.raster import native
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement, disagreement_reference, normals_of
 from surfkit.scene.camera import Camera

@@ -12,10 +12,10 @@ from surfkit.losses.base import Sample, ignoring
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.raster.select import select
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, View
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 SIZE = (11, 14)
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 7.0, 5.5, SIZE[1], SIZE[0])

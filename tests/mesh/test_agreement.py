@@ -13,7 +13,7 @@ from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import View
 
 from .shapes import around, look_at, maps_of, seen, sphere, subject

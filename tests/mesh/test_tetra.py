@@ -14,8 +14,8 @@ from surfkit.mesh.delaunay import crossing, split
 from surfkit.mesh.tetra import Tetra, triangles, used
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.scene.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
 from surfkit.testing import check_mesher
 

@@ -8,9 +8,9 @@ import pytest
 
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
-from surfkit.partition import executor
-from surfkit.partition.executor import LOG, Inline, Job, Pool
-from surfkit.partition.state import STALE_S, BlockState, read_state, worked_on, write_state
+from surfkit.execute import base as executor
+from surfkit.execute.base import LOG, Inline, Job, Pool
+from surfkit.execute.state import STALE_S, BlockState, read_state, worked_on, write_state
 
 
 def job(folder: Path, index: int, code: str = "", **more) -> Job:

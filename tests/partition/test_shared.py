@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.core.errand import Outcome, attend
-from surfkit.partition.executor import LOG, Job
-from surfkit.partition.shared import MARK, errand, marked
+from surfkit.execute.base import LOG, Job
+from surfkit.execute.remote import Outcome, attend
+from surfkit.execute.shared import MARK, errand, marked
 
 HOST = socket.gethostname()
 
@@ -63,7 +63,7 @@ def test_told_to_end_by_someone_else(tmp_path):
 @pytest.mark.parametrize("module", ["torch", "numpy", "pycolmap"])
 def test_agents_are_light(module):
     """What an agent of a cluster imports for an errand."""
-    code = f"import sys, surfkit.core.errand; raise SystemExit({module!r} in sys.modules)"
+    code = f"import sys, surfkit.execute.remote; raise SystemExit({module!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

@@ -8,8 +8,8 @@ import torch
 from needs import needs_native
 from torch import Tensor
 
+from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster import native
 from surfkit.raster.api import ALPHA_MIN, Gradients, Maps, Render, Splats
 from surfkit.raster.footprints import gaussians, surfels
 from surfkit.raster.native import NativeRasterizer

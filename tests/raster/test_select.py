@@ -5,8 +5,9 @@ import warnings
 import pytest
 from needs import needs_native
 
+from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster import native
+from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select
 
@@ -23,7 +24,7 @@ def test_without_the_compiled_module_the_reference_draws_with_one_warning(monkey
 @needs_native
 def test_the_compiled_module_is_preferred():
     rasterizer, name = select("cpu")
-    assert isinstance(rasterizer, native.NativeRasterizer)
+    assert isinstance(rasterizer, NativeRasterizer)
     assert name == f"cpu {native.module().kernels_in_use()}"
 
 

@@ -7,31 +7,32 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit import optimise, pipeline
+from surfkit import pipeline
 from surfkit.appearance import Exposure
-from surfkit.blocks import Hands
+from surfkit.blocks.schedule import Hands
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.core.registry import components
 from surfkit.core.tree import evolve
 from surfkit.densify.prune import Importance
-from surfkit.folder import Run
+from surfkit.export.ply import read_splats
 from surfkit.losses.depth import DepthRegression
-from surfkit.optimise import Every
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run, with_steps
 from surfkit.primitives import Gaussian3D
 from surfkit.raster.select import select
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.recipes.city import FIRST
 from surfkit.refine import Distil, Recover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
-from surfkit.scene.data import Data
-from surfkit.scene.ply import read_splats
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.run import stage as optimise
+from surfkit.run.folder import Run
+from surfkit.run.stage import Every
 from surfkit.testing import check_refine
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.faults import Diverged, NotFinite
 from surfkit.train.stage import Stage

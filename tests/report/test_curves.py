@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.evaluate.chart import BLUE, LEFT, ORANGE, RIGHT, SIZE, round_above
+from surfkit.evaluate.geometry.chart import BLUE, LEFT, ORANGE, RIGHT, SIZE, round_above
 
 
 @pytest.fixture

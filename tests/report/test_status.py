@@ -5,8 +5,8 @@ import pytest
 from surfkit.cli import main
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Measured, StageBegan, StepDone, emit
-from surfkit.core.journal import kept
 from surfkit.core.lock import held
+from surfkit.run.journal import kept
 
 TOTALS = {"points": 9, "steps": 40, "seconds": 2.0, "cpu_seconds": 3.0}
 

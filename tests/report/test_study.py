@@ -10,14 +10,14 @@ from rich.console import Console
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.densify import CountCap, Elongation
+from surfkit.readers.data import Data
 from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
 from surfkit.report import study
 from surfkit.report.ablation import Row, Table
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
 from surfkit.report.table import lines, markdown
-from surfkit.scene.data import Data
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
 
 TABLE = Table(

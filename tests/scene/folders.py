@@ -12,8 +12,8 @@ from needs import needs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from surfkit.scene.ply import write_points
-from surfkit.scene.synthetic import Flight, look, photograph, write_colmap
+from surfkit.export.ply import write_points
+from surfkit.testing.synthetic import Flight, look, photograph, write_colmap
 
 FLIGHT = Flight(views=6, width=40, height=30, points=60, test_every=3)
 GL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene.data import Data
-from surfkit.scene.depth_prior import read_priors
-from surfkit.scene.read import RANDOM_POINTS, read
-from surfkit.scene.synthetic import SURFACES, Flight, look, photograph, write_colmap
+from surfkit.readers.data import Data
+from surfkit.readers.depth_prior import read_priors
+from surfkit.readers.read import RANDOM_POINTS, read
+from surfkit.run.notes import noted
+from surfkit.testing.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
 from .folders import DEPTHS, FLIGHT, city, renumbered, squarely, with_tests_apart
 

@@ -10,10 +10,10 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.scene import colmap
-from surfkit.scene.data import Data
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers import colmap
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[2] / "examples" / "boruszyn"
 FLIGHT = Flight(views=5, width=40, height=30, points=60)

@@ -9,13 +9,14 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene import copies, undistort
-from surfkit.scene.capture import library
-from surfkit.scene.data import Data
+from surfkit.readers import undistort
+from surfkit.readers.capture import library
+from surfkit.readers.data import Data
+from surfkit.readers.read import observations, read
+from surfkit.run.notes import noted
+from surfkit.scene import copies
 from surfkit.scene.photos import read_photo, view_photo
-from surfkit.scene.read import observations, read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(views=5, width=64, height=48, points=80)
 LENSES = {
@@ -227,7 +228,7 @@ def test_what_a_lens_does_not_show_is_masked(farm):
     scene = read(Data(farm))
     view = scene.train[0]
     if view.mask is not None:
-        from surfkit.scene.masks import read_mask
+        from surfkit.readers.masks import read_mask
 
         keep = read_mask(view.mask, (view.camera.width, view.camera.height))
         assert (view_photo(view)[:, ~keep] == 0).all()

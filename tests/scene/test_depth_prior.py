@@ -11,14 +11,14 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene import read as scenes
+from surfkit.readers import read as scenes
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import confidence_path, find_maps, map_path, normal_path, write_map, write_record
+from surfkit.readers.depth_prior import read_priors, resized
+from surfkit.readers.read import observations
+from surfkit.run.notes import noted
 from surfkit.scene.align import align, sample
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import confidence_path, find_maps, map_path, normal_path, write_map, write_record
-from surfkit.scene.depth_prior import read_priors, resized
-from surfkit.scene.read import observations
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.scene.capture import library
-from surfkit.scene.ply import read_splats
-from surfkit.scene.synthetic import Flight, look, photograph, write_colmap
+from surfkit.export.ply import read_splats
+from surfkit.readers.capture import library
+from surfkit.testing.synthetic import Flight, look, photograph, write_colmap
 
 from .folders import FLIGHT, blender, city, nerfstudio, odm, save, surveyed, views_of, with_tests_apart
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.scene import extract
-from surfkit.scene.data import Data
-from surfkit.scene.depth_files import map_path
-from surfkit.scene.depth_prior import alignment, read_priors
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.readers import extract
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import map_path
+from surfkit.readers.depth_prior import alignment, read_priors
+from surfkit.readers.read import read
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module")

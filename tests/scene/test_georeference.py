@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene.data import Data
-from surfkit.scene.georeference import placed, utm
-from surfkit.scene.ply import SplatTable, read_splats, read_vertices, write_splats
-from surfkit.scene.read import read
+from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_splats
+from surfkit.readers.data import Data
+from surfkit.readers.georeference import placed, utm
+from surfkit.readers.read import read
+from surfkit.run.notes import noted
 from surfkit.scene.scene import Frame
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 
 from .folders import surveyed
 

@@ -8,10 +8,10 @@ import pytest
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.doctor.examine import examine
+from surfkit.readers.data import Data
 from surfkit.scene import groups
-from surfkit.scene.data import Data
 from surfkit.scene.groups import apart, connected
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(kind="grid", views=16, width=24, height=18, points=400)
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene.data import Data
+from surfkit.readers.data import Data
+from surfkit.readers.read import RANDOM_POINTS, observations, read
+from surfkit.run.notes import noted
 from surfkit.scene.photos import view_photo
-from surfkit.scene.read import RANDOM_POINTS, observations, read
-from surfkit.scene.synthetic import photograph
+from surfkit.testing.synthetic import photograph
 
 from .folders import FLIGHT, blender, lens, nerfstudio, odm, pixels_of, save, sparse, to_world, views_of
 
@@ -161,7 +161,7 @@ def test_damaged_transforms(tmp_path, truth, change, text):
 
 
 def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, truth):
-    from surfkit.scene.synthetic import write_colmap
+    from surfkit.testing.synthetic import write_colmap
 
     odm(nerfstudio(tmp_path, truth), truth)
     with pytest.raises(BadInput, match="could be of layout nerfstudio or odm; choose one with --layout"):

@@ -9,12 +9,12 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene.data import Data
-from surfkit.scene.masks import mask_cache, read_mask, view_mask
+from surfkit.readers.data import Data
+from surfkit.readers.masks import mask_cache, read_mask, view_mask
+from surfkit.readers.read import read
+from surfkit.run.notes import noted
 from surfkit.scene.photos import view_photo
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module")

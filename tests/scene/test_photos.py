@@ -8,9 +8,9 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.readers.capture import library
 from surfkit.scene import photos
 from surfkit.scene.camera import Camera
-from surfkit.scene.capture import library
 from surfkit.scene.copies import Copies
 from surfkit.scene.photos import is_turned, photo_cache, photo_size, read_photo
 from surfkit.scene.scene import View

@@ -9,8 +9,8 @@ import torch
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.scene import ply
-from surfkit.scene.ply import SplatTable, read_splats, read_vertices, write_points, write_splats
+from surfkit.export import ply
+from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_points, write_splats
 from surfkit.scene.scene import Frame
 
 

@@ -8,11 +8,11 @@ import pytest
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.notes import noted
-from surfkit.scene.data import Data
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.run.notes import noted
 from surfkit.scene.photos import read_photo, view_photo
-from surfkit.scene.read import read
-from surfkit.scene.synthetic import Flight, photograph, write_colmap
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
 @pytest.fixture

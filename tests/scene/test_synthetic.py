@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from surfkit.scene.photos import read_photo
-from surfkit.scene.synthetic import SURFACES, Flight, photograph, write_colmap
+from surfkit.testing.synthetic import SURFACES, Flight, photograph, write_colmap
 
 
 @pytest.fixture(scope="module", params=["orbit", "grid"])

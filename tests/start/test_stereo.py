@@ -10,13 +10,13 @@ from torch.nn.functional import normalize
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
-from surfkit.scene.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
-from surfkit.scene.synthetic import SURFACES, Flight, photograph
 from surfkit.start.base import Known, Start
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.stereo import StereoStart, normals_of, pixel_size
 from surfkit.start.voxels import Collected, Samples, apart, thinned, thinned_to
+from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
 
 @pytest.fixture(scope="module")

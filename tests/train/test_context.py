@@ -11,7 +11,8 @@ from surfkit.densify.base import Densify, Prune
 from surfkit.densify.filters import CountCap
 from surfkit.densify.trim import Trim
 from surfkit.primitives.points import Edit, Points
-from surfkit.train import checkpoint, pieces
+from surfkit.train import checkpoint
+from surfkit.train import streaming as pieces
 from surfkit.train.stage import Stage
 
 QUIET = Stage(steps=6, densify=None, sh_every=2)

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from surfkit.core.registry import components
-from surfkit.evaluate.images import evaluate_views
+from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.losses.base import Loss, ignoring
 from surfkit.raster.api import Maps
-from surfkit.testing import _maps, _sample
+from surfkit.testing.checks import _maps, _sample
 
 SIZE = (24, 32)
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.train import checkpoint, pieces
+from surfkit.train import checkpoint
+from surfkit.train import streaming as pieces
 from surfkit.train.stage import Stage
 
 from .test_checkpoint import small_files

@@ -14,7 +14,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
-from surfkit.scene.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
 from surfkit.train.adam import Rate
 from surfkit.train.rig import CHOICE, Rig

@@ -1,5 +1,4 @@
 // What Python sees of the stereo: arrays are checked in depth/native.py, which alone calls this.
-#include "bind.h"
 
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -12,7 +11,7 @@
 #include <string>
 #include <vector>
 
-#include "../../raster/cpu/pool.h"
+#include "../../native/pool.h"
 #include "stereo.h"
 
 namespace nb = nanobind;

@@ -7,7 +7,7 @@
 
 #include <algorithm>
 
-#include "../../raster/cpu/simd.h"
+#include "../../native/simd.h"
 
 #define SURFKIT_PASTE(a, b) a##b
 #define SURFKIT_TABLE(name) SURFKIT_PASTE(stereo_kernels_, name)

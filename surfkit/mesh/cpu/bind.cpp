@@ -10,8 +10,7 @@
 #include <optional>
 #include <string>
 
-#include "../../raster/cpu/pool.h"
-#include "bind.h"
+#include "../../native/pool.h"
 #include "grid.h"
 #include "shade.h"
 

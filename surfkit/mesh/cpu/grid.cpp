@@ -6,7 +6,7 @@
 #include <cstring>
 #include <new>
 
-#include "../../raster/cpu/pool.h"
+#include "../../native/pool.h"
 
 namespace surfkit {
 namespace {

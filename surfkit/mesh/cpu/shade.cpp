@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "../../raster/cpu/pool.h"
+#include "../../native/pool.h"
 
 namespace surfkit {
 namespace {

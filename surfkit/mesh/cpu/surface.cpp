@@ -2,7 +2,7 @@
 #include <algorithm>
 #include <cstring>
 
-#include "../../raster/cpu/pool.h"
+#include "../../native/pool.h"
 #include "grid.h"
 
 namespace surfkit {

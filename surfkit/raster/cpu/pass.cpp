@@ -5,7 +5,7 @@
 #include <limits>
 #include <stdexcept>
 
-#include "pool.h"
+#include "../../native/pool.h"
 
 namespace surfkit {
 namespace {

@@ -8,7 +8,7 @@
 static inline double square_root(double x) { return std::sqrt(x); }
 static inline double natural_log(double x) { return std::log(x); }
 #include "../splat_math.h"
-#include "buffer.h"
+#include "../../native/buffer.h"
 #include "kernels.h"
 
 namespace surfkit {

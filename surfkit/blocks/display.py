@@ -1,0 +1,126 @@
+"""What a person sees while blocks are tuned in other processes: a table on a terminal, else a line now and then."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from surfkit.blocks.eta import all_left, in_words, seconds_left, so_far
+from surfkit.core.check import BadInput
+from surfkit.core.clock import clock
+from surfkit.execute.state import BlockState, read_state
+from surfkit.train.progress import larger
+
+DRAW_EVERY_S = 1.0
+PLAIN_EVERY_S = 30.0
+"""Between two lines where there is no terminal to draw on."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where all blocks stand.
+
+    Attributes:
+        states: Of each block that is tuned at all, by number.
+        steps: That each has to make.
+        at_once: How many are worked on at a time.
+    """
+
+    states: Mapping[int, BlockState]
+    steps: int
+    at_once: int = 1
+
+    @property
+    def done(self) -> int:
+        """Blocks that are done."""
+        return sum(state.status == "done" and state.step >= self.steps for state in self.states.values())
+
+    def heading(self) -> str:
+        """All blocks in a few words: 3 of 20 blocks done, about 2:10:00 left."""
+        left = all_left(list(self.states.values()), self.steps, self.at_once)
+        text = f"{self.done} of {len(self.states)} blocks done"
+        return text if left is None else f"{text}, about {clock(left)} left"
+
+    def line(self) -> str:
+        """All blocks that are worked on, in one line."""
+        working = [f"block {at}: {in_words(s)}" for at, s in self.states.items() if s.status == "running"]
+        return "; ".join([self.heading(), *working])
+
+
+def state_since(folder: Path, since: float) -> BlockState:
+    """The state of the block in a folder, as far as it tells of the time since then, in seconds since 1970."""
+    try:
+        state = read_state(folder)
+    except (BadInput, OSError):  # damaged, or gone just now
+        return BlockState()
+    return replace(state, status="planned") if state.heard < since and state.status != "done" else state
+
+
+class Board:
+    """Looks at the folders of blocks every so often, in a thread, and shows how far they are."""
+
+    def __init__(self, look: Callable[[], Standing], console: Console | None = None) -> None:
+        """Show what `look` tells."""
+        self.look = look
+        self.console = console or Console(stderr=True)
+        self.outer = larger()
+        self.live: Live | None = None
+        self.over = threading.Event()
+        self.thread = threading.Thread(target=self.watch, name="board", daemon=True)
+
+    def __enter__(self) -> Board:
+        if self.outer is None and self.console.is_terminal:
+            self.live = Live(console=self.console, auto_refresh=False, transient=True)
+            self.live.start()
+        self.thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.over.set()
+        self.thread.join()
+        if self.live is not None:
+            self.live.stop()
+
+    def watch(self) -> None:
+        """Show, until it is over."""
+        every = DRAW_EVERY_S if self.live or self.outer else PLAIN_EVERY_S
+        while not self.over.wait(every):
+            self.show(self.look())
+
+    def show(self, now: Standing) -> None:
+        """Show where the blocks stand."""
+        if self.outer is not None:
+            made = sum(min(state.step, now.steps) for state in now.states.values())
+            self.outer("blocks", made, len(now.states) * now.steps, now.heading())
+        elif self.live is not None:
+            self.live.update(table(now), refresh=True)
+        else:
+            self.console.print(now.line(), highlight=False, soft_wrap=True)
+
+
+def table(now: Standing) -> Table | Text:
+    """A row for each block that is worked on or has failed; the others are only counted."""
+    told = {index: state for index, state in now.states.items() if state.status in ("running", "failed")}
+    if not told:
+        return Text(now.heading())
+    drawn = Table(title=now.heading(), title_justify="left", box=None, padding=(0, 2, 0, 0))
+    for name in ("block", "", "step", "time", "left", ""):
+        drawn.add_column(name, justify="right" if name in ("step", "time", "left") else "left")
+    for index, state in told.items():
+        times = [clock(s) if s is not None else "" for s in (so_far(state), seconds_left(state))]
+        silent = time.time() - state.heard
+        word = (state.error or "") if state.status == "failed" else f"silent for {clock(silent)}" * (silent > 60)
+        notes = "; ".join(filter(None, (word, *state.eased)))
+        bar = ProgressBar(max(1, state.steps), state.step, width=20)
+        drawn.add_row(str(index), bar, f"{state.step:,}/{state.steps:,}", *times, notes)
+    return drawn

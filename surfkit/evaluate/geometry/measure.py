@@ -1,0 +1,156 @@
+"""The geometry of a reconstruction, measured: figures for metrics.json, and files to look at."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.events import FileWritten, emit
+from surfkit.evaluate.geometry.chart import write_chart
+from surfkit.evaluate.geometry.class_pictures import write_classes
+from surfkit.evaluate.geometry.classes import class_figures, classify
+from surfkit.evaluate.geometry.comparison import Comparison, Outcome, compare
+from surfkit.evaluate.geometry.errors import LONGEST_PX, coloured, seen_by, write_cloud, write_plan, write_row
+from surfkit.evaluate.geometry.repetition import Draw
+from surfkit.evaluate.geometry.scores import chamfer, curve, shares
+from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.transform import apply, scale_of, write_transform
+from surfkit.evaluate.images.seams import Seams
+from surfkit.scene.crop import write_crop
+from surfkit.scene.scene import Frame, View
+
+REACH = 5
+"""Multiples of tau that the curve covers."""
+FAR = 20.0
+"""Multiples of tau above which distances do not count in the chamfer distance of DTU, by default."""
+PICTURES = 3
+"""Views that are drawn."""
+NAMES = ("precision", "recall", "f1")
+
+
+def measure_geometry(
+    files: tuple[Path, Path],
+    settings: Comparison,
+    out: Path,
+    views: Sequence[View] = (),
+    frame: Frame | None = None,
+    seams: Seams | None = None,
+) -> dict[str, Any]:
+    """Compare a mesh or cloud with the truth, write what there is to look at into a folder, and return the figures.
+
+    Args:
+        files: The reconstruction and the truth.
+        settings: How.
+        out: Gets crop.json, transform.txt, precision.ply, recall.ply, curve.png, plan.png and pictures of a few views
+            and of each class.
+        views: Training views; without any, the crop volume must be given.
+        frame: Of the views.
+        seams: Borders of blocks, to tell the places near them apart.
+
+    Raises:
+        BadInput: A file that cannot be used, or two that do not belong together.
+    """
+    reconstruction, truth = map(read_surface, files)
+    outcome = compare(reconstruction, truth, settings, views, frame)
+    found = figures(outcome, settings) | {"reconstruction": str(files[0]), "truth": str(files[1])}
+    write_files(out, outcome, settings)
+    if frame is not None:
+        write_views(out, outcome, views, frame)
+    if settings.classes:
+        classes = classify(outcome, settings, views, frame, seams)
+        found["classes"] = class_figures(classes, outcome.draws[0], outcome.tau)
+        write_classes(out, outcome, classes, views, frame)
+    return found
+
+
+def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
+    """Plain data: precision, recall and F1 with standard deviations, chamfer distances, alignments."""
+    tau = outcome.tau
+    each = [dict(zip(NAMES, shares(draw.distances, tau), strict=True)) for draw in outcome.draws]
+    means = {name: statistics.fmean(draw[name] for draw in each) for name in NAMES}
+    spread = {f"{name}_std": statistics.stdev(d[name] for d in each) if len(each) > 1 else None for name in NAMES}
+    first, far = outcome.draws[0], settings.far or FAR * tau
+    taus = np.linspace(0, REACH * tau, 4 * REACH + 1)
+    precision, recall = curve(first.distances, taus).T.tolist()
+    crop = outcome.crop
+    return {
+        **means,
+        **spread,
+        "tau": tau,
+        "tau_from": "given" if settings.tau else "spacing of the truth",
+        "align": settings.align,
+        "draws": each,
+        "alignments": {way: draw and _alignment(draw, outcome) for way, draw in outcome.others.items()},
+        "chamfer": chamfer(first.distances),
+        "chamfer_dtu": {**chamfer(first.distances, far), "far": far},
+        "points": {"reconstruction": len(first.reconstruction), "truth": len(first.truth)},
+        "crop": crop and {"from": settings.crop, "low": crop.low, "high": crop.high, "area": crop.area},
+        "truth_voxel": outcome.voxel,
+        "seen_points": outcome.seen,
+        "curve": {"tau": taus.tolist(), "precision": precision, "recall": recall},
+    }
+
+
+def _alignment(draw: Draw, outcome: Outcome) -> dict[str, Any]:
+    """One way of aligning: what it changed, how well it fits, and what it gives."""
+    found = draw.alignment
+    change = found.matrix @ np.linalg.inv(outcome.matrix)
+    turn = change[:3, :3] / scale_of(change)
+    middle = draw.truth.mean(0)
+    return {
+        "scale": scale_of(change),
+        "moved": float(np.linalg.norm(apply(change, middle[None])[0] - middle)),
+        "turned_degrees": float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))),
+        "residual": found.residual,
+        "matched": found.matched,
+        **dict(zip(NAMES, shares(draw.distances, outcome.tau), strict=True)),
+        "matrix": found.matrix.tolist(),
+    }
+
+
+def write_files(out: Path, outcome: Outcome, settings: Comparison) -> None:
+    """Write the crop volume, the transform, both clouds coloured by error, the curve and the plan."""
+    draw, tau = outcome.draws[0], outcome.tau
+    if outcome.crop is not None:
+        write_crop(out / "crop.json", outcome.crop)
+    write_transform(out / "transform.txt", draw.alignment.matrix)
+    write_cloud(out / "precision.ply", draw.reconstruction, draw.distances.to_truth, tau)
+    write_cloud(out / "recall.ply", draw.truth, draw.distances.to_reconstruction, tau)
+    taus = np.linspace(0, REACH * tau, 201)
+    precision, recall, f1 = shares(draw.distances, tau)
+    title = f"precision {precision:.3f}, recall {recall:.3f}, F1 {f1:.3f} at tau = {tau:.3g}"
+    write_chart(out / "curve.png", taus, curve(draw.distances, taus), tau, title)
+    write_plan(out / "plan.png", _parts(draw, tau), outcome.crop, settings.up or "z", tau)
+    for name in ("precision.ply", "recall.ply", "curve.png", "plan.png"):
+        emit(FileWritten(out / name, "geometry"))
+
+
+def _parts(draw: Draw, tau: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Both clouds with captions and colours."""
+    captions = (
+        f"reconstruction: blue within {tau:.3g} of the truth, orange to red wrong",
+        f"truth: blue within {tau:.3g} of the reconstruction, orange to red missing",
+    )
+    clouds = (draw.reconstruction, draw.truth)
+    distances = (draw.distances.to_truth, draw.distances.to_reconstruction)
+    return [(c, p, coloured(d, tau)) for c, p, d in zip(captions, clouds, distances, strict=True)]
+
+
+def write_views(out: Path, outcome: Outcome, views: Sequence[View], frame: Frame) -> None:
+    """Draw both clouds, coloured by error, as a few of the training views see them."""
+    draw, tau = outcome.draws[0], outcome.tau
+    back = np.linalg.inv(draw.alignment.matrix)
+    for i in range(min(PICTURES, len(views))):
+        view = views[(2 * i + 1) * len(views) // (2 * min(PICTURES, len(views)))]
+        camera = view.camera.sized(LONGEST_PX)
+        pose = frame.input_pose(camera.world_to_camera)
+        gap = tau / scale_of(draw.alignment.matrix)
+        parts = _parts(draw, tau)
+        images = [seen_by(camera, pose, apply(back, points), colors, gap) for _, points, colors in parts]
+        path = out / f"view{i}.png"
+        write_row(path, [caption for caption, _, _ in parts], images)
+        emit(FileWritten(path, "geometry"))

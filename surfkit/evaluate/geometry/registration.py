@@ -1,0 +1,98 @@
+"""Alignment of a reconstruction to the truth: three rounds of point-to-point ICP at shrinking distances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.evaluate.geometry.scores import WORKERS
+from surfkit.evaluate.geometry.transform import apply, fitted, scale_of
+
+ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
+"""Voxel and reach of each round, multiples of tau (the Tanks and Temples toolbox, whose last round thins by count)."""
+ITERATIONS = 20
+RESIZED = 2.0
+"""Factor of size at which a round gives up."""
+CHANGE = 1e-6
+"""Of the matched share and of the residual, as a share of it, at which a round is over."""
+MOST = 100_000
+"""Points of the reconstruction that are matched: many more than seven numbers need."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What ICP found.
+
+    Attributes:
+        matrix: (4, 4) from the frame of the reconstruction to that of the truth.
+        matched: Share of the points with a partner within the reach of the last round.
+        residual: Root mean square distance of those, in units of the truth; None without any.
+    """
+
+    matrix: np.ndarray
+    matched: float
+    residual: float | None
+
+    @property
+    def scale(self) -> float:
+        """By how much lengths change."""
+        return scale_of(self.matrix)
+
+
+Clouds = Callable[[float, np.ndarray], tuple[np.ndarray, object, np.ndarray]]
+"""For a voxel and the transform so far: (n, 3) points of the reconstruction in its own frame, and the truth as a search
+tree and as the (m, 3) points of it, each thinned and inside the crop volume."""
+
+
+def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool) -> Alignment:
+    """The reconstruction brought to the truth, from a start that is not far off.
+
+    Args:
+        clouds: What to compare.
+        start: (4, 4), such as the identity.
+        tau: Threshold that sets the distances of the rounds.
+        with_scale: Whether the size may change.
+    """
+    found = Alignment(start, 0.0, None)
+    for voxel, reach in ROUNDS:
+        source, there, target = clouds(voxel * tau, found.matrix)
+        if len(source) > MOST:
+            source = source[np.linspace(0, len(source) - 1, MOST).astype(np.int64)]
+        found = icp(source, there, target, Alignment(found.matrix, 0.0, None), reach * tau, with_scale)
+    return found
+
+
+def icp(
+    source: np.ndarray, there: object, target: np.ndarray, start: Alignment, reach: float, with_scale: bool
+) -> Alignment:
+    """One round: match each point with the nearest within reach, fit, and again, until nothing changes.
+
+    Args:
+        source: (n, 3) points of the reconstruction, in its own frame.
+        there: Search tree of the truth.
+        target: (m, 3) points of that tree.
+        start: Where to begin.
+        reach: Largest distance of a match.
+        with_scale: Whether the size may change.
+    """
+    found = start
+    for _ in range(ITERATIONS):
+        away, partner = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
+        near = np.isfinite(away)
+        residual = float(np.sqrt((away[near] ** 2).mean())) if near.any() else None
+        now = Alignment(found.matrix, float(near.mean()), residual)
+        settled = found.residual is not None and residual is not None
+        settled = settled and abs(now.matched - found.matched) < CHANGE
+        if settled and abs(residual - found.residual) < CHANGE * max(residual, found.residual):
+            return now
+        if near.sum() < 3 or residual == 0:
+            return now
+        matrix = fitted(source[near], target[partner[near]], with_scale)
+        if not 1 / RESIZED < np.cbrt(abs(np.linalg.det(matrix[:3, :3]))) / start.scale < RESIZED:
+            return now  # the two do not fit, and a smaller one is always nearer
+        found = Alignment(matrix, now.matched, now.residual)
+    away, _ = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
+    near = np.isfinite(away)
+    return Alignment(found.matrix, float(near.mean()), float(np.sqrt((away[near] ** 2).mean())) if near.any() else None)

@@ -1,0 +1,188 @@
+"""One repetition of a comparison: points drawn, aligned, cropped and thinned, and the distances between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.memory import size
+from surfkit.evaluate.geometry.registration import Alignment, align
+from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
+from surfkit.evaluate.geometry.scores import Distances, nearest, tree
+from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.thinning import thin, voxel_for
+from surfkit.evaluate.geometry.transform import apply
+from surfkit.evaluate.geometry.volume import said
+from surfkit.scene.crop import Crop
+from surfkit.scene.memory import free_bytes
+
+MOST = 4_000_000
+"""Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
+FOR_ICP = 400_000
+"""Points of the reconstruction that ICP thins and looks at: many more than seven numbers need."""
+LEAST = 10
+"""Points on either side without which shares mean nothing."""
+SAMPLE_BYTES = 200
+"""Memory for a point that is drawn from a mesh; as much again for one of the other side."""
+SMALL = 0.1
+"""Of the truth's extent: a reconstruction smaller than this has another unit."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """The reconstruction or the truth, from which points can be drawn.
+
+    Attributes:
+        surface: The file.
+        cloud: (n, 3) its points, thinned if there were too many; None for a mesh.
+        count: Points that a draw from a mesh has.
+        voxel: By which the cloud was thinned, or None.
+    """
+
+    surface: Surface
+    cloud: np.ndarray | None
+    count: int
+    voxel: float | None = None
+
+    def points(self, draw: np.random.Generator) -> np.ndarray:
+        """(n, 3) float64: of a mesh, new ones with every draw."""
+        return sample_surface(self.surface, self.count, draw) if self.cloud is None else self.cloud
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One repetition of the measurement.
+
+    Attributes:
+        reconstruction: (n, 3) points inside the crop volume, thinned, frame of the truth.
+        truth: (m, 3) likewise.
+        distances: Between them.
+        alignment: By which they were brought together.
+    """
+
+    reconstruction: np.ndarray
+    truth: np.ndarray
+    distances: Distances
+    alignment: Alignment
+
+
+def cloud_side(surface: Surface, voxel: float | None) -> Side:
+    """A cloud that is read, and thinned, now; larger ones than `MOST` also if no voxel is given."""
+    if voxel is None and len(surface) <= MOST:
+        return Side(surface, np.concatenate(list(surface.blocks())), len(surface))
+    if voxel is None:
+        voxel = voxel_for(surface.blocks, MOST)
+        emit(Warned(f"{surface.path}: {len(surface)} points, thinned to one in each voxel of {voxel:.3g}"))
+    cloud = thin(surface.blocks(), voxel, next(block[0] for block in surface.blocks() if len(block)))
+    return Side(surface, cloud, len(cloud), voxel)
+
+
+def mesh_side(surface: Surface, count: int | None, tau: float) -> Side:
+    """A mesh, of which as many points are drawn as it has vertices and faces, as the paper does.
+
+    A coarse mesh gets more, so that they lie no further apart than 0.7 tau: right surfaces would count as missing.
+    """
+    if count is None:
+        needed = int(2 * float(face_areas(surface).sum()) / tau**2) + 1
+        count = max(len(surface) + len(surface.faces), min(needed, MOST))
+        if count < needed:
+            emit(
+                Warned(
+                    f"{surface.path}: its {count} samples lie further apart than 0.7 times tau ({tau:.3g}), so right "
+                    f"surfaces count as missing; give a larger --tau, or --samples {needed}"
+                )
+            )
+    free = free_bytes()
+    if count * SAMPLE_BYTES > free:
+        raise BadInput(
+            f"{surface.path}: {count:,} samples take {size(count * SAMPLE_BYTES)}, and {size(free)} are free; give "
+            f"--samples {max(LEAST, free // SAMPLE_BYTES // 2)} or less"
+        )
+    return Side(surface, None, count)
+
+
+class Measurement:
+    """One repetition: its random points and lattice, and what is computed from them.
+
+    Args:
+        ours: The reconstruction.
+        theirs: The truth.
+        crop: Volume, or None.
+        tau: Threshold; points are thinned to half of it.
+        draw: Of the points and of where the lattice of voxels begins.
+    """
+
+    def __init__(self, ours: Side, theirs: Side, crop: Crop | None, tau: float, draw: np.random.Generator) -> None:
+        self.crop, self.tau, self.paths = crop, tau, (ours.surface.path, theirs.surface.path)
+        self.source = ours.points(draw)
+        target = theirs.points(draw)
+        self.target = self.cropped(target)
+        self.spans = said(self.source), said(target)
+        self.offset = draw.random(3)
+        self.targets = cache(self._target)
+
+    def cropped(self, points: np.ndarray) -> np.ndarray:
+        """Those in the crop volume, of (n, 3) points in the frame of the truth."""
+        return points if self.crop is None else points[self.crop.inside(points)]
+
+    def thinned(self, points: np.ndarray, voxel: float) -> np.ndarray:
+        """(m, 3) of (n, 3) points in the frame of the truth."""
+        return thin([points], voxel, self.target[0] - self.offset * voxel)
+
+    def _target(self, voxel: float) -> tuple[object, np.ndarray]:
+        points = self.thinned(self.target, voxel)
+        return tree(points), points
+
+    def clouds(self, voxel: float, matrix: np.ndarray) -> tuple[np.ndarray, object, np.ndarray]:
+        """What a round of ICP compares (`registration.Clouds`)."""
+        few = self.source[:: max(1, len(self.source) // FOR_ICP)]
+        moved = self.thinned(self.cropped(apply(matrix, few)), voxel)
+        return apply(np.linalg.inv(matrix), moved), *self.targets(voxel)
+
+    def draw(self, start: np.ndarray, way: str) -> Draw | None:
+        """Align in one way, and compare; None where that leaves too few points to compare."""
+        found = Alignment(start, 0.0, None)
+        if way != "none":
+            found = align(self.clouds, start, self.tau, with_scale=way == "similarity")
+        ours = self.thinned(self.cropped(apply(found.matrix, self.source)), self.tau / 2)
+        there, theirs = self.targets(self.tau / 2)
+        if min(len(ours), len(theirs)) < LEAST:
+            return None
+        distances = Distances(nearest(there, ours), nearest(tree(ours), theirs))
+        if way == "none":
+            near = distances.to_truth[distances.to_truth < 2 * self.tau]
+            residual = float(np.sqrt((near**2).mean())) if len(near) else None
+            found = Alignment(start, len(near) / len(ours), residual)
+        return Draw(ours, theirs, distances, found)
+
+    def refuse_strangers(self, matrix: np.ndarray) -> None:
+        """BadInput if the two cannot lie in one frame."""
+        moved = self.cropped(apply(matrix, self.source))
+        places = f"the reconstruction spans {self.spans[0]}, the truth {self.spans[1]}"
+        remedy = "if frames or units differ, give --transform; if the crop volume is wrong, --crop"
+        for points, what, path in zip((moved, self.target), ("reconstruction", "truth"), self.paths, strict=True):
+            if len(points) < LEAST:
+                where = "in all" if self.crop is None else "inside the crop volume"
+                raise BadInput(f"{path}: {len(points)} points of the {what} {where}; {places}; {remedy}")
+        sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (moved, self.target)]
+        if sizes[0] < SMALL * sizes[1]:
+            raise BadInput(
+                f"{self.paths[0]}: where they are compared, the reconstruction is {sizes[0]:.3g} across and the truth "
+                f"{sizes[1]:.3g}: another unit? {places}; {remedy}"
+            )
+        gap = np.maximum(moved.min(0) - self.target.max(0), self.target.min(0) - moved.max(0)).max()
+        if gap > 80 * self.tau:
+            raise BadInput(
+                f"{self.paths[1]}: the truth lies {gap:.3g} away from the reconstruction: {places}; {remedy}"
+            )
+
+
+def refuse_few(points: np.ndarray, path: Path) -> None:
+    """BadInput if shares of so few points would mean nothing."""
+    if len(points) < LEAST:
+        raise BadInput(f"{path}: {len(points)} points; {LEAST} or more are needed to compare with")

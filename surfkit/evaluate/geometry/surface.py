@@ -1,0 +1,172 @@
+"""Meshes and clouds of points from files, however large: positions stay on disk until a block of them is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.optional import needed
+from surfkit.export.ply import TYPES, read_vertices
+from surfkit.readers.sparse_ply import read_points
+
+BLOCK = 1 << 20
+"""Points in memory at a time."""
+CORNERS = ("vertex_indices", "vertex_index")
+"""Names that PLY files give to the corners of a face."""
+
+Blocks = Callable[[], Iterator[np.ndarray]]
+"""Begins anew with every call: (n, 3) float64 positions, block by block."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a file holds: a mesh, or a cloud of points.
+
+    Attributes:
+        path: The file.
+        rows: (V,) records with fields x, y, z, which may lie on disk, or a plain (V, 3) array.
+        faces: (F, 3) rows of the corners; None for a cloud.
+    """
+
+    path: Path
+    rows: np.ndarray
+    faces: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def vertices(self, part: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """(n, 3) float64 of all vertices, or of some."""
+        if self.rows.dtype.names is None:
+            return np.asarray(self.rows[part], np.float64)
+        rows = self.rows[part]
+        return np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """(n, 3) float64 finite positions of the vertices, block by block."""
+        for start in range(0, len(self), BLOCK):
+            block = self.vertices(slice(start, start + BLOCK))
+            yield block[np.isfinite(block).all(1)]
+
+
+def read_surface(path: Path) -> Surface:
+    """The mesh or cloud in a file: PLY read here, block by block; OBJ, STL, GLB, OFF and text PLY meshes by trimesh.
+
+    Points that are not finite are left out, with a warning, and so are faces at such vertices.
+
+    Raises:
+        BadInput: No such file, damaged, without points, or a mesh without faces.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path}: no such file; name a mesh or a cloud of points")
+    found = _ply(path) if path.suffix.lower() == ".ply" else _other(path)
+    if not len(found):
+        raise BadInput(f"{path}: no points in it; write the file again")
+    if found.faces is not None and not len(found.faces):
+        raise BadInput(f"{path}: a mesh without faces, so there is no surface to measure; make the mesh again")
+    return _sound(found)
+
+
+def _ply(path: Path) -> Surface:
+    lines = _header(path)
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element face ")), None)
+    if "format binary_little_endian 1.0" in lines:
+        rows, _ = read_vertices(path)
+        if not {"x", "y", "z"} <= set(rows.dtype.names or ()):
+            raise BadInput(f"{path}: its points lack x, y or z; write the file again")
+        return Surface(path, rows, None if count is None else _faces(path, lines, rows, count))
+    if count is None:
+        return Surface(path, read_points(path)[0])
+    return _other(path)
+
+
+def _header(path: Path) -> list[str]:
+    """Lines of a PLY header; that it ends is for `read_vertices` to check."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(1 << 16)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    if not head.startswith(b"ply"):
+        raise BadInput(f"{path}: no PLY file: it does not begin with 'ply'")
+    text = head.partition(b"end_header")[0].decode("ascii", "replace")
+    lines = [" ".join(line.split()) for line in text.replace("\r", "\n").split("\n")]
+    for line in lines:
+        if line.startswith("element ") and not (len(line.split()) == 3 and line.split()[2].isdecimal()):
+            raise BadInput(f"{path}: cannot read {line!r} in the PLY header; write the file again")
+    return lines
+
+
+def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.ndarray:
+    """(F, 3) corners, mapped from a binary file whose faces come after its vertices."""
+    elements = [line.split()[1] for line in lines if line.startswith("element ")]
+    if elements[1] != "face":
+        raise BadInput(f"{path}: element {elements[1]!r} lies before the faces; write vertices, then faces")
+    begun = lines.index(f"element face {count}") + 1
+    ends = [i for i, line in enumerate(lines) if i > begun and line.startswith("element ")]
+    fields: list[tuple] = []
+    for words in (line.split() for line in lines[begun : ends[0] if ends else None] if line.startswith("property ")):
+        if words[1] == "list" and len(words) == 5 and words[4] in CORNERS and {words[2], words[3]} <= TYPES.keys():
+            fields += [("size", "<" + TYPES[words[2]]), ("corners", "<" + TYPES[words[3]], (3,))]
+        elif len(words) == 3 and words[1] in TYPES:
+            fields.append((words[2], "<" + TYPES[words[1]]))
+        else:
+            raise BadInput(f"{path}: cannot read {' '.join(words)!r} of a face; leave it out of the file")
+    dtype = np.dtype(fields)
+    if "corners" not in (dtype.names or ()):
+        raise BadInput(f"{path}: its faces have no {CORNERS[0]}; write the file again")
+    if not count:
+        return np.empty((0, 3), np.int32)
+    start = (rows.offset + rows.nbytes) if isinstance(rows, np.memmap) else 0
+    size = path.stat().st_size
+    if not start or size - start < count * dtype.itemsize:
+        raise BadInput(
+            f"{path}: not {count} triangles in it: it is cut off, or has faces of other kinds; triangulate it"
+        )
+    mapped = np.memmap(path, dtype, "r", start, (count,))
+    if (mapped["size"] != 3).any():
+        raise BadInput(f"{path}: has faces with more or fewer than 3 corners; triangulate it")
+    return mapped["corners"]
+
+
+def _other(path: Path) -> Surface:
+    with needed("trimesh", f"{path}: a file that is not binary PLY"):
+        import trimesh
+    try:
+        loaded = trimesh.load(path, process=False)
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_geometry()
+    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
+        raise BadInput(f"{path}: cannot be read as a mesh or cloud: {' '.join(str(error).split())}") from error
+    vertices, faces = getattr(loaded, "vertices", None), getattr(loaded, "faces", None)
+    if vertices is None:
+        raise BadInput(f"{path}: no mesh and no cloud of points in it")
+    return Surface(path, np.asarray(vertices, np.float64), None if faces is None else np.asarray(faces))
+
+
+def _sound(found: Surface) -> Surface:
+    """The same without what is not finite, told by a warning; faces must name vertices that are there."""
+    starts = range(0, len(found), BLOCK)
+    good = [np.isfinite(found.vertices(slice(start, start + BLOCK))).all(1) for start in starts]
+    bad = len(found) - sum(int(part.sum()) for part in good)
+    if bad == len(found):
+        raise BadInput(f"{found.path}: none of its {bad} points is finite; write the file again")
+    faces = found.faces
+    if faces is not None:
+        low, high = int(faces.min()), int(faces.max())
+        if low < 0 or high >= len(found):
+            raise BadInput(
+                f"{found.path}: a face names vertex {high if low >= 0 else low} of {len(found)}; write it again"
+            )
+    if bad:
+        emit(Warned(f"{found.path}: {bad} of {len(found)} points are not finite and are left out"))
+    if bad and faces is not None:
+        faces = faces[np.concatenate(good)[faces].all(1)]
+        if not len(faces):
+            raise BadInput(f"{found.path}: no face with finite corners; make the mesh again")
+    return Surface(found.path, found.rows, faces)

@@ -1,0 +1,79 @@
+"""The crop volume that the photographs allow: where enough of them show the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.evaluate.geometry.outline import outline
+from surfkit.evaluate.geometry.scores import surface_gap, tree
+from surfkit.evaluate.geometry.transform import apply, scale_of
+from surfkit.evaluate.geometry.visibility import visible_counts
+from surfkit.scene.crop import PLANES, Axis, Crop
+from surfkit.scene.scene import Frame, View
+
+RADIUS = 0.02
+"""Of the alpha shape, as a share of the diagonal of the visible ground: half of the paper's 50 m on a square kilometre,
+as holes are filled here."""
+
+
+@dataclass(frozen=True)
+class Enough:
+    """What a point must be seen by to count, and what the volume around such points is.
+
+    Attributes:
+        share: Of the views.
+        axis: That stands on the ground.
+        radius: Of the alpha shape, units of the truth; a share of the diagonal if None.
+        margin: Added below and above, so that noise on the lowest ground is not cut off.
+    """
+
+    share: float
+    axis: Axis
+    radius: float | None
+    margin: float
+
+
+def visible_crop(
+    truth: np.ndarray, views: Sequence[View], frame: Frame, matrix: np.ndarray, enough: Enough
+) -> tuple[Crop, int]:
+    """The volume around the points of the truth that enough views show, and how many points that are.
+
+    Args:
+        truth: (n, 3) frame of the truth.
+        views: Training views.
+        frame: Of the views.
+        matrix: (4, 4) from the input frame of the views to that of the truth.
+        enough: What is enough.
+    """
+    here = apply(np.linalg.inv(matrix), truth)
+    gap = surface_gap(tree(truth), truth[:: max(1, len(truth) // 100_000)]) / scale_of(matrix)
+    counts = visible_counts(here, views, frame, gap)
+    least = max(1, math.ceil(enough.share * len(views)))
+    kept = truth[counts >= least]
+    if len(kept) < 3:
+        raise BadInput(
+            f"--crop auto: {len(kept)} of {len(truth)} points of the truth are seen by {least} or more of {len(views)} "
+            f"views (the best one by {counts.max(initial=0)}); the truth spans {said(here)}, for the "
+            f"cameras, and these {said(centres(views, frame))}: lower --visible, or give --transform if "
+            "the truth is in another frame or unit"
+        )
+    along = kept[:, "xyz".index(enough.axis)]
+    ground = kept[:, list(PLANES[enough.axis])]
+    radius = enough.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
+    low, high = float(along.min()) - enough.margin, float(along.max()) + enough.margin
+    return Crop(outline(ground, radius), low, high, enough.axis), len(kept)
+
+
+def centres(views: Sequence[View], frame: Frame) -> np.ndarray:
+    """(V, 3) float64 places of the cameras, input frame."""
+    return frame.to_input(np.stack([view.camera.centre.numpy() for view in views]))
+
+
+def said(points: np.ndarray) -> str:
+    """The box of (n, 3) points in a few words."""
+    return " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in zip(points.min(0), points.max(0), strict=True))

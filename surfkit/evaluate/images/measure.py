@@ -1,0 +1,169 @@
+"""How close renders come to photographs that training has not seen, and how fast they are drawn."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import PhotoSkipped, emit
+from surfkit.evaluate.images.lpips import Perceptual
+from surfkit.raster.api import Maps
+from surfkit.raster.ssim import ssim, ssim_map
+from surfkit.scene.scene import View
+
+Draw = Callable[[View], Maps]
+"""Renders a view."""
+
+Show = Callable[[View, Tensor, Maps], None]
+"""Gets a view, its photograph as (3, H, W) uint8 and its render."""
+
+SMALLEST = 1e-10
+"""Mean squared error at which PSNR ends, at 100 dB: equal images have a PSNR that JSON can hold."""
+
+
+class Pictures(Protocol):
+    """Photographs by the position of their view."""
+
+    def __getitem__(self, at: int, /) -> Tensor:
+        """(3, H, W) uint8."""
+
+
+def psnr(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB for a peak of 1, at most 100.
+
+    Args:
+        render: (3, H, W), clamped to [0, 1] first, as a screen shows it.
+        photo: (3, H, W) in [0, 1].
+        mask: (H, W) bool, False where pixels do not count.
+    """
+    errors = (render.clamp(0, 1).double() - photo.double()).square()
+    error = errors.mean() if mask is None else errors[:, mask].mean()
+    return float(-10 * error.clamp_min(SMALLEST).log10())
+
+
+def similarity(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
+    """Mean structural similarity of (3, H, W) images in [0, 1].
+
+    With a mask (H, W), the mean over the windows around pixels that count, in which the others are alike.
+    """
+    if mask is None:
+        return float(ssim(render, photo))
+    return float(ssim_map(render, torch.where(mask, photo, render))[:, mask].mean())
+
+
+def color_corrected(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The render after the affine change of colour that brings it closest to the photograph, both (3, H, W).
+
+    For photographs of changing exposure: what a held-out one's own exposure was is not known from training. With a
+    mask (H, W) bool, only pixels where it is True decide.
+    """
+    colors, wanted = render.flatten(1).double().T, photo.flatten(1).double().T
+    inputs = torch.cat([colors, torch.ones_like(colors[:, :1])], 1)
+    known = slice(None) if mask is None else mask.flatten()
+    damped = inputs[known].T @ inputs[known] + 1e-9 * torch.eye(4).to(inputs)  # one colour has no unique answer
+    change = torch.linalg.solve(damped, inputs[known].T @ wanted[known])
+    return (inputs @ change).T.reshape(render.shape).to(render)
+
+
+def evaluate_views(
+    views: Sequence[View],
+    photos: Pictures,
+    draw: Draw,
+    *,
+    timed: Draw | None = None,
+    show: Show | None = None,
+    correct_color: bool = False,
+    masks: Sequence[Tensor | None] | None = None,
+    networks: Sequence[Perceptual] = (),
+) -> dict[str, Any]:
+    """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
+
+    A photograph that cannot be read is left out, and `PhotoSkipped` tells so.
+
+    Args:
+        views: Held-out views.
+        photos: By position in `views`.
+        draw: Makes the renders that are measured and shown.
+        timed: Makes the renders whose speed counts, where it is not `draw`: colours only, for one.
+        show: Called once a view, to write pictures.
+        correct_color: Also measure "psnr_corrected", of `color_corrected` renders.
+        masks: Which pixels count, by position in `views`; a view without any is shown but not measured.
+        networks: Of LPIPS: also measure "lpips_NET" as defined, and "lpips_NET_unscaled" as the published tables of
+            Gaussian splatting have it.
+    """
+    per_image = {}
+    for at, view in enumerate(views):
+        try:
+            photo = photos[at]
+        except BadInput as error:
+            emit(PhotoSkipped(view.name, str(error)))
+            continue
+        maps, mask = draw(view), None if masks is None else masks[at]
+        if mask is None or mask.any():
+            render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
+            per_image[view.name] = _measured(render, target, mask, correct_color)
+            per_image[view.name] |= perceived(networks, render, target, mask)
+        if show is not None:
+            show(view, photo, maps)
+    names = ("psnr", "ssim", *["psnr_corrected"] * correct_color, *lpips_names(networks))
+    means = {name: _mean([values[name] for values in per_image.values()]) for name in names}
+    return {"images": {**means, "per_image": per_image}, "fps": frames_per_second(views, timed or draw)}
+
+
+def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color: bool) -> dict[str, float]:
+    mask = None if mask is None else mask.to(render.device)
+    found = {"psnr": psnr(render, photo, mask), "ssim": similarity(render, photo, mask)}
+    if correct_color:
+        found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)
+    return found
+
+
+def perceived(
+    networks: Sequence[Perceptual], render: Tensor, photo: Tensor, mask: Tensor | None = None
+) -> dict[str, float]:
+    """LPIPS of (3, H, W) images in [0, 1], as defined and unscaled, by name of the measure."""
+    return {
+        name: network.distance(render, photo, mask, unscaled)
+        for network in networks
+        for unscaled, name in zip((False, True), lpips_names([network]), strict=True)
+    }
+
+
+def lpips_names(networks: Sequence[Perceptual]) -> list[str]:
+    """Names of what networks measure."""
+    return [f"lpips_{network.net}{end}" for network in networks for end in ("", "_unscaled")]
+
+
+def frames_per_second(views: Sequence[View], draw: Draw, warmup: int = 2, most: int = 20) -> float | None:
+    """Frames a second of the median render, after `warmup` renders that do not count; None without views.
+
+    Args:
+        views: At most `most` of them are drawn, evenly chosen.
+        draw: Makes the renders.
+        warmup: Renders before the clock starts.
+        most: Renders that count.
+    """
+    if not views:
+        return None
+    chosen = [views[i * len(views) // min(most, len(views))] for i in range(min(most, len(views)))]
+    for i in range(warmup):
+        _seconds(chosen[i % len(chosen)], draw)
+    return 1 / statistics.median(_seconds(view, draw) for view in chosen)
+
+
+def _seconds(view: View, draw: Draw) -> float:
+    start = time.perf_counter()
+    maps = draw(view)
+    if maps.color.is_cuda:
+        torch.cuda.synchronize(maps.color.device)
+    return time.perf_counter() - start
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return statistics.fmean(values) if values else None

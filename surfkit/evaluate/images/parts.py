@@ -1,0 +1,93 @@
+"""PSNR and SSIM over parts of held-out photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import PhotoSkipped, emit
+from surfkit.evaluate.images.measure import Draw, psnr, similarity
+from surfkit.evaluate.images.seen import Sight
+
+Masks = dict[str, Tensor]
+"""(H, W) bool of each part, by its name."""
+FEWEST = 64
+"""Pixels of a photograph that a figure is taken of."""
+
+
+def measure_parts(
+    found: Iterable[Sight],
+    parts: Callable[[Sight], Masks],
+    draw: Draw,
+    photo_of: Callable[[Sight], Tensor],
+    mask_of: Callable[[Sight], Tensor | None],
+) -> dict[str, dict[str, Any]]:
+    """PSNR and SSIM of each part, as means over photographs that count by their pixels in it, and its share of all.
+
+    A photograph that cannot be read is left out, and `PhotoSkipped` tells so.
+
+    Args:
+        found: What the photographs show.
+        parts: Which pixels belong to which part.
+        draw: Makes the renders.
+        photo_of: (3, H, W) uint8.
+        mask_of: Which pixels count at all, (H, W) bool, or None for all.
+    """
+    sums: dict[str, dict[str, float]] = {}
+    total = 0
+    for sight in found:
+        try:
+            photo = photo_of(sight)
+        except BadInput as error:
+            emit(PhotoSkipped(sight.view.name, str(error)))
+            continue
+        keep = mask_of(sight)
+        render = draw(sight.view).color.cpu().clamp(0, 1)
+        target = photo.to(render) / 255
+        total += target[0].numel() if keep is None else int(keep.sum())
+        for name, mask in parts(sight).items():
+            mask = mask if keep is None else mask & keep
+            into = sums.setdefault(name, {"pixels": 0, "counted": 0, "psnr": 0.0, "ssim": 0.0})
+            into["pixels"] += (count := int(mask.sum()))
+            if count >= FEWEST:
+                into["counted"] += count
+                into["psnr"] += count * psnr(render, target, mask)
+                into["ssim"] += count * similarity(render, target, mask)
+    return {name: _means(one, total) for name, one in sums.items()}
+
+
+def _means(sums: dict[str, float], total: int) -> dict[str, float | None]:
+    counted = sums["counted"]
+    figures = {name: sums[name] / counted if counted else None for name in ("psnr", "ssim")}
+    return {**figures, "share": sums["pixels"] / max(1, total)}
+
+
+def by_views(least: tuple[int, ...]) -> Callable[[Sight], Masks]:
+    """Parts seen by so many training views or more, and by fewer, for each of some numbers."""
+
+    def parts(sight: Sight) -> Masks:
+        found = {}
+        for number in least:
+            enough = sight.full(sight.counts >= number)
+            found |= {f"{number}": enough, f"<{number}": ~enough}
+        return found
+
+    return parts
+
+
+def by_seams(near: Callable[[Sight], Tensor]) -> Callable[[Sight], Masks]:
+    """Parts near the borders of blocks and elsewhere; pixels that show no place are in neither.
+
+    Args:
+        near: (h, w) bool of a photograph's places.
+    """
+
+    def parts(sight: Sight) -> Masks:
+        known, close = torch.isfinite(sight.places[..., 0]), near(sight)
+        return {"near": sight.full(known & close), "elsewhere": sight.full(known & ~close)}
+
+    return parts

@@ -1,0 +1,14 @@
+"""Who does the work on the blocks of a large scene."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+from surfkit.execute.base import Inline, Pool
+from surfkit.execute.ray import Ray
+from surfkit.execute.slurm import Slurm
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """What this folder offers."""
+    return {"inline": Inline, "pool": Pool, "ray": Ray, "slurm": Slurm}

@@ -1,0 +1,33 @@
+// The one native extension. Each folder with kernels brings its own part of it, in its cpu/bind.cpp.
+#include <nanobind/nanobind.h>
+
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
+namespace surfkit {
+
+void add_raster(nanobind::module_& m);
+void add_mesh(nanobind::module_& m);
+void add_stereo(nanobind::module_& m);
+
+namespace {
+
+// Every step frees and takes the same buffers of some 10 to 100 MB. By default glibc gives each back to the system, which
+// clears its pages anew: a sixth of the CPU time of a training.
+void keep_freed_memory() {
+#if defined(__GLIBC__)
+    if (!mallopt(M_MMAP_THRESHOLD, 1 << 30)) mallopt(M_MMAP_THRESHOLD, 32 << 20);
+    mallopt(M_TRIM_THRESHOLD, 256 << 20);
+#endif
+}
+
+}  // namespace
+}  // namespace surfkit
+
+NB_MODULE(_native, m) {
+    surfkit::keep_freed_memory();
+    surfkit::add_raster(m);
+    surfkit::add_mesh(m);
+    surfkit::add_stereo(m);
+}

@@ -1,0 +1,338 @@
+"""Estimated depth of the training photographs, in the units of the scene, for the depth loss."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.readers.data import Data
+from surfkit.readers.depth_files import DepthFile, find_maps, normal_path, read_record
+from surfkit.readers.made_maps import located
+from surfkit.readers.read import model_folder, observations
+from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
+from surfkit.scene.cache import Cache
+from surfkit.scene.observations import Observations
+from surfkit.scene.scene import Scene, View
+from surfkit.scene.vectors import unit
+
+UNITS = 1.25
+"""A map in input units that is off by a larger factor from the sparse points is in other units."""
+EDGE = 0.05
+"""Neighbours whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
+TRUSTED = 0.5
+"""Pixels of a higher confidence count as trusted."""
+HARDLY = 0.02
+"""Where a smaller share of all pixels is trusted, something is wrong with what the maps were made from."""
+OFF = "what needs them is off, such as the losses depth and normal-prior"
+"""What becomes of a run without depth priors."""
+WITH_NORMALS = "estimator:patch-match"
+"""Words that have normals estimated too."""
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What is known beforehand of the depth of a photograph.
+
+    Attributes:
+        inverse: (H, W) float32 inverse camera z, 1/local units; 0 where there is none.
+        confidence: (H, W) float32 in [0, 1]; 0 where there is none.
+        typical: Inverse depth that is typical of the data set, 1/local units.
+        normal: (3, H, W) float32 unit normals of the surface in the camera's axes, towards the camera; 0 where there is
+            none. None where the data set has no normals.
+    """
+
+    inverse: Tensor
+    confidence: Tensor
+    typical: float
+    normal: Tensor | None = None
+
+
+Priors = Cache["DepthPrior | None"]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the depth maps of a data set become inverse depths, whichever of its photographs are trained on.
+
+    Attributes:
+        typical: See `DepthPrior`.
+        fits: Scale and offset of the map of each training photograph that has one which can be used, by name.
+    """
+
+    typical: float
+    fits: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units.
+
+    `trusted` is the share of its pixels that are, if that was looked at.
+    """
+
+    file: DepthFile
+    scale: float
+    offset: float
+    trusted: float = 1.0
+
+
+def prior_cache(
+    views: Sequence[View],
+    fits: Sequence[Fit | None],
+    typical: float,
+    budget_bytes: int | None = None,
+    normals: bool = False,
+) -> Priors:
+    """The priors of training views by position, as `fits` says how to read them; with normals if there are any."""
+
+    def read(at: int) -> DepthPrior | None:
+        fit = fits[at]
+        return None if fit is None else _read(views[at], fit, typical, normals)
+
+    each = prior_bytes(normals)
+    sizes = [each * v.camera.width * v.camera.height if f else 0 for v, f in zip(views, fits, strict=True)]
+    return Cache(read, sizes, budget_bytes, opened=_unpacked)
+
+
+def prior_bytes(normals: bool) -> int:
+    """What a prior takes for each pixel in a cache: float32 for depth and confidence, int8 for normals."""
+    return 8 + 3 * normals
+
+
+def _unpacked(prior: DepthPrior | None) -> DepthPrior | None:
+    """A prior whose normals are unit vectors again."""
+    if prior is None or prior.normal is None:
+        return prior
+    return replace(prior, normal=unit(prior.normal.to(torch.float32)))
+
+
+def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
+    size = (view.camera.height, view.camera.width)
+    try:
+        inverse = torch.from_numpy(fit.file.read()) * fit.scale + fit.offset
+        confidence = fit.file.read_confidence()
+        normal = fit.file.read_normal() if normals else None
+    except BadInput as error:
+        raise BadInput(f"{fit.file.path}: {error}") from error
+    if normal is not None:
+        normal = _nearest(torch.from_numpy(np.array(normal)), size)
+    inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
+    there = (inverse > 0).to(torch.float32)
+    if confidence is None:
+        return DepthPrior(inverse, there, typical, normal)
+    grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
+    return DepthPrior(inverse, grown * there, typical, normal)
+
+
+def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """(3, H, W) of (3, h, w) of any type: the value of the pixel in whose place the middle of each one lies."""
+    rows, columns = (
+        ((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new)).long().clamp_max(old - 1)
+        for new, old in zip(size, values.shape[1:], strict=True)
+    )
+    return values[:, rows][:, :, columns]
+
+
+def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
+    """The depth map of each training photograph that has one, by name: of the data set, or made for it."""
+    names = [view.name for view in scene.train]
+    if data.priors is not None:
+        return find_maps(folder := located(data.priors), folder, names)
+    return find_maps(data.path, model_folder(data), names, scene.frame.metres)
+
+
+def read_priors(
+    data: Data,
+    scene: Scene,
+    budget_bytes: int | None = None,
+    known: Alignment | None = None,
+    normals: bool = False,
+) -> Priors | None:
+    """The depth priors of a data set; None where there are none.
+
+    Args:
+        data: The data set.
+        scene: That `read` gave for it, or some of its photographs.
+        budget_bytes: Memory to keep them in; None keeps all.
+        known: How they are aligned, where the scene has only some of the photographs; see `alignment` for None.
+        normals: Whether to read their normals too, where there are any.
+    """
+    known = known or alignment(data, scene, normals)
+    if not any(view.name in known.fits for view in scene.train):
+        return None
+    maps = prior_files(data, scene)
+    lost = [view.name for view in scene.train if view.name in known.fits and view.name not in maps]
+    if lost:
+        again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it anew"
+        raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
+    fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
+    return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
+
+
+def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
+    """How the depth maps of a data set fit its sparse points, and a warning where there are none.
+
+    Photographs without a map, or with one that cannot be used, are listed in one warning; where `normals` are wanted
+    too, another one tells that there are none.
+    """
+    maps = prior_files(data, scene)
+    if not maps:
+        remedy = f"; {how_to_make(data, normals)}" if data.priors is None else ""
+        emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
+        return Alignment(0.0, {})
+    tracks = observations(data, scene)
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
+    fits = [answer if isinstance(answer, Fit) else None for answer in answers]
+    reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
+    for at in _outliers(fits):
+        reasons[scene.train[at].name] = "its scale is far from that of the other images"
+        fits[at] = None
+    if not any(fits):
+        emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {listed(reasons)}"))
+        return Alignment(0.0, {})
+    if reasons:
+        emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
+    _warn_of_leaks(data, scene)
+    if text := untrusted(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
+        emit(Warned(text))
+    found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
+    if normals and (text := lacking_normals(data, [maps[name] for name in found])):
+        emit(Warned(text))
+    return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
+
+
+def untrusted(share: float) -> str | None:
+    """What to tell of depth maps of which a share of the pixels is trusted; None where that is enough."""
+    if share >= HARDLY:
+        return None
+    causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
+    return f"only {share:.1%} of the pixels of the depth maps are trusted; see whether the photographs {causes}"
+
+
+def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:
+    """A map (h, w) at another size (H, W), smooth on surfaces and sharp between them; 0 stays 0."""
+    if inverse.shape == size:
+        return inverse
+    smaller = size[0] < inverse.shape[0]
+    near = interpolate(inverse[None, None], size, mode="nearest-exact")[0, 0]
+    there = (inverse > 0).to(inverse.dtype)
+    both = torch.stack([inverse, there])[None]
+    smooth, full = interpolate(both, size, mode="area" if smaller else "bilinear")[0]
+    one_surface = (full == 1) & ((smooth - near).abs() < EDGE * near)
+    return torch.where(one_surface, smooth, near)
+
+
+def typical_inverse_depth(views: Sequence[View], observations: Observations, scene: Scene) -> float:
+    """The median over views of the median inverse depth of their sparse points, 1/local units."""
+    medians = [np.median(c) for view in views for c in [observations.of(view, MAX_ERROR_PX)[1]] if len(c)]
+    if medians:
+        return float(np.median(medians))
+    xyz = scene.cloud.xyz.to(torch.float64)  # a model without tracks: every point that is before a camera
+    some = views[:: max(1, len(views) // 100)]
+    depths = torch.cat([xyz @ view.camera.world_to_camera[2, :3] + view.camera.world_to_camera[2, 3] for view in some])
+    return float((1 / depths[depths > 0]).median())
+
+
+def listed(reasons: Mapping[str, str]) -> str:
+    """Names by reason, in one line."""
+    groups: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        groups.setdefault(reason, []).append(name)
+    return "; ".join(f"{reason}: {', '.join(names)}" for reason, names in groups.items())
+
+
+def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene) -> Fit | str:
+    """How the map of a view becomes inverse depth, or why it cannot."""
+    if file is None:
+        return "no map"
+    try:
+        values = file.read()
+        confidence, normal = file.read_confidence(), file.read_normal()
+        _check_map(values, view)
+        _check_beside(values, {"confidence": confidence, "normals": normal})
+        trusted = 1.0 if confidence is None else float((confidence > TRUSTED).mean())
+        at, inverse = observations.of(view, MAX_ERROR_PX)
+        values = sample(values, at)
+        if not file.aligned:
+            return Fit(file, *align(values, inverse), trusted)
+        _check_units(values / scene.frame.scale, inverse)
+        return Fit(file, 1 / scene.frame.scale, 0.0, trusted)
+    except BadInput as error:
+        return str(error).removeprefix(f"{file.path}: ")
+
+
+def _check_map(values: np.ndarray, view: View) -> None:
+    height, width = values.shape
+    wanted = width * view.camera.height / view.camera.width
+    if abs(height - wanted) > 1 + 0.01 * wanted:
+        raise BadInput(f"{width} x {height} px is not the shape of its photograph")
+    known = values[np.isfinite(values)]
+    if not len(known):
+        raise BadInput("no value in it")
+    if np.ptp(known) <= 1e-6 * np.abs(known).max():
+        raise BadInput("constant")
+
+
+def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -> None:
+    height, width = values.shape
+    for what, array in beside.items():
+        if array is not None and array.shape[-2:] != values.shape:
+            size = f"{array.shape[-1]} x {array.shape[-2]} px"
+            raise BadInput(f"it has {width} x {height} px, and its {what} {size}")
+
+
+def _check_units(values: np.ndarray, inverse: np.ndarray) -> None:
+    known = np.isfinite(values) & (values > 0)
+    ratio = float(np.median(values[known] / inverse[known])) if known.sum() > MIN_POINTS else 1.0
+    if not 1 / UNITS < ratio < UNITS:
+        raise BadInput("its depths are not those of the sparse points")
+
+
+def _outliers(fits: Sequence[Fit | None]) -> list[int]:
+    """Positions of the images whose alignment failed; maps that came in input units share one scale."""
+    scales = {at: fit.scale for at, fit in enumerate(fits) if fit is not None and not fit.file.aligned}
+    if not scales:
+        return []
+    usual = float(np.median(list(scales.values())))
+    return [at for at, scale in scales.items() if not usual / SCALE_BAND <= scale <= usual * SCALE_BAND]
+
+
+def _warn_of_leaks(data: Data, scene: Scene) -> None:
+    """Maps made from several photographs must not have seen those that are kept to measure with."""
+    used = read_record(data.path).get("matched") if data.priors is None else None  # a run matches what it trains on
+    seen = [view.name for view in scene.held_out if isinstance(used, list) and view.name in used]
+    if seen:
+        text = (
+            f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs kept from training, "
+            f"{seen[0]} for one, so the quality will look better than it is; "
+            f"{how_to_make(data)} --again, with the same split"
+        )
+        emit(Warned(text))
+
+
+def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
+    """What to tell of maps that a loss of normals looks at; None where all have normals.
+
+    Not every estimator finds normals, and a loss that is 0 throughout shows nowhere else.
+    """
+    without = sum(not normal_path(file.path).exists() for file in files)
+    if not without:
+        return None
+    remedy = f"make others with `surfkit prepare depth {data.path} {WITH_NORMALS} --again`"
+    remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
+    what = f"{without} of {len(files)} depth priors have no normals"
+    return f"{what}, and the loss normal-prior learns nothing from those; {remedy}"
+
+
+def how_to_make(data: Data, normals: bool = False) -> str:
+    """Which command makes depth priors, with normals if a loss looks at them."""
+    return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"

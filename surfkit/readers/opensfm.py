@@ -1,0 +1,119 @@
+"""OpenDroneMap projects: photographs in images/, and OpenSfM's reconstruction of them, on the map if it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput, few, leaving_out, reject
+from surfkit.core.codec import read_json
+from surfkit.core.events import Warned, emit
+from surfkit.readers.capture import Capture, Reader, Shot, camera_of
+from surfkit.readers.data import Data
+from surfkit.readers.georeference import placed
+from surfkit.scene.names import find_files
+
+PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
+"""Where the reconstruction may lie, the first that is there wins. OpenDroneMap puts one on the map in the place of the
+second, by an affine map that no pose can follow: cameras and points no longer fit. So the topocentric one is moved."""
+LENSES = {
+    "perspective": ("RADIAL", ("k1", "k2")),
+    "simple_radial": ("SIMPLE_RADIAL", ("k1",)),
+    "radial": ("RADIAL", ("k1", "k2")),
+    "brown": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "", "", "")),
+    "fisheye": ("RADIAL_FISHEYE", ("k1", "k2")),
+    "fisheye_opencv": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+}
+"""COLMAP's name of each projection, and the coefficients that it takes."""
+
+
+@dataclass(frozen=True)
+class ODM(Reader):
+    """OpenDroneMap: images/ and opensfm/reconstruction.json; with GPS in UTM and metres if it chose a zone, z up."""
+
+    def recognises(self, root: Path) -> bool:
+        return any((root / place).is_file() for place in PLACES)
+
+    def read(self, data: Data) -> Capture:
+        path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[1])
+        model = _largest(path, read_json(path, Any))
+        names = sorted(model["shots"])
+        folder = data.path / (data.images or "images")
+        found = find_files(folder, names)
+        if missing := [name for name in names if name not in found]:
+            text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}; put them there"
+            reject(BadInput(text))
+        try:
+            cameras = {name: _camera(f"{path}: camera {name!r}", lens) for name, lens in model["cameras"].items()}
+            shots = []
+            for name in names:
+                with leaving_out():
+                    shots.append(_shot(name, model["shots"][name], cameras, found.get(name, folder / name)))
+            points = list(model.get("points", {}).values())
+            xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
+            rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
+        except BadInput:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
+        good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+        return _on_earth(Capture(shots, xyz[good], rgb[good].astype(np.uint8)), data.path, path.parent, model)
+
+
+def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, Any]) -> Capture:
+    """A topocentric capture where it lies on Earth; the same one if the photographs had no GPS."""
+    height = float(np.median(capture.xyz[:, 2])) if len(capture.xyz) else 0.0
+    place = placed(root, folder, model, height)
+    if place is None:
+        return capture
+    capture = replace(capture, metres=1.0, crs=place.crs, shift=place.shift)
+    if (move := place.moved) is None:
+        return capture
+    shots = [replace(shot, pose=move.pose(shot.pose)) for shot in capture.shots]
+    return replace(capture, shots=shots, xyz=move.points(capture.xyz))
+
+
+def _largest(path: Path, models: Any) -> Mapping[str, Any]:
+    """The reconstruction with most photographs."""
+    listed = [model for model in models if isinstance(model, dict)] if isinstance(models, list) else []
+    whole = [model for model in listed if isinstance(model.get("shots"), dict) and model["shots"]]
+    if not whole:
+        raise BadInput(f"{path}: no reconstruction with shots in it; run ODM's OpenSfM stage again")
+    best = max(whole, key=lambda model: len(model["shots"]))
+    if len(whole) > 1:
+        count = len(best["shots"])
+        emit(Warned(f"{path} has {len(whole)} reconstructions; the largest is used, of {count} photographs"))
+    return best
+
+
+def _camera(where: str, lens: Mapping[str, Any]) -> Any:
+    """The pycolmap camera of OpenSfM's normalised intrinsics: lengths are shares of the longer side."""
+    kind = str(lens.get("projection_type"))
+    if kind not in LENSES:
+        raise BadInput(f"{where}: projection {kind}; known: {', '.join(LENSES)}; cut up panoramas")
+    model, names = LENSES[kind]
+    width, height = int(lens["width"]), int(lens["height"])
+    longer = max(width, height)
+    focal = [float(lens[f"focal_{axis}"] if f"focal_{axis}" in lens else lens["focal"]) * longer for axis in "xy"]
+    centre = [float(lens.get("c_x", 0)) * longer + width / 2, float(lens.get("c_y", 0)) * longer + height / 2]
+    extra = [float(lens.get(name, 0)) for name in names]
+    if model not in ("FULL_OPENCV", "OPENCV_FISHEYE"):  # of one focal length
+        if abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
+            raise BadInput(f"{where}: projection {kind} with two focal lengths; convert the camera to brown")
+        focal = focal[:1]
+    return camera_of(where, model, (width, height), [*focal, *centre, *extra])
+
+
+def _shot(name: str, shot: Mapping[str, Any], cameras: Mapping[str, Any], photo: Path) -> Shot:
+    from scipy.spatial.transform import Rotation
+
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec(np.array(shot["rotation"], np.float64)).as_matrix()
+    pose[:3, 3] = np.array(shot["translation"], np.float64)
+    if not np.isfinite(pose).all():
+        raise BadInput(f"the pose of {name!r} is not finite; delete the shot from reconstruction.json")
+    return Shot(name, pose, cameras[shot["camera"]], photo)

@@ -1,0 +1,249 @@
+"""A data set of any known layout as a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput, reject
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import components, find
+from surfkit.readers.capture import Capture, Reader, Shot, Tracked
+from surfkit.readers.colmap import COLMAP, MODELS
+from surfkit.readers.data import Data
+from surfkit.readers.masks import check_mask, find_masks
+from surfkit.readers.reduced import reduced
+from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistorted
+from surfkit.scene.camera import Camera
+from surfkit.scene.groups import apart
+from surfkit.scene.observations import Observations, Seen
+from surfkit.scene.photos import is_turned, photo_size
+from surfkit.scene.scene import Cloud, Frame, Scene, View
+
+RANDOM_POINTS = 50_000
+"""Where a data set has no sparse points."""
+
+
+def read(data: Data) -> Scene:
+    """The scene in a data set, in its local frame; photographs of distorted cameras are undistorted on the way.
+
+    Raises:
+        BadInput: Something is missing, damaged, or of a kind that is not supported; one line says what to do.
+    """
+    reader = reader_of(data)
+    if data.layout is None and len(fitting := _fitting(data.path)) > 1:
+        others = ", ".join(name for name, other in fitting.items() if other != reader)
+        emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+    capture = captured(data, reader)
+    if text := apart(capture.groups):
+        emit(Warned(text))
+    return assembled(data, capture)
+
+
+def captured(data: Data, reader: Reader) -> Capture:
+    """What a reader finds in a data set, and in the one that is for tests."""
+    for name, value in {"model": data.model, "split": data.split}.items():
+        if value is not None and not isinstance(reader, Tracked):
+            raise BadInput(f"--{name} {value}: is for COLMAP data sets; leave it out")
+    capture = reader.read(data)
+    return capture if data.test_data is None else _with_tests(capture, reader, data)
+
+
+def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
+    """The scene of a capture.
+
+    Args:
+        data: The data set, and how to use it.
+        capture: What its reader has found in it.
+        keep: Folder of the undistorted photographs; by default one that later runs find again.
+        only: Names of the photographs to make views of; all by default.
+    """
+    held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
+    shots = sorted(capture.shots, key=lambda shot: shot.name)
+    if twice := next((a.name for a, b in pairwise(shots) if a.name == b.name), None):
+        reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
+    poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
+    frame = _frame(data, capture, poses)
+    wanted = [shot for shot in shots if only is None or shot.name in only]
+    views = _views(*reduced(data, wanted), frame, keep)
+    return Scene(
+        name=data.path.resolve().name,
+        train=tuple(view for view in views if view.name not in held_out),
+        held_out=tuple(view for view in views if view.name in held_out),
+        cloud=_cloud(capture, poses, frame),
+        frame=frame,
+    )
+
+
+def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
+    """The photographs of both data sets, those of the test data held out, under the name of its folder."""
+    root = data.test_data
+    if root is None or not root.is_dir():
+        raise BadInput(f"--test-data {root}: no such folder")
+    own = reader.read(replace(data, path=root, model=None, test_data=None)).shots
+    tests = [replace(shot, name=f"{root.resolve().name}/{shot.name}") for shot in own]
+    return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
+
+
+def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
+    """The frame of the training cameras, with what the data set or the user knows of its place and unit."""
+    frame = Frame.around(poses, capture.xyz)
+    shift = capture.shift or frame.shift
+    given = data.metres_per_unit
+    if given is not None and capture.metres not in (None, given):
+        emit(Warned(f"--metres-per-unit {given:g} is used, though {data.path} is in units of {capture.metres:g} m"))
+    if any(shift):
+        text = " ".join(f"{value:.15g}" for value in shift)
+        emit(
+            Warned(
+                f"coordinates reach {np.abs(frame.origin).max():.0f}, too large for files of float32: these leave out "
+                f"the offset {text}, which their headers and run.json name"
+            )
+        )
+    return replace(frame, metres=given or capture.metres, crs=capture.crs, shift=shift)
+
+
+def reader_of(data: Data) -> Reader:
+    """The reader for a data set: the one that `layout` names, or the one that recognises the folder."""
+    root = data.path
+    if not root.is_dir():
+        raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
+    if not any(root.iterdir()):
+        raise BadInput(f"{root}: the folder is empty; {_wanted()}")
+    if data.layout is not None:
+        return find(Reader, data.layout)()
+    fitting = _fitting(root)
+    if "colmap" in fitting:  # it has the points and their observations
+        return fitting["colmap"]
+    if len(fitting) > 1:
+        raise BadInput(f"{root}: could be of layout {' or '.join(fitting)}; choose one with --layout")
+    return next(iter(fitting.values()), COLMAP())
+
+
+def _fitting(root: Path) -> dict[str, Reader]:
+    """The readers that recognise a folder, by name."""
+    return {name: cls() for name, cls in components(Reader).items() if cls().recognises(root)}
+
+
+def observations(data: Data, scene: Scene) -> Observations:
+    """Which points of the sparse model each photograph shows; none where the layout keeps no observations.
+
+    Args:
+        data: The data set.
+        scene: That `read` gave for it.
+    """
+    reader = reader_of(data)
+    if not isinstance(reader, Tracked):
+        return Observations(np.zeros((0, 3)), np.zeros(0), {})
+    tracks, seen = reader.tracks(data), {}
+    for view in (*scene.train, *scene.held_out):
+        if view.name in tracks.seen:
+            rows, pixels = tracks.seen[view.name]
+            seen[view.name] = Seen(rows, _shares(pixels, tracks.cameras[view.name], view.camera))
+    return Observations(scene.frame.to_local(tracks.xyz), tracks.error_px, seen)
+
+
+def model_folder(data: Data) -> Path:
+    """Where the sparse model of a data set lies; the data set itself if its layout has none."""
+    reader = reader_of(data)
+    return reader.model_folder(data) if isinstance(reader, Tracked) else data.path
+
+
+def _wanted() -> str:
+    others = ", ".join(name for name in components(Reader) if name != "colmap")
+    return (
+        f"a data set is a folder with images/ and a COLMAP model in {', '.join(MODELS[:-1])} or {MODELS[-1]}, "
+        f"or of another layout: {others or 'none is registered'}"
+    )
+
+
+def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -> list[View]:
+    """The photographs at the size to use them at, undistorted."""
+    for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
+        check_camera(shot.camera, shot.name)
+    masks = find_masks(data.path, data.masks, shots)
+    with ThreadPoolExecutor(4) as pool:
+        sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
+        turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
+        for shot, size in zip(shots, sizes, strict=True):
+            check_size(shot, size)
+            if shot.name in masks:
+                check_mask(masks[shot.name], size)
+        given = [
+            Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
+            for shot, size in zip(shots, sizes, strict=True)
+        ]
+        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistorted(p, data.path, keep), given))
+    if any(turned):
+        first = shots[turned.index(True)].name
+        emit(
+            Warned(
+                f"{sum(turned)} of {len(shots)} photographs have an EXIF tag that turns them, {first} for one: it is "
+                "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
+            )
+        )
+    return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
+
+
+def check_size(shot: Shot, size: tuple[int, int]) -> None:
+    """BadInput unless the photograph is the camera's picture at some size, within a pixel."""
+    full = (shot.camera.width, shot.camera.height)
+    long = 0 if full[0] >= full[1] else 1
+    if abs(full[1 - long] * size[long] / full[long] - size[1 - long]) <= 1:
+        return
+    turned = " (turned by 90 degrees)" if size[0] * full[0] == size[1] * full[1] else ""
+    advice = "use the photographs that the model was made from, whole and unturned"
+    if turned and is_turned(shot.path):
+        advice = (
+            "the model was made from photographs turned as EXIF says, so save them like that (mogrify -auto-orient)"
+        )
+    raise BadInput(
+        f"{shot.path}: {size[0]} x {size[1]} px{turned}, but its camera {shot.camera.camera_id} has "
+        f"{full[0]} x {full[1]}; {advice}"
+    )
+
+
+def _view(shot: Shot, picture: Picture, frame: Frame) -> View:
+    lens = picture.camera
+    full = Camera(
+        world_to_camera=frame.local_pose(shot.pose),
+        fx=float(lens.focal_length_x),
+        fy=float(lens.focal_length_y),
+        cx=float(lens.principal_point_x),
+        cy=float(lens.principal_point_y),
+        width=int(lens.width),
+        height=int(lens.height),
+    )
+    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white)
+
+
+def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
+    """(K, 2) pixels of a lens as shares of the width and height of the undistorted picture."""
+    if is_pinhole(lens):
+        return pixels / (lens.width, lens.height)
+    rays = np.asarray(lens.cam_from_img(pixels), np.float64).reshape(-1, 2)
+    return (rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
+
+
+def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
+    if len(capture.xyz):
+        xyz = frame.to_local(capture.xyz).astype(np.float32)
+        return Cloud(torch.from_numpy(xyz), torch.from_numpy(capture.rgb))
+    emit(
+        Warned(
+            f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
+            "cameras and of what lies before them, which takes longer and leaves more floaters"
+        )
+    )
+    local = np.stack([frame.local_pose(pose).numpy() for pose in poses])
+    centres = -(local[:, :3, :3].transpose(0, 2, 1) @ local[:, :3, 3:])[..., 0]
+    corners = np.concatenate([centres, centres + local[:, 2, :3]])  # one extent ahead, along the optical axes
+    draw = np.random.default_rng(0)
+    xyz = draw.uniform(corners.min(0), corners.max(0), (RANDOM_POINTS, 3)).astype(np.float32)
+    return Cloud(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8))

@@ -1,0 +1,154 @@
+"""Photographs of distorted cameras as a pinhole camera would have taken them, made once and kept on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from surfkit.core.check import BadInput
+from surfkit.export.ply import replacing
+from surfkit.readers.capture import library
+from surfkit.readers.masks import read_mask
+from surfkit.scene.copies import digest, place
+from surfkit.scene.photos import read_photo
+
+FOLDER = "undistorted"
+RECIPE = "1"
+"""Changes when the same photograph would come out otherwise: what is on disk is then made again."""
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Models that are pinholes when all their coefficients are 0."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photograph and the camera that took it.
+
+    Attributes:
+        path: On disk.
+        mask: On disk, if it has one.
+        camera: pycolmap.Camera.
+        size: Width and height to use it at.
+        white: Whether its transparent pixels lie over white, or over black.
+    """
+
+    path: Path
+    mask: Path | None
+    camera: Any
+    size: tuple[int, int]
+    white: bool = False
+
+
+def is_pinhole(camera: Any) -> bool:
+    """Whether a camera shows straight lines as straight."""
+    name = camera.model.name
+    extra = [camera.params[i] for i in camera.extra_params_idxs()]
+    return name in PINHOLES or (name in POLYNOMIAL and not any(extra))
+
+
+def check_camera(camera: Any, name: str) -> None:
+    """BadInput for a camera that cannot be used; `name` is one of its photographs."""
+    where = f"camera {camera.camera_id} of {name}"
+    values = [*camera.params, camera.width, camera.height]
+    if not (np.isfinite(values).all() and camera.width > 0 and camera.height > 0):
+        raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
+    if not len(camera.focal_length_idxs()):
+        raise BadInput(f"{where} has model {camera.model.name}, a panorama; cut it into perspective photographs")
+    if not all(camera.params[i] > 0 for i in camera.focal_length_idxs()):
+        raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
+
+
+def undistorted(picture: Picture, root: Path, keep: Path | None = None) -> Picture:
+    """The picture of a pinhole camera, from the cache of the data set or made now.
+
+    Args:
+        picture: Of any perspective or fisheye camera.
+        root: The data set, in which the cache is kept; where that cannot be written, the user's own cache.
+        keep: Folder of the cache, where it is to be another one.
+
+    Raises:
+        BadInput: The photograph is damaged, or its camera has no pinhole equivalent.
+    """
+    lens = _Lens.of(picture.camera, picture.size)
+    camera, grid, inside = _warp(lens)
+    path = (keep or cache_folder(root)) / _cached(picture, lens, root)
+    mask = path.with_name(f"{path.stem}-mask.png") if picture.mask is not None or not inside.all() else None
+    if not path.exists():
+        if mask is not None:
+            _save(mask, _keep(picture, grid, inside).to(torch.uint8).mul(255)[None].expand(3, -1, -1))
+        photo = read_photo(picture.path, picture.size, picture.white).float()
+        values = grid_sample(photo[None], grid, "bicubic", "border", align_corners=False)[0]
+        _save(path, (values * inside).round().clamp(0, 255).to(torch.uint8))  # last: with it, the mask is there too
+    return replace(picture, path=path, mask=mask, camera=camera, size=(camera.width, camera.height))
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera as plain values, at the size it is used at."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, camera: Any, size: tuple[int, int]) -> _Lens:
+        scaled = library().Camera(
+            model=camera.model.name, width=camera.width, height=camera.height, params=list(camera.params)
+        )
+        scaled.rescale(*size)
+        return cls(camera.model.name, tuple(scaled.params), *size)
+
+    def camera(self) -> Any:
+        return library().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+
+@lru_cache(maxsize=8)
+def _warp(lens: _Lens) -> tuple[Any, Tensor, Tensor]:
+    """The pinhole camera, where its pixels lie in the photograph, (1, h, w, 2), and (h, w) which of them do."""
+    source = lens.camera()
+    try:
+        camera = library().undistort_camera(library().UndistortCameraOptions(), source)
+    except (ValueError, RuntimeError) as error:
+        raise BadInput(f"a {lens.model} camera cannot be undistorted: {' '.join(str(error).split())}") from error
+    x = (np.arange(camera.width) + 0.5 - camera.principal_point_x) / camera.focal_length_x
+    y = (np.arange(camera.height) + 0.5 - camera.principal_point_y) / camera.focal_length_y
+    rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
+    share = np.asarray(source.img_from_cam(rays)) / (lens.width, lens.height)
+    inside = (np.isfinite(share) & (share >= 0) & (share <= 1)).all(1)
+    grid = np.nan_to_num(share * 2 - 1, nan=-2).clip(-2, 2).astype(np.float32)  # beyond 1 is outside
+    shape = (camera.height, camera.width)
+    return camera, torch.from_numpy(grid).reshape(1, *shape, 2), torch.from_numpy(inside).reshape(shape)
+
+
+def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
+    """(h, w) bool: pixels that the photograph shows and its mask keeps."""
+    if picture.mask is None:
+        return inside
+    mask = read_mask(picture.mask, picture.size).float()[None, None]
+    return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
+
+
+def _cached(picture: Picture, lens: _Lens, root: Path) -> str:
+    """The name of the undistorted picture, which tells what went into it."""
+    paths = [path for path in (picture.path, picture.mask) if path is not None]
+    return f"{picture.path.stem}-{digest(root, f'{RECIPE} {lens} {picture.white}', paths)}.png"
+
+
+def cache_folder(root: Path) -> Path:
+    """Where the undistorted photographs of a data set are kept."""
+    return place(root, FOLDER)
+
+
+def _save(path: Path, pixels: Tensor) -> None:
+    """A (3, H, W) picture as PNG; whole or not there."""
+    with replacing(path) as file:
+        Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(file, "PNG", compress_level=1)

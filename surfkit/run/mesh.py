@@ -1,0 +1,209 @@
+"""From a trained run to its mesh: made, cleaned, written in the frame of the input, and looked at."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, read_keys, write_json
+from surfkit.core.events import FileWritten, Progress, emit
+from surfkit.evaluate.images.pictures import write_picture
+from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.clean import Report, clean
+from surfkit.mesh.files import Format, write_mesh
+from surfkit.mesh.fusion import TILES
+from surfkit.mesh.shade import from_above, shaded, up_of
+from surfkit.mesh.simplify import require, simplified
+from surfkit.raster.api import Rasterizer
+from surfkit.readers.depth_prior import read_priors
+from surfkit.readers.masks import mask_cache
+from surfkit.run.folder import Run
+from surfkit.scene.crop import Crop, box, read_crop
+from surfkit.scene.photos import view_photo
+from surfkit.scene.scene import Scene
+from surfkit.train.stage import StageState
+
+SHOWN = 4
+"""Training views that pictures are made of."""
+LONGEST = 800
+"""Side of a picture, pixels."""
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What becomes of the triangles of a mesher."""
+
+    formats: tuple[Format, ...] = ("ply",)
+    """Files to write: ply, obj, glb. The last has floats alone and so an offset of its own, in NAME.glb.json."""
+
+    lods: tuple[float, ...] = ()
+    """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
+
+    clusters: int = 50
+    """Drop loose clusters of triangles that are smaller than this many others."""
+
+    least_triangles: int = 50
+    """Drop loose clusters with fewer triangles."""
+
+    hole_edges: int = 0
+    """Fill holes of up to this many edges; 0 leaves all open."""
+
+    crop_box: tuple[float, float, float, float, float, float] | None = None
+    """Keep what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
+
+    crop: Path | None = None
+    """Keep what lies in the volume of this crop file, as Tanks and Temples has them, in the frame of the input."""
+
+    def __post_init__(self) -> None:
+        for name in ("clusters", "least_triangles"):
+            if getattr(self, name) < 1:
+                raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
+        if not 0 <= self.hole_edges <= 1000:
+            raise BadInput(f"--hole-edges {self.hole_edges}: give 0 to 1000")
+        if wrong := [share for share in self.lods if not 0 < share < 1]:
+            raise BadInput(f"--lods {wrong[0]:g}: a share of the triangles lies between 0 and 1")
+        if not self.formats:
+            raise BadInput("--formats: name at least one of ply, obj, glb")
+        if self.crop is not None and self.crop_box is not None:
+            raise BadInput("--crop and --crop-box: give one of the two")
+        if self.lods:
+            require()
+
+    def volume(self) -> Crop | None:
+        """The crop, in the frame of the input."""
+        if self.crop_box is not None:
+            return box(self.crop_box)
+        return None if self.crop is None else read_crop(self.crop)
+
+
+def subject(
+    this: Run,
+    state: StageState,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    budget_bytes: int,
+    mesher: Mesher | None = None,
+) -> Subject:
+    """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
+    stage = this.stage
+    splats = this.primitive.shape(stage.finished(state), state.sh_degree)
+    masks = mask_cache(scene.train, budget_bytes // 4)
+    wanted = mesher is not None and mesher.needs_prior
+    priors = read_priors(this.data, scene, budget_bytes // 4) if wanted else None
+    return Subject(
+        splats=splats,
+        views=scene.train,
+        draw=lambda view: rasterizer.render(splats, view.camera, stage.near, distortion=False).maps,
+        rasterizer=rasterizer,
+        near=stage.near,
+        frame=scene.frame,
+        budget_bytes=budget_bytes,
+        generator=torch.Generator().manual_seed(this.recipe.seed),
+        scratch=this.out,
+        keep=lambda at: None if masks is None else masks[at],
+        priors=priors,
+        photo=lambda at: view_photo(scene.train[at]),
+    )
+
+
+def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, steps: int) -> dict[str, Any]:
+    """Make the mesh of a run, write it into the run's folder, and return what mesh.json says.
+
+    Args:
+        this: The run.
+        mesher: How.
+        delivery: What to write.
+        subject: What to mesh.
+        steps: That the splats were trained for.
+
+    Raises:
+        BadInput: There is no surface, or nothing is left of it.
+    """
+    began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
+    for left in this.out.glob(TILES):
+        shutil.rmtree(left)  # of a process that was killed
+    raw = mesher.mesh(subject)
+    inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
+    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
+    facts = dict(raw.facts)
+    del raw
+    forget(this)
+    written = list(write_files(this, mesh, delivery, subject))
+    record = {
+        "mesher": mesher,
+        "delivery": delivery,
+        "steps": steps,
+        "lengths": facts,
+        "cleaning": describe(report, subject),
+        "files": [path.name for path in written],
+        "crs": frame.crs,
+        "metres_per_unit": frame.metres,
+        "seconds": round(time.perf_counter() - began, 2),
+    }
+    look(this, mesh, subject)
+    write_json(this.mesh_record, record)
+    emit(FileWritten(this.mesh_record, "facts of the mesh"))
+    return dump(record)
+
+
+def describe(report: Report, subject: Subject) -> dict[str, Any]:
+    """The report with lengths in units of the data set."""
+    return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
+
+
+def forget(this: Run) -> None:
+    """Delete what an earlier mesh left; its record goes first."""
+    this.mesh_record.unlink(missing_ok=True)
+    for path in (*this.out.glob("mesh.*"), *this.out.glob("mesh-lod*"), *this.mesh_pictures.rglob("*.png")):
+        path.unlink(missing_ok=True)
+
+
+def write_files(this: Run, mesh: Mesh, delivery: Delivery, subject: Subject) -> Iterator[Path]:
+    """Write the mesh in all formats and levels, and give the paths."""
+    meshes = [("mesh", mesh)]
+    for at, share in enumerate(delivery.lods, 1):
+        meshes.append((f"mesh-lod{at}", simplified(mesh, share)))
+        emit(Progress("simplifying", at, len(delivery.lods)))
+    for name, each in meshes:
+        for kind in dict.fromkeys(delivery.formats):
+            for path in write_mesh(this.out / f"{name}.{kind}", each, subject.frame):
+                emit(FileWritten(path, "mesh"))
+                yield path
+
+
+def look(this: Run, mesh: Mesh, subject: Subject) -> None:
+    """Write pictures of the mesh: beside the renders of a few training views, and from above."""
+    count = min(SHOWN, len(subject.views))
+    views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
+    cameras = [view.camera for view in subject.views]
+    path = this.mesh_pictures / "above.png"
+    write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
+    emit(FileWritten(path, "picture"))
+    for at, view in enumerate(views):
+        camera = view.camera.fitted(LONGEST)
+        color = subject.draw(view).color.clamp(0, 1)
+        if camera != view.camera:
+            size = (camera.height, camera.width)
+            color = torch.nn.functional.interpolate(color[None], size, mode="area")[0]
+        path = this.mesh_pictures / f"view-{at + 1}.png"
+        write_picture(path, torch.cat([color, shaded(mesh, camera)], dim=2))
+        emit(FileWritten(path, "picture"))
+
+
+def meshed(this: Run, steps: int) -> bool:
+    """Whether the mesh of a recipe is there, made from splats of so many steps; the recipe may want none."""
+    if this.recipe.mesh is None:
+        return True
+    if not this.mesh_record.exists():
+        return False
+    remedy = "delete it, and the mesh is made anew"
+    record = read_keys(this.mesh_record, {"files": tuple[str, ...], "steps": int}, remedy)
+    there = all((this.out / name).exists() for name in record["files"])
+    return there and record["steps"] == steps

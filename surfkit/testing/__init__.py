@@ -1,0 +1,21 @@
+"""Checks that the parts of a plugin keep their contract, and small scenes to try them on."""
+
+from surfkit.testing.checks import (
+    check_component,
+    check_loss,
+    check_mesher,
+    check_partition,
+    check_policy,
+    check_primitive,
+    check_refine,
+)
+
+__all__ = [
+    "check_component",
+    "check_loss",
+    "check_mesher",
+    "check_partition",
+    "check_policy",
+    "check_primitive",
+    "check_refine",
+]
