@@ -21,7 +21,7 @@ from torch import Tensor
 from trained import halfway
 
 from surfkit.core.tree import evolve
-from surfkit.partition import Assign, ContractedGrid, Partition, PictureShare, QuantileGrid, Sight, SSIMDifference
+from surfkit.partition import Assign, CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid, SSIMDifference
 from surfkit.readers.data import Data
 from surfkit.recipes import COARSE
 
@@ -51,15 +51,15 @@ class Case:
         return self.difference[there] > SSIMDifference().threshold, self.share[there] > threshold
 
 
-def coarse_model(path: Path, steps: int, scale: float) -> Sight:
+def coarse_model(path: Path, steps: int, scale: float) -> CoarseModel:
     """A scene half-way through a training of so many steps, and its views."""
     losses = {name: loss for name, loss in COARSE.pretrain.losses.items() if name != "depth"}
     trainer, state = halfway(evolve(COARSE, "pretrain.losses", losses), 2 * steps, Data(path, scale=scale))
-    splats = trainer.primitive.shape(state.points.params, state.sh_degree)
-    return Sight(splats, trainer.views, trainer.rasterizer, trainer.stage.near)
+    splats = trainer.primitive.activate(state.points.params, state.sh_degree)
+    return CoarseModel(splats, trainer.views, trainer.rasterizer, trainer.stage.near)
 
 
-def compared(sight: Sight, way: Partition) -> Case:
+def compared(sight: CoarseModel, way: Partition) -> Case:
     """Both ways, one after the other."""
     cells = way.cells(sight)
     owner, seconds, found = cells.owner(sight.splats.means), [], []

@@ -57,7 +57,7 @@ this, scene = Run(out, recipe, data, "pretrain"), read(data)
 params = recipe.primitive.init(scene.cloud, torch.Generator().manual_seed(0))
 state = StageState(Points.fresh(params), Order(len(scene.train)), torch.Generator(), index=steps, sh_degree=3)
 checkpoint.save(this.checkpoint, state)
-sight = Sight(recipe.primitive.shape(params, 0), scene.train, select("cpu")[0], stage.near)
+sight = Sight(recipe.primitive.activate(params, 0), scene.train, select("cpu")[0], stage.near)
 cells = recipe.partition.cells(sight)
 inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
 write_json(out / "recipe.json", recipe)
@@ -163,15 +163,15 @@ def merge(out: Path) -> None:
     from surfkit.pipeline import opened
     from surfkit.raster.select import select
     from surfkit.readers import extract
-    from surfkit.run.context import Site, views_file
-    from surfkit.run.stage import Every
-    from surfkit.train.material import Store
+    from surfkit.run.context import RunContext, views_file
+    from surfkit.run.stage import Intervals
+    from surfkit.train.material import CacheSettings
 
-    this = opened(out)
+    run = opened(out)
     scene = extract.load(views_file(out, 0)).scene  # the driver has read the data set for other reasons
-    site = Site(this, scene, select("cpu")[0], Every(pictures=0), Store("100MB"))
+    ctx = RunContext(run, scene, select("cpu")[0], Intervals(pictures=0), CacheSettings("100MB"))
     plan = read_json(out / "blocks" / "plan.json", Record).plan
-    assert put_together(site, plan, coarse_model(this))
+    assert put_together(ctx, plan, coarse_model(run))
 
 
 def main() -> None:

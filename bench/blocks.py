@@ -18,25 +18,25 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Hands, extract_views, planned, work
+from surfkit.blocks.schedule import Compute, extract_views, planned, work
 from surfkit.blocks.worker import coarse_model
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
 from surfkit.execute import Pool
-from surfkit.partition import Balanced, ContractedGrid, Partition, PictureShare, QuantileGrid, Sight
+from surfkit.partition import Balanced, CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid
 from surfkit.partition.plan import Fewest, plan
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 
 def tuning(steps: int) -> dict[str, float]:
@@ -49,21 +49,23 @@ def tuning(steps: int) -> dict[str, float]:
     seconds = {}
     with tempfile.TemporaryDirectory() as folder:
         data, out = Data(EXAMPLE, scale=2.0), Path(folder) / "run"
-        run(replace(recipe, partition=None), data, out, Hands("cpu"), Every(pictures=0))
+        run(replace(recipe, partition=None), data, out, Compute("cpu"), Intervals(pictures=0))
         for workers in (1, 2):
             write_json(out / "recipe.json", recipe)
             for old in ("blocks", "tune"):
                 shutil.rmtree(out / old, ignore_errors=True)
-            site = Site(Run(out, recipe, data), read(data), select("cpu")[0], Every(pictures=0), Store("1GB"))
-            blocks = planned(site, coarse_model(site.this)).plan
-            extract_views(site, blocks)
+            ctx = RunContext(
+                Run(out, recipe, data), read(data), select("cpu")[0], Intervals(pictures=0), CacheSettings("1GB")
+            )
+            blocks = planned(ctx, coarse_model(ctx.run)).plan
+            extract_views(ctx, blocks)
             began = time.perf_counter()
-            work(site, blocks, Hands("cpu", Pool(workers=workers, threads=1)))
+            work(ctx, blocks, Compute("cpu", Pool(workers=workers, threads=1)))
             seconds[f"{workers} workers s"] = time.perf_counter() - began
     return seconds | {"faster with 2": seconds["1 workers s"] / seconds["2 workers s"]}
 
 
-def city(points: int = 20_000, side: int = 20) -> Sight:
+def city(points: int = 20_000, side: int = 20) -> CoarseModel:
     """Discs on the ground, four times as dense in the middle, under a grid of cameras that look down."""
     draws = torch.Generator().manual_seed(0)
     xy = torch.rand(points, 2, generator=draws) * 2 - 1
@@ -78,7 +80,7 @@ def city(points: int = 20_000, side: int = 20) -> Sight:
         pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
         pose[:3, 3] = -pose[:3, :3] @ torch.tensor([x, y, 0.25], dtype=torch.float64)
         views.append(View(f"{at:04}", Camera(pose, 60.0, 60.0, 32.0, 24.0, 64, 48), path=EXAMPLE))
-    return Sight(Splats("surfel", means, quats, sizes, opaque, grey), views, select("cpu")[0], 0.01)
+    return CoarseModel(Splats("surfel", means, quats, sizes, opaque, grey), views, select("cpu")[0], 0.01)
 
 
 def efficiency(costs: list[float], devices: int) -> float:

@@ -20,12 +20,12 @@ from pathlib import Path
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.pipeline import Every, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 TIMES = ("seconds", "cpu_seconds")
 
@@ -34,8 +34,8 @@ def measure(data: Data, steps: int, budget: str) -> dict[str, object]:
     """Times and result of one run."""
     cache, _, copies = budget.partition("+")
     with tempfile.TemporaryDirectory() as folder:
-        recipe, store = with_steps(recipes()["2dgs"], steps), Store(cache, bool(copies))
-        metrics = run(recipe, data, Path(folder), Hands("cpu"), Every(pictures=0), store)
+        recipe, caches = with_steps(recipes()["2dgs"], steps), CacheSettings(cache, bool(copies))
+        metrics = run(recipe, data, Path(folder), Compute("cpu"), Every(pictures=0), caches)
         points = (Path(folder) / "point_cloud.ply").read_bytes()
     found = {name: metrics[name] for name in TIMES}
     return found | {"psnr": metrics["images"]["psnr"], "points": hashlib.blake2b(points, digest_size=8).hexdigest()}

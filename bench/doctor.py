@@ -16,7 +16,7 @@ from pathlib import Path
 
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.doctor.examine import examine
@@ -30,7 +30,7 @@ def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:
     """One run, in a process of its own, so that its peak of memory is its own too."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, Hands("cpu"), Every(pictures=0))
+        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, Compute("cpu"), Every(pictures=0))
         disk = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     answer.put({**{key: metrics[key] for key in ("points", "seconds")}, "memory": peak_memory_bytes(), "disk": disk})
 
@@ -42,9 +42,9 @@ def main() -> None:
     words.add_argument("--steps", type=int, default=1_000)
     words.add_argument("--scale", type=float, default=4)
     asked = words.parse_args()
-    data, context = Data(asked.data, scale=asked.scale), multiprocessing.get_context("spawn")
-    answer = context.Queue()
-    process = context.Process(target=real, args=(data, asked.steps, answer))
+    data, ctx = Data(asked.data, scale=asked.scale), multiprocessing.get_context("spawn")
+    answer = ctx.Queue()
+    process = ctx.Process(target=real, args=(data, asked.steps, answer))
     process.start()
     was = answer.get()
     process.join()

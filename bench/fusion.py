@@ -24,7 +24,7 @@ from surfkit.evaluate.geometry.repetition import Measurement
 from surfkit.evaluate.geometry.scores import nearest, shares, tree
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.mesh.agreement import Agreement
-from surfkit.mesh.base import Mesh, Subject
+from surfkit.mesh.base import Mesh, MeshInput
 from surfkit.mesh.clean import clean
 from surfkit.mesh.files import write_mesh
 from surfkit.mesh.shade import draw_faces
@@ -94,14 +94,14 @@ def maps_of(depth: np.ndarray, normal: np.ndarray) -> Maps:
     return Maps(0.5 * alpha.expand(3, -1, -1), alpha, plane, plane, torch.from_numpy(normal).float())
 
 
-def subject(scene: Scene, maps: list[Maps]) -> Subject:
+def subject(scene: Scene, maps: list[Maps]) -> MeshInput:
     """What a mesher is given."""
     by_name = {view.name: some for view, some in zip(scene.train, maps, strict=True)}
 
     def draw(view: View) -> Maps:
         return by_name[view.name]
 
-    return Subject(points(scene.train, draw), scene.train, draw, None, 0.01, scene.frame, 4 << 30)
+    return MeshInput(points(scene.train, draw), scene.train, draw, None, 0.01, scene.frame, 4 << 30)
 
 
 def score(mesh: Mesh, scene: Scene, pack: Path, tau: float, crop: object) -> dict[str, float]:

@@ -62,14 +62,14 @@ class Deadly:
             fsync(file)
             self.operation()
 
-        def saved(tensors: object, path: Path, metadata: object = None) -> None:
+        def load_state(tensors: object, path: Path, metadata: object = None) -> None:
             save_file(tensors, path, metadata)
             self.written += 1
             if self.written == self.torn:
                 os.truncate(path, int(self.share * os.path.getsize(path)))
                 die()
 
-        os.fsync, safetensors.torch.save_file = flushed, saved
+        os.fsync, safetensors.torch.save_file = flushed, load_state
         sys.addaudithook(self.audit)
 
     def audit(self, event: str, args: tuple) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from machine import RESULTS, save
 
-from surfkit.mesh.base import Subject
+from surfkit.mesh.base import MeshInput
 from surfkit.mesh.lattice import Lattice
 from surfkit.mesh.native import NativeGrid
 from surfkit.mesh.picture import picture
@@ -260,7 +260,7 @@ def in_tiles(views: int, voxel: float, budget: int) -> dict:
     count = len(means)
     fields = means, torch.ones(count, 4), torch.ones(count, 2), torch.ones(count), torch.ones(count, 1, 3)
     seen = [View(str(at), camera, Path()) for at, camera in enumerate(cameras)]
-    given = Subject(Splats("surfel", *fields), seen, draw, None, 0.1, Frame(np.zeros(3), 1.0, 1.0), budget)
+    given = MeshInput(Splats("surfel", *fields), seen, draw, None, 0.1, Frame(np.zeros(3), 1.0, 1.0), budget)
     before, began = rss(), time.perf_counter()
     mesh = TSDF(voxel=voxel, depth_limit=160.0, least_views=0.03).mesh(given)
     seconds, peak = time.perf_counter() - began, rss() - before

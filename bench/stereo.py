@@ -28,7 +28,7 @@ from mesh import rss
 from PIL import Image
 
 from surfkit.depth import PatchMatch, PlaneSweep
-from surfkit.depth.base import DepthEstimator, Material
+from surfkit.depth.base import DepthEstimator, DepthInput
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.scene import Frame, Scene, View
@@ -81,7 +81,7 @@ class Group:
         work = self.folder / "work"
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir()
-        given = Material(self.views, self.tracks, torch.device("cpu"), work)
+        given = DepthInput(self.views, self.tracks, torch.device("cpu"), work)
         size = self.views[0].camera.height, self.views[0].camera.width
         found = np.zeros((len(self.views), 2, *size), np.float32)
         for estimate in estimator.estimate(given, range(len(self.views))):

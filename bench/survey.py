@@ -15,9 +15,9 @@ import torch
 from machine import save
 from trained import copied, halfway
 
-from surfkit.losses.base import Sample
+from surfkit.losses.base import Target
 from surfkit.recipes import SURFELS
-from surfkit.train.views import Survey
+from surfkit.train.views import ViewContributions
 
 
 def taken(action: Callable[[], object]) -> float:
@@ -34,14 +34,14 @@ def main() -> None:
     trainer, state = halfway(SURFELS, 1_000)
     losses = trainer.stage.losses | {"normal": replace(trainer.stage.losses["normal"], start=0)}
     trainer = replace(trainer, stage=replace(trainer.stage, losses=losses, densify=None))
-    splats = trainer.primitive.shape(state.points.params, trainer.primitive.sh_degree)
+    splats = trainer.primitive.activate(state.points.params, trainer.primitive.sh_degree)
 
-    def survey() -> None:
-        Survey(trainer.views, trainer.rasterizer, splats, trainer.stage.near).survey()
+    def contributions() -> None:
+        ViewContributions(trainer.views, trainer.rasterizer, splats, trainer.stage.near).contributions()
 
     def forward() -> None:
         for at, view in enumerate(trainer.views):
-            sample = Sample(view, trainer.photos[at].to(torch.float32).div_(255))
+            sample = Target(view, trainer.photos[at].to(torch.float32).div_(255))
             maps = trainer.rasterizer.render(splats, view.camera, trainer.stage.near, True, False).maps
             sum(loss(maps, sample) for name, loss in losses.items() if name != "distortion")
 
@@ -50,7 +50,7 @@ def main() -> None:
         for _ in trainer.views:
             trainer.step(fresh)
 
-    times = {action: [] for action in (survey, forward, epoch)}
+    times = {action: [] for action in (contributions, forward, epoch)}
     for index in range(options.rounds + 1):
         for action, kept in times.items():
             kept += [taken(action)] * (index > 0)

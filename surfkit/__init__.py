@@ -30,7 +30,7 @@ _HOME = {
     "surfkit.primitives.points": ("Edit", "Points"),
     "surfkit.losses.base": ("Loss",),
     "surfkit.densify.base": ("Densify", "Filter", "Policy", "Prune", "Signal", "Step", "Views"),
-    "surfkit.mesh.base": ("Mesh", "Mesher", "Subject"),
+    "surfkit.mesh.base": ("Mesh", "Mesher", "MeshInput"),
     "surfkit.train.stage": ("Stage",),
     "surfkit.recipe": ("Recipe",),
 }

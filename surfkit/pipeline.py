@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from surfkit.blocks.schedule import Hands, tuned
+from surfkit.blocks.schedule import Compute, tune_blocks
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
@@ -30,7 +30,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import (
     Run,
     claim,
@@ -44,18 +44,18 @@ from surfkit.run.folder import (
     refuse_other,
 )
 from surfkit.run.journal import kept
-from surfkit.run.mesh import Delivery, deliver, meshed, subject
+from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, subject
 from surfkit.run.notes import noted
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
-from surfkit.run.refine import refined, seen_by
-from surfkit.run.stage import Every, Job, drawer, drawing, optimise, saved
-from surfkit.run.start import Beginning, priors_of
+from surfkit.run.refine import refine_model, seen_by
+from surfkit.run.stage import Intervals, Job, drawer, drawing, load_state, optimise
+from surfkit.run.start import InitialPoints, priors_of
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
-from surfkit.train.material import Store, read_ahead
+from surfkit.train.material import CacheSettings, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import MOST_STEPS, StageState
 
@@ -74,9 +74,9 @@ def run(
     recipe: Recipe,
     data: Data,
     out: Path,
-    hands: Hands | None = None,
-    every: Every | None = None,
-    store: Store | None = None,
+    compute: Compute | None = None,
+    intervals: Intervals | None = None,
+    caches: CacheSettings | None = None,
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
 
@@ -84,9 +84,9 @@ def run(
         recipe: What to do.
         data: What to do it with.
         out: Run folder.
-        hands: Who computes.
-        every: When checkpoints and pictures are written.
-        store: Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
+        compute: Who computes.
+        intervals: When checkpoints and pictures are written.
+        caches: Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
 
     Raises:
         BadInput: `out` holds a run of another recipe or of other data, another process works in it, or the data cannot
@@ -94,93 +94,98 @@ def run(
         Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
         KeyboardInterrupt: The run was asked to stop, and has saved its state.
     """
-    this = Run(out, recipe, replace(data, path=data.path.resolve()))
-    hands, every, store, meter = hands or Hands(), every or Every(), store or Store(), Meter()
-    if every.pictures is None:
-        every = replace(every, pictures=max(1, recipe.pretrain.steps // 5))
-    refuse_unready(this, hands, store)
+    run = Run(out, recipe, replace(data, path=data.path.resolve()))
+    compute, intervals, caches, meter = (
+        compute or Compute(),
+        intervals or Intervals(),
+        caches or CacheSettings(),
+        Meter(),
+    )
+    if intervals.pictures is None:
+        intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
+    refuse_unready(run, compute, caches)
     with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
         sweep(out, out / "blocks")
-        refuse_other(this)
-        scene = read(this.data)
+        refuse_other(run)
+        scene = read(run.data)
         meter.scene_read()
-        rasterizer, backend = drawer(hands.device)
-        state = saved(this, scene, repair=True)
-        prints = refuse_changed(this, scene, {scene.train[at].name for at in state.skipped} if state else set())
+        rasterizer, backend = drawer(compute.device)
+        state = load_state(run, scene, repair=True)
+        prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
-        warn_of_no_edits(this)
-        warn_of_idle(this, hands)
-        this = use.enter_context(with_maps(this, scene, prints, store, hands.device, state is not None))
-        start = beginning(this, scene, store, state)
-        claim(this, backend, prints, notes, scene.frame)
+        warn_of_no_edits(run)
+        warn_of_idle(run, compute)
+        run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, state is not None))
+        start = beginning(run, scene, caches, state)
+        claim(run, backend, prints, notes, scene.frame)
         with kept(out):
             if start is not None:
-                discard_results(this)
-                state = optimise(Job(this, scene, rasterizer, every, start.given, meter, cloud=start), state)
+                discard_results(run)
+                state = optimise(Job(run, scene, rasterizer, intervals, start.given, meter, cloud=start), state)
                 del start  # the memory of its photographs is free for what comes
             if recipe.partition is not None:
                 state = None  # it is in the folder
-                this, state = tuned(Site(this, scene, rasterizer, every, store), hands)
-            this, state = refined(Site(this, scene, rasterizer, every, store), state)
-            return results(Site(this, scene, rasterizer, every, store), state, hands.device, meter)
+                run, state = tune_blocks(RunContext(run, scene, rasterizer, intervals, caches), compute)
+            run, state = refine_model(RunContext(run, scene, rasterizer, intervals, caches), state)
+            return results(RunContext(run, scene, rasterizer, intervals, caches), state, compute.device, meter)
 
 
-def refuse_unready(this: Run, hands: Hands, store: Store) -> None:
+def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
-    refuse_file(this.out)
-    store.bytes(), store.maps_bytes()
-    if this.recipe.partition is not None:
-        hands.workers.ready()
-    if this.recipe.mesh is not None:
-        this.recipe.mesh.ready()
+    refuse_file(run.out)
+    caches.bytes(), caches.maps_bytes()
+    if run.recipe.partition is not None:
+        compute.workers.ready()
+    if run.recipe.mesh is not None:
+        run.recipe.mesh.ready()
 
 
-def beginning(this: Run, scene: Scene, store: Store, state: StageState | None) -> Beginning | None:
+def beginning(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
     """Where pretraining begins and what it looks at, also where it goes on; None where it has all its steps."""
-    if state is not None and state.index >= this.recipe.pretrain.steps:
+    if state is not None and state.index >= run.recipe.pretrain.steps:
         return None
-    known = priors_of(this, scene, begun=state is not None)
-    return Beginning(this, scene, read_ahead(this.data, scene, this.recipe.pretrain.losses, store, known), known)
+    known = priors_of(run, scene, begun=state is not None)
+    return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 
 
-def results(site: Site, state: StageState, device: Device, meter: Meter) -> dict[str, Any]:
+def results(ctx: RunContext, state: StageState, device: Device, meter: Meter) -> dict[str, Any]:
     """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
-    this, scene, rasterizer = site.this, site.scene, site.rasterizer
-    if this.metrics.exists() and this.cloud.exists() and meshed(this, state.index):
-        say(f"{this.out} is finished; delete {this.metrics.name} in it to measure again")
-        return read_metrics(this.out)
-    if not this.cloud.exists():
-        export(this, state, scene)
-    if not meshed(this, state.index):
-        mesh(site, state, device)
-    return evaluate(this, state, scene, rasterizer, meter, lpips_weights="gpu")
+    run, scene, rasterizer = ctx.run, ctx.scene, ctx.rasterizer
+    if run.metrics.exists() and run.cloud.exists() and has_mesh(run, state.index):
+        say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
+        return read_metrics(run.out)
+    if not run.cloud.exists():
+        export(run, state, scene)
+    if not has_mesh(run, state.index):
+        mesh(ctx, state, device)
+    return evaluate(run, state, scene, rasterizer, meter, lpips_weights="gpu")
 
 
-def export(this: Run, state: StageState, scene: Scene) -> None:
+def export(run: Run, state: StageState, scene: Scene) -> None:
     """Write the points and the cameras in the frame of the input."""
-    params = this.stage.finished(state)
-    write_cameras(this.cameras, scene)
-    emit(FileWritten(this.cameras, "cameras"))
-    write_splats(this.cloud, to_table(this.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
-    emit(FileWritten(this.cloud, "points"))
+    params = run.stage.finished(state)
+    write_cameras(run.cameras, scene)
+    emit(FileWritten(run.cameras, "cameras"))
+    write_splats(run.cloud, to_table(run.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
+    emit(FileWritten(run.cloud, "points"))
 
 
-def mesh(site: Site, state: StageState, device: Device) -> None:
+def mesh(ctx: RunContext, state: StageState, device: Device) -> None:
     """Make the mesh that the recipe wants, with depth maps if it wants some, also for a run that was trained without.
 
     A surface that cannot be had is told, and costs no measurements.
     """
-    mesher, out = site.this.recipe.mesh, site.this.out
+    mesher, out = ctx.run.recipe.mesh, ctx.run.out
     try:
-        with with_maps_to_mesh(site.this, mesher, site.scene, site.store, device) as this:
-            what = subject(this, state, site.scene, site.rasterizer, cache_bytes("auto"), mesher)
-            deliver(this, mesher, Delivery(), what, state.index)
+        with with_maps_to_mesh(ctx.run, mesher, ctx.scene, ctx.caches, device) as run:
+            what = subject(run, state, ctx.scene, ctx.rasterizer, cache_bytes("auto"), mesher)
+            make_mesh(run, mesher, MeshOutput(), what, state.index)
     except BadInput as error:
         emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
 
 
 def evaluate(
-    this: Run,
+    run: Run,
     state: StageState,
     scene: Scene,
     rasterizer: Rasterizer,
@@ -190,7 +195,7 @@ def evaluate(
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.
 
     Args:
-        this: The run.
+        run: The run.
         state: Its splats.
         scene: Its data.
         rasterizer: What draws.
@@ -199,11 +204,11 @@ def evaluate(
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)
-    draw, colors = (drawing(this, state, rasterizer, geometry) for geometry in (True, False))
+    draw, colors = (drawing(run, state, rasterizer, geometry) for geometry in (True, False))
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
-        write_picture(picture_path(this.pictures, view.name), panel(photo, maps))
+        write_picture(picture_path(run.pictures, view.name), panel(photo, maps))
 
     with meter.adding("pictures") if meter else nullcontext():
         measured = evaluate_views(
@@ -212,7 +217,7 @@ def evaluate(
             draw,
             timed=colors,
             show=show,
-            correct_color=this.shown.appearance is not None,
+            correct_color=run.shown.appearance is not None,
             masks=mask_cache(scene.held_out, ahead),
             networks=perceptual,
         )
@@ -220,20 +225,20 @@ def evaluate(
         measured["images"]["lpips_not_measured"] = lacking
     if meter:
         emit(MemoryTaken(meter.report()))
-    record = read_record(this.out)
+    record = read_record(run.out)
     memory = record.get("memory_bytes") or {}
     metrics = {
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
         "points": len(state.points),
-        "steps": sum(replace(this, part=part).stage.steps for part in this.parts[: this.parts.index(this.part) + 1]),
+        "steps": sum(replace(run, part=part).stage.steps for part in run.parts[: run.parts.index(run.part) + 1]),
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
         "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
         "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,
         "memory_bytes": memory,
     }
-    return note_metrics(this.metrics, metrics)
+    return note_metrics(run.metrics, metrics)
 
 
 def opened(out: Path) -> Run:
@@ -252,26 +257,26 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     Raises:
         BadInput: The folder holds no run, or one that is not finished.
     """
-    this = opened(out)
-    scene = read(this.data)
+    run = opened(out)
+    scene = read(run.data)
     state, ahead = None, None
-    for part in reversed(this.parts):
-        this = replace(this, part=part)
-        if (state := saved(this, seen_by(this, scene))) is not None:
+    for part in reversed(run.parts):
+        run = replace(run, part=part)
+        if (state := load_state(run, seen_by(run, scene))) is not None:
             break
         ahead = part
     step, again = state.index if state else 0, "give its surfkit train command again to finish it"
-    if step < this.stage.steps:
-        raise BadInput(f"{out}: the run stopped after step {step} of {this.stage.steps}; {again}")
+    if step < run.stage.steps:
+        raise BadInput(f"{out}: the run stopped after step {step} of {run.stage.steps}; {again}")
     if ahead is not None:
         raise BadInput(f"{out}: {'not all blocks are tuned' if ahead == 'tune' else f'{ahead} is not begun'}; {again}")
-    return this, state, scene
+    return run, state, scene
 
 
-def warn_of_no_edits(this: Run) -> None:
+def warn_of_no_edits(run: Run) -> None:
     """Say which stages cannot add a point, though they are to."""
-    for part in this.parts:
-        run = replace(this, part=part)
+    for part in run.parts:
+        run = replace(run, part=part)
         steps = run.stage.densify.edit_steps(run.stage.steps) if run.stage.densify is not None else None
         if steps is not None and len(steps) == 0:
             emit(
@@ -282,9 +287,9 @@ def warn_of_no_edits(this: Run) -> None:
             )
 
 
-def warn_of_idle(this: Run, hands: Hands) -> None:
+def warn_of_idle(run: Run, compute: Compute) -> None:
     """Say that an executor was chosen for nothing."""
-    if this.recipe.partition is None and hands.workers != Inline():
+    if run.recipe.partition is None and compute.workers != Inline():
         emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
 
 

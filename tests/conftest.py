@@ -188,11 +188,11 @@ class Crowded:
     def __len__(self):
         return 20
 
-    def survey(self, alpha_power=0.5, transmittance_power=0.5):
-        from surfkit.densify.base import Tally
+    def contributions(self, alpha_power=0.5, transmittance_power=0.5):
+        from surfkit.densify.base import Contribution
 
         seen = (self.contribution > 0).long()
-        return Tally(self.contribution**alpha_power, self.contribution**alpha_power, 50 * seen, 10 * seen)
+        return Contribution(self.contribution**alpha_power, self.contribution**alpha_power, 50 * seen, 10 * seen)
 
     def each(self, alpha_power, transmittance_power):
         for at in range(20):
@@ -218,8 +218,8 @@ def crowd():
         index=1_000,
         steps=30_000,
         seen=torch.rand(count, generator=draw) > 0.3,
-        shape=Surfel2D().shape(params, 3),
-        grad=4e-4 * torch.rand(count, generator=draw),
+        splats=Surfel2D().activate(params, 3),
+        grad_norm=4e-4 * torch.rand(count, generator=draw),
         radii=50 * torch.rand(count, generator=draw),
         image_px=800,
         views=Crowded(contribution),

@@ -17,14 +17,14 @@ import torch
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.oom_retry import ANEW, BARE, HELD, capped, following
-from surfkit.blocks.schedule import Hands, Unfinished
+from surfkit.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, capped, next_fallback
+from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
 from surfkit.execute import Pool
-from surfkit.execute.base import Ended, Job
+from surfkit.execute.base import Job, JobResult
 from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare, QuantileGrid
@@ -35,7 +35,7 @@ from surfkit.readers.depth_prior import alignment
 from surfkit.readers.read import read as read_scene
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.scene import memory
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -43,7 +43,7 @@ from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
 from surfkit.train.stage import Stage, Trainer
 
 STEPS = 12
-EVERY = Every(checkpoint=3, pictures=0)
+EVERY = Intervals(checkpoint=3, pictures=0)
 GROWING = ADC(threshold=1e-12, start=3, every=4, until=9, cull_opacity=0.0)
 """Twice as many points after step 4, and again after step 8."""
 
@@ -66,7 +66,7 @@ def recipe() -> Recipe:
 @pytest.fixture(scope="module")
 def undisturbed(data, recipe, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed") / "run"
-    run(recipe, data, out, Hands("cpu"), EVERY)
+    run(recipe, data, out, Compute("cpu"), EVERY)
     return out
 
 
@@ -96,7 +96,7 @@ def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
 
     def optimising(job, state):
         def short(self, state):
-            if job.this.block == block and len(state.points) > limit:
+            if job.run.block == block and len(state.points) > limit:
                 raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
             return step(self, state)
 
@@ -111,11 +111,11 @@ def test_a_block_for_which_memory_is_short_stops_to_grow(undisturbed, data, reci
     before = points_of(undisturbed, 0)
     with monkeypatch.context() as patch:
         short_above(300, patch)
-        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     state = read_state(tmp_path / "blocks" / "000")
-    assert (state.status, state.rung, state.attempts, state.kind) == ("done", HELD, 3, None)
+    assert (state.status, state.fallback, state.attempts, state.kind) == ("done", NO_GROWTH, 3, None)
     assert points_of(tmp_path, 0) <= state.most_points == 199 < 700 < before
-    assert read_state(tmp_path / "blocks" / "001").rung == 0 and points_of(tmp_path, 1) > 700
+    assert read_state(tmp_path / "blocks" / "001").fallback == 0 and points_of(tmp_path, 1) > 700
     said = notes(tmp_path)
     assert [text for text in said if text.startswith("block 0 failed: out of memory")][0].endswith(
         "though photographs are no longer kept in it; it is tried again: photographs are not kept in memory, which "
@@ -129,17 +129,19 @@ def test_a_block_for_which_memory_is_short_stops_to_grow(undisturbed, data, reci
     main(["status", str(tmp_path)])
     told = capsys.readouterr().out
     assert "photographs not kept in memory; then at most 199 points from step 3 on" in " ".join(told.split())
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)  # and it is not forgotten
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)  # and it is not forgotten
     assert notes(tmp_path) == said
 
 
 def test_a_block_too_large_since_its_checkpoint_begins_anew(data, recipe, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         short_above(300, patch)
-        run(recipe, data, tmp_path, Hands("cpu"), replace(EVERY, checkpoint=4))
+        run(recipe, data, tmp_path, Compute("cpu"), replace(EVERY, checkpoint=4))
     state = read_state(tmp_path / "blocks" / "000")
-    assert (state.rung, state.most_points, state.begun_points) == (ANEW, 199, 199) and points_of(tmp_path, 0) <= 199
-    assert state.eased[1:] == ("at most 390 points from step 4 on", "begun anew, at most 199 points")
+    assert (state.fallback, state.most_points, state.begun_points) == (START_AGAIN, 199, 199) and points_of(
+        tmp_path, 0
+    ) <= 199
+    assert state.reduced[1:] == ("at most 390 points from step 4 on", "begun anew, at most 199 points")
 
 
 def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, tmp_path, monkeypatch):
@@ -148,22 +150,24 @@ def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, 
         with pytest.raises(
             Unfinished, match="block 0 failed: out of memory .*; more blocks or smaller .*; the others are done"
         ):
-            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+            run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     state = read_state(tmp_path / "blocks" / "000")
-    assert (state.kind, state.rung, state.attempts) == ("oom", HELD, 3), "it has not grown: nothing to begin anew for"
+    assert (state.kind, state.fallback, state.attempts) == ("oom", NO_GROWTH, 3), (
+        "it has not grown: nothing to begin anew for"
+    )
     assert read_state(tmp_path / "blocks" / "001").status == "done"
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     state = read_state(tmp_path / "blocks" / "000")
-    assert (state.status, state.rung) == ("done", HELD), "the same command goes on from the rung"
+    assert (state.status, state.fallback) == ("done", NO_GROWTH), "the same command goes on from the rung"
 
 
 def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Real processes with a real limit: 10 MB for each point, and 3 GB more than the program has."""
     command, out = blocks.job_of, without_block_0(undisturbed, tmp_path / "run")
-    write_state(out / "blocks" / "000", rung=BARE, eased=("photographs not kept in memory",))
+    write_state(out / "blocks" / "000", fallback=NO_CACHE, reduced=("photographs not kept in memory",))
 
-    def limited(site, plan, index, hands):
-        job = command(site, plan, index, hands)
+    def limited(ctx, plan, index, compute):
+        job = command(ctx, plan, index, compute)
         code = (
             "import resource, sys, psutil, torch\nfrom surfkit.cli import main\nimport surfkit.cli.tune\n"
             "from surfkit.train.stage import Trainer\nstep = Trainer.step\n"
@@ -177,10 +181,10 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
 
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "job_of", limited)
-        run(recipe, data, out, Hands("cpu", Pool(workers=2)), EVERY)
+        run(recipe, data, out, Compute("cpu", Pool(workers=2)), EVERY)
     state = read_state(out / "blocks" / "000")
     log = (out / "blocks" / "000" / "log.txt").read_text()
-    assert (state.status, state.rung, state.most_points) == ("done", HELD, 199), log
+    assert (state.status, state.fallback, state.most_points) == ("done", NO_GROWTH, 199), log
     assert "block 0: for want of memory: at most 199 points from step 3 on" in notes(out), "a worker's note"
     assert "are lowered from" not in log, "on its rung there is no cache to lower"
 
@@ -189,16 +193,16 @@ def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, rec
     """SIGKILL, and the system counts one more; the first rung leaves the result as it is."""
     command, kills, out = blocks.job_of, iter([7, 8]), without_block_0(undisturbed, tmp_path / "run")
 
-    def deadly(site, plan, index, hands):
-        job = command(site, plan, index, hands)
+    def deadly(ctx, plan, index, compute):
+        job = command(ctx, plan, index, compute)
         first = index == 0 and not read_state(job.folder).error
         return replace(job, command=("-c", "import os; os.kill(os.getpid(), 9)")) if first else job
 
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "job_of", deadly)
         patch.setattr(blocks, "oom_kills", lambda: next(kills))
-        run(recipe, data, out, Hands("cpu", Pool(workers=2)), EVERY)
-    assert read_state(out / "blocks" / "000").rung == BARE and same(out, undisturbed)
+        run(recipe, data, out, Compute("cpu", Pool(workers=2)), EVERY)
+    assert read_state(out / "blocks" / "000").fallback == NO_CACHE and same(out, undisturbed)
     assert any("ended by SIGKILL while memory ran out on this machine" in text for text in notes(out))
     assert not any("less than the recipe" in text for text in notes(out))
 
@@ -212,10 +216,10 @@ def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, rec
     ],
 )
 def test_clusters_tell_that_memory_gave_out(data, recipe, tmp_path, why, kind):
-    site = tuning.Site(Run(tmp_path, recipe, data), None, None, EVERY, None)
-    job = Job(0, site.place(0), lambda: 0, ())
-    assert blocks.told(site, Ended(job, 70, why)) == f"failed: {why}"
-    assert read_state(site.place(0)).kind == kind
+    ctx = tuning.RunContext(Run(tmp_path, recipe, data), None, None, EVERY, None)
+    job = Job(0, ctx.place(0), lambda: 0, ())
+    assert blocks.told(ctx, JobResult(job, 70, why)) == f"failed: {why}"
+    assert read_state(ctx.place(0)).kind == kind
 
 
 def test_the_system_counts_whom_it_ends(tmp_path, monkeypatch):
@@ -235,10 +239,13 @@ def test_the_system_counts_whom_it_ends(tmp_path, monkeypatch):
     assert memory.oom_kills() == 3
 
 
-def test_rungs():
-    assert following(BlockState(), None).number == BARE and following(BlockState(rung=BARE), None) is None
-    assert following(BlockState(rung=HELD, most_points=9, begun_points=9), GROWING) is None
-    assert following(BlockState(rung=ANEW, most_points=9, begun_points=5), GROWING) is None
+def test_fallbacks():
+    assert (
+        next_fallback(BlockState(), None).number == NO_CACHE
+        and next_fallback(BlockState(fallback=NO_CACHE), None) is None
+    )
+    assert next_fallback(BlockState(fallback=NO_GROWTH, most_points=9, begun_points=9), GROWING) is None
+    assert next_fallback(BlockState(fallback=START_AGAIN, most_points=9, begun_points=5), GROWING) is None
     assert capped(GROWING, 50).filters == (CountCap(50),)
 
 
@@ -246,7 +253,7 @@ def test_rungs():
 def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp_path, monkeypatch, workers):
     """Room for what is small only: one line, the last checkpoint stays, and later the same bits."""
     out, limits = without_block_0(undisturbed, tmp_path / "run"), resource.getrlimit(resource.RLIMIT_FSIZE)
-    hands = Hands("cpu") if workers is None else Hands("cpu", workers)
+    compute = Compute("cpu") if workers is None else Compute("cpu", workers)
     size = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
     work = blocks.work
 
@@ -257,14 +264,14 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     monkeypatch.setattr(blocks, "work", limited)
     try:
         with pytest.raises(DiskFull, match=r"block \d failed: .*the disk is full .*: free some space, and the same"):
-            run(recipe, data, out, hands, EVERY)
+            run(recipe, data, out, compute, EVERY)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     last, damage = checkpoint.load_last(out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     assert read_state(out / "blocks" / "000").kind == "disk" and not list(out.rglob(".*.part"))
     assert 0 < last.index < STEPS and damage is None
     monkeypatch.setattr(blocks, "work", work)
-    run(recipe, data, out, Hands("cpu"), EVERY)
+    run(recipe, data, out, Compute("cpu"), EVERY)
     assert same(out, undisturbed)
 
 
@@ -273,11 +280,11 @@ def test_blocks_do_not_begin_without_room(undisturbed, data, recipe, tmp_path, m
     usage = type("Usage", (), {"free": whole // 2})
     monkeypatch.setattr(foresight.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(BadInput, match=r"blocks need at least \S+ MB of disk .* are free; make room"):
-        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert not list((tmp_path / "blocks").glob("00*"))
     usage.free = 2 * whole
     monkeypatch.setattr(foresight, "free_bytes", lambda: 1 << 20)
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     said = notes(tmp_path)
     assert any("may need about" in text and "of disk" in text for text in said)
     assert any("may need about" in text and "of memory" in text for text in said)
@@ -324,15 +331,15 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
     assert map_path(tmp_path / "data", "view_003.png").exists()
     read, given = tuning.read_ahead, []
 
-    def reading(data, scene, losses, store, known):
-        given.append((scene, read(data, scene, losses, store, known)))
+    def reading(data, scene, losses, caches, known):
+        given.append((scene, read(data, scene, losses, caches, known)))
         return given[-1][1]
 
     monkeypatch.setattr(tuning, "read_ahead", reading)
     deep = {"losses": recipe.tune.losses | {"depth": DepthRegression()}}
     pretrain, tune = replace(recipe.pretrain, **deep), replace(recipe.tune, **deep)
     apart = replace(recipe, pretrain=pretrain, tune=tune, assign=PictureShare(0.6))
-    run(apart, Data(tmp_path / "data"), tmp_path / "run", Hands("cpu"), EVERY)
+    run(apart, Data(tmp_path / "data"), tmp_path / "run", Compute("cpu"), EVERY)
     whole = alignment(Data(tmp_path / "data"), read_scene(Data(tmp_path / "data")))
     assert len(given) == 2 and len(whole.fits) == 9
     for scene, material in given:
@@ -351,7 +358,7 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 
     def optimising(job, state):
         def spoilt(self, state):
-            if job.this.block == 1 and state.index == 7:
+            if job.run.block == 1 and state.index == 7:
                 raise Diverged(8, "view_001.png", "the losses are nan")
             return step(self, state)
 
@@ -360,7 +367,7 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 
     monkeypatch.setattr(tuning, "optimise", optimising)
     with pytest.raises(Unfinished, match="block 1 failed: .*the losses are nan, also after .* halved 2 times"):
-        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     states = [read_state(tmp_path / "blocks" / name) for name in ("000", "001")]
     assert [(state.status, state.kind, state.attempts) for state in states] == [("done", None, 1), ("failed", "nan", 1)]
     assert sum("block 1: step 8" in text and "back to step 6" in text for text in notes(tmp_path)) == 2

@@ -18,7 +18,7 @@ from surfkit.appearance.exposure import Exposure
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.schedule import Hands, Unfinished
+from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
@@ -29,15 +29,15 @@ from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.recipe import Recipe
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train import streaming as pieces
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Stage
 
 STEPS = 12
-EVERY = Every(checkpoint=4, pictures=0)
+EVERY = Intervals(checkpoint=4, pictures=0)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def recipe() -> Recipe:
 @pytest.fixture(scope="module")
 def undisturbed(data, recipe, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed") / "run"
-    run(recipe, data, out, Hands("cpu"), EVERY)
+    run(recipe, data, out, Compute("cpu"), EVERY)
     return out
 
 
@@ -86,8 +86,8 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
     assert metrics["steps"] == 2 * STEPS, "of both stages"
     stages = map(json.loads, (undisturbed / "events.jsonl").read_text().splitlines())
     assert sum(line["event"] == "StepDone" for line in stages) == STEPS, "blocks have journals of their own"
-    this, state, _ = load_run(undisturbed)
-    assert this.part == "tune" and state.index == STEPS
+    loaded, state, _ = load_run(undisturbed)
+    assert loaded.part == "tune" and state.index == STEPS
 
 
 def test_merged_points_lie_in_their_block(undisturbed):
@@ -109,9 +109,9 @@ def test_tuning_changes_what_it_should(undisturbed):
 
 
 def test_a_pool_comes_to_the_same_bits(undisturbed, data, recipe, tmp_path):
-    run(recipe, data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert same(tmp_path, undisturbed)
-    again = run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    again = run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert again["points"] == len(params(undisturbed)["means"])
 
 
@@ -119,22 +119,22 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
     """Ctrl-C between two steps of the second block; then another executor finishes."""
     guarded = blocks.guarded
 
-    def stopped(site, plan, index):
+    def stopped(ctx, plan, index):
         if index == 1:
-            site = replace(site, every=Every(checkpoint=4, pictures=0))
+            ctx = replace(ctx, intervals=Intervals(checkpoint=4, pictures=0))
             monkeypatch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
-        return guarded(site, plan, index)
+        return guarded(ctx, plan, index)
 
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "guarded", stopped)
         with pytest.raises(KeyboardInterrupt):
-            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+            run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     monkeypatch.undo()
     state = read_state(tmp_path / "blocks" / "001")
     assert (state.status, state.kind) == ("failed", "interrupted") and not (tmp_path / "metrics.json").exists()
     with pytest.raises(BadInput, match="not all blocks are tuned"):
         load_run(tmp_path)
-    run(recipe, data, tmp_path, Hands("cpu", Pool(workers=1)), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu", Pool(workers=1)), EVERY)
     assert same(tmp_path, undisturbed)
 
 
@@ -164,8 +164,8 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
     """The first process of block 0 kills itself in the middle of its steps; the next one goes on."""
     command = blocks.job_of
 
-    def deadly(site, plan, index, hands):
-        job = command(site, plan, index, hands)
+    def deadly(ctx, plan, index, compute):
+        job = command(ctx, plan, index, compute)
         if index == 0 and not (tmp_path / "killed").exists():
             code = (
                 "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
@@ -178,7 +178,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(blocks, "job_of", deadly)
-        run(recipe, data, tmp_path / "run", Hands("cpu", Pool(workers=2)), EVERY)
+        run(recipe, data, tmp_path / "run", Compute("cpu", Pool(workers=2)), EVERY)
     assert (
         tmp_path / "killed"
     ).exists() and "block 0 was ended by SIGKILL; it is tried again" in capsys.readouterr().err
@@ -189,20 +189,20 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
     optimise = tuning.optimise
 
     def failing(job, state):
-        if job.this.out.name == "001":
+        if job.run.out.name == "001":
             raise Fault("numbers are not finite")
         return optimise(job, state)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuning, "optimise", failing)
         with pytest.raises(Unfinished, match="block 1 failed: numbers are not finite; the others are done") as told:
-            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+            run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert told.value.status == 3
     assert read_state(tmp_path / "blocks" / "000").status == "done"
     assert main(["status", str(tmp_path)]) == 3
     said = capsys.readouterr().out
     assert "1 of 2 done" in said and "failed (fault): numbers are not finite, step 0 of 12" in said
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert same(tmp_path, undisturbed)
 
 
@@ -212,7 +212,7 @@ def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(blocks, "ARRIVE_S", 0.2)
     monkeypatch.setattr(blocks, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
     with pytest.raises(Unfinished, match="block 1 failed: nothing of its work has come to"):
-        run(recipe, data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
 
 
 def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_path):
@@ -240,14 +240,14 @@ def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_p
 
 
 def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 4))
-    run(longer, data, tmp_path, Hands("cpu"), EVERY)
+    run(longer, data, tmp_path, Compute("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
     before = read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record)
     (tmp_path / "blocks" / "plan.json").unlink()
-    run(longer, data, tmp_path, Hands("cpu"), EVERY)
+    run(longer, data, tmp_path, Compute("cpu"), EVERY)
     assert read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record) == before, "nothing is overwritten"
     assert (tmp_path / "blocks-before-2" / "000").is_dir() and "blocks-before-2" in (tmp_path / "run.json").read_text()
 
@@ -257,17 +257,17 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
     shutil.rmtree(tmp_path / "run" / "blocks" / "001")
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
     (tmp_path / "run" / "blocks" / ".merge.json.7.part").write_bytes(b"of a process that is gone")
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".*.part"))
 
 
 def test_blocks_of_a_finished_run_can_be_deleted(undisturbed, data, recipe, tmp_path, capsys):
     shutil.copytree(undisturbed, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "blocks")
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert "is finished" in capsys.readouterr().err and not (tmp_path / "run" / "blocks").exists()
     shutil.rmtree(tmp_path / "run" / "tune")
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed), "without the merged model they are tuned again"
 
 
@@ -278,7 +278,7 @@ def test_a_damaged_result_is_not_merged(undisturbed, data, recipe, tmp_path):
     path = tmp_path / "run" / "blocks" / "000" / "tune" / "checkpoint.safetensors"
     content = path.read_bytes()
     path.write_bytes(content[:-8] + b"damaged!")
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed)
     assert "block 0 has lost steps" in (tmp_path / "run" / "run.json").read_text()
 
@@ -288,14 +288,14 @@ def test_a_longer_coarse_stage_makes_the_old_result_void(undisturbed, data, reci
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 8))
     monkeypatch.setattr(pipeline, "optimise", stop_after(pipeline.optimise, STEPS + 3))
     with pytest.raises(KeyboardInterrupt):
-        run(longer, data, tmp_path / "run", Hands("cpu"), EVERY)
+        run(longer, data, tmp_path / "run", Compute("cpu"), EVERY)
     with pytest.raises(BadInput, match=f"stopped after step {STEPS + 3} of {STEPS + 8}"):
         load_run(tmp_path / "run")
 
 
 def test_exposures_of_blocks_are_folded(data, recipe, tmp_path):
     tune = replace(recipe.tune, appearance=Exposure())
-    metrics = run(replace(recipe, tune=tune), data, tmp_path, Hands("cpu"), EVERY)
+    metrics = run(replace(recipe, tune=tune), data, tmp_path, Compute("cpu"), EVERY)
     assert metrics["images"]["psnr_corrected"] > 8 and load_run(tmp_path)[1].looks
 
 
@@ -329,14 +329,14 @@ def test_a_plan_that_cannot_be(undisturbed, data, recipe, tmp_path):
         spoil(record["plan"])
         path.write_text(json.dumps(record))
         with pytest.raises(BadInput, match="plan"):
-            run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+            run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
 
 
 def test_blocks_of_a_plan_that_is_gone_are_put_aside(undisturbed, data, recipe, tmp_path):
     shutil.copytree(undisturbed, tmp_path / "run")
     (tmp_path / "run" / "blocks" / "plan.json").unlink()
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=STEPS + 4))
-    run(longer, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(longer, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert (tmp_path / "run" / "blocks-before" / "000").is_dir()
     began = (tmp_path / "run" / "blocks" / "000" / "events.jsonl").read_text().splitlines()
     assert sum('"StepDone"' in line for line in began) == STEPS, "from the first step, not on top of the old ones"
@@ -353,17 +353,17 @@ def test_tune_by_hand(undisturbed, tmp_path, capsys):
 def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, monkeypatch):
     """From pieces of 7 points, against the whole coarse model and pictures of all of it."""
     monkeypatch.setattr(pieces, "ROWS", 7)
-    this, _, scene = load_run(undisturbed)
+    loaded, _, scene = load_run(undisturbed)
     plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
     rasterizer = select("cpu")[0]
-    site = tuning.Site(this, scene, rasterizer, EVERY, Store())
+    ctx = tuning.RunContext(loaded, scene, rasterizer, EVERY, CacheSettings())
     coarse = checkpoint.load(undisturbed / "pretrain" / "checkpoint.safetensors")
-    splats = this.recipe.primitive.shape(coarse.points.params, coarse.sh_degree)
+    splats = loaded.recipe.primitive.activate(coarse.points.params, coarse.sh_degree)
     for index in range(2):
         views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
         wanted = plan.cells.owner(coarse.points.params["means"]) == index
-        wanted |= rasterizer.render(splats, views[0].camera, this.recipe.pretrain.near).seen
-        begun = tuning.Start(site, plan, index, views)()
+        wanted |= rasterizer.render(splats, views[0].camera, loaded.recipe.pretrain.near).seen
+        begun = tuning.Start(ctx, plan, index, views)()
         found = begun.params
         assert begun.sh_degree == coarse.sh_degree == 3
         assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
@@ -389,30 +389,30 @@ def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_pa
         assert main(["tune", str(tmp_path / "run"), "1", "--device", "cpu"]) == 0
     finally:
         away.rename(model)
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed)
     (folder / "views.npz").write_bytes(b"damaged")
     (folder / "state.json").unlink()
     assert main(["tune", str(tmp_path / "run"), "1"]) == 2 and "views.npz cannot be used" in capsys.readouterr().err
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert read_state(folder).status == "done"
 
 
 def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_path):
     """Not what it owns: what its views show is drawn, too. Its few views are all looked at here, so it is exact."""
-    this, _, scene = load_run(undisturbed)
+    loaded, _, scene = load_run(undisturbed)
     plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
     begun = read_state(undisturbed / "blocks" / "000").begun_points
     assert plan.blocks[0].begins == begun > plan.blocks[0].points
-    fresh = tuning.Site(replace(this, out=tmp_path), scene, select("cpu")[0], EVERY, Store())
-    memory = [blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes]
+    fresh = tuning.RunContext(replace(loaded, out=tmp_path), scene, select("cpu")[0], EVERY, CacheSettings())
+    memory = [blocks.job_of(fresh, plan, 0, Compute("cpu")).memory_bytes]
     write_state(fresh.place(0), begun_points=begun + 10)
-    memory.append(blocks.job_of(fresh, plan, 0, Hands("cpu")).memory_bytes)
+    memory.append(blocks.job_of(fresh, plan, 0, Compute("cpu")).memory_bytes)
     assert memory[1] - memory[0] == 10 * 3 * foresight.POINT_BYTES, "what it has really begun with counts more"
 
 
 def test_an_inline_executor_is_the_default(recipe):
-    assert Hands().workers == Inline() and Hands().device == "auto"
+    assert Compute().workers == Inline() and Compute().device == "auto"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from surfkit.blocks.display import Board, Standing, state_since, table
+from surfkit.blocks.display import BlockDisplay, BlockProgress, state_since, table
 from surfkit.blocks.eta import all_left, in_words, pace, seconds_left, so_far
 from surfkit.cli.status import rows
 from surfkit.execute.state import BlockState, write_state
@@ -49,7 +49,7 @@ def test_time_left_of_all_blocks():
 def test_lines_where_there_is_no_terminal(monkeypatch):
     monkeypatch.setattr("surfkit.blocks.display.PLAIN_EVERY_S", 0.02)
     text = io.StringIO()
-    with Board(lambda: Standing(STATES, 300, 2), Console(file=text)):
+    with BlockDisplay(lambda: BlockProgress(STATES, 300, 2), Console(file=text)):
         time.sleep(0.3)
     lines = text.getvalue().splitlines()
     assert set(lines) == {"1 of 4 blocks done, about 1:10 left; block 0: step 130/300, 0:20, 0:34 left"}
@@ -58,8 +58,8 @@ def test_lines_where_there_is_no_terminal(monkeypatch):
 
 def test_a_table_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=110)
-    eased = replace(RUNNING, eased=("at most 9 points from step 3 on",))
-    console.print(table(Standing(STATES | {2: eased}, 300, 2)))
+    reduced = replace(RUNNING, reduced=("at most 9 points from step 3 on",))
+    console.print(table(BlockProgress(STATES | {2: reduced}, 300, 2)))
     text = console.file.getvalue()
     assert "1 of 4 blocks done" in text and "at most 9 points" in text and "numbers" in text
     assert text.count("/300") == 3 and "silent for" in text, "heard of long ago"
@@ -68,7 +68,7 @@ def test_a_table_on_a_terminal():
 def test_a_larger_display_gets_the_sum(monkeypatch):
     monkeypatch.setattr("surfkit.blocks.display.DRAW_EVERY_S", 0.01)
     seen = []
-    with progress.outer(lambda *line: seen.append(line)), Board(lambda: Standing(STATES, 300)):
+    with progress.outer(lambda *line: seen.append(line)), BlockDisplay(lambda: BlockProgress(STATES, 300)):
         time.sleep(0.2)
     assert seen[0] == ("blocks", 130 + 300 + 70, 1200, "1 of 4 blocks done, about 2:20 left")
 

@@ -11,8 +11,8 @@ from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F4
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.forecast import Begun, begun, memory_of, need
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.forecast import InitialModel, begun, memory_of, need
+from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -28,7 +28,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, write_map, write_record
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 DENSIFY = ADC(start=2, until=STEPS, every=2, threshold=1e-9, reset_every=7, recovery=0)
 
@@ -48,7 +48,7 @@ def runs(data, growing, tmp_path_factory):  # noqa: F811
     found = {}
     for context in ("densified", "tuned", "frozen"):
         found[context] = tmp_path_factory.mktemp(context) / "run"
-        run(replace(growing, context=context), data, found[context], Hands("cpu"), EVERY)
+        run(replace(growing, context=context), data, found[context], Compute("cpu"), EVERY)
     return found
 
 
@@ -63,16 +63,16 @@ def coarse_and_plan(out):
 
 def test_frozen_points_end_as_the_coarse_model_has_them(runs):
     """All that the views of a block show of others', found by drawing the whole coarse model, and in its order."""
-    this, _, scene = load_run(runs["frozen"])
+    loaded, _, scene = load_run(runs["frozen"])
     coarse, plan = coarse_and_plan(runs["frozen"])
     params, rasterizer = coarse.points.params, select("cpu")[0]
-    splats = this.recipe.primitive.shape(params, coarse.sh_degree)
+    splats = loaded.recipe.primitive.activate(params, coarse.sh_degree)
     for index in range(2):
         own = plan.cells.owner(params["means"]) == index
         seen = torch.zeros_like(own)
         for view in scene.train:
             if view.name in plan.blocks[index].views:
-                seen |= rasterizer.render(splats, view.camera, this.recipe.pretrain.near).seen
+                seen |= rasterizer.render(splats, view.camera, loaded.recipe.pretrain.near).seen
         state = block_state(runs["frozen"], index)
         wanted = {name: value[seen & ~own] for name, value in params.items()}
         assert len(wanted["means"]) > 20
@@ -112,7 +112,7 @@ def test_the_plan_tells_the_borders(runs):
 
 
 def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):  # noqa: F811
-    run(replace(growing, context="tuned"), data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+    run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert same(tmp_path, runs["tuned"])
 
 
@@ -120,9 +120,9 @@ def killed_in_block_1(monkeypatch):
     """A worker that is killed without a word after step 7 of block 1, three steps after its last checkpoint."""
     command = blocks.job_of
 
-    def deadly(site, plan, index, hands):
-        job = command(site, plan, index, hands)
-        mark = site.this.out / "killed"
+    def deadly(ctx, plan, index, compute):
+        job = command(ctx, plan, index, compute)
+        mark = ctx.run.out / "killed"
         if index == 1 and not mark.exists():
             code = (
                 "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
@@ -139,7 +139,7 @@ def killed_in_block_1(monkeypatch):
 def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):  # noqa: F811
     """In a pool; what was made in this process, undisturbed, has the same bits, those of the frozen points too."""
     killed_in_block_1(monkeypatch)
-    run(replace(growing, context="frozen"), data, tmp_path, Hands("cpu", Pool(workers=2)), EVERY)
+    run(replace(growing, context="frozen"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert (tmp_path / "killed").exists() and same(tmp_path, runs["frozen"])
     for index in range(2):
         found, true = block_state(tmp_path, index), block_state(runs["frozen"], index)
@@ -152,21 +152,21 @@ def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
         with pytest.raises(KeyboardInterrupt):
-            run(frozen, data, tmp_path, Hands("cpu"), EVERY)
+            run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "blocks" / "000" / "tune" / "checkpoint.safetensors"
     state = checkpoint.load(path)
     state.frozen = {}
     checkpoint.save(path, state)
     with pytest.raises(blocks.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"):
-        run(frozen, data, tmp_path, Hands("cpu"), EVERY)
+        run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     assert checkpoint.load(path).index == 6 and "delete" in capsys.readouterr().err
     with pytest.raises(BadInput, match='context "frozen", and this one has "tuned"'):
-        run(replace(growing, context="tuned"), data, tmp_path, Hands("cpu"), EVERY)
+        run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu"), EVERY)
 
 
 def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):  # noqa: F811
     """Its blocks go on as they began."""
-    run(replace(growing, context="densified"), data, tmp_path, Hands("cpu"), EVERY)
+    run(replace(growing, context="densified"), data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "recipe.json"
     old = json.loads(path.read_text())
     del old["context"]
@@ -185,25 +185,25 @@ def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F81
     deep = replace(recipe.tune, losses=recipe.tune.losses | {"depth": DepthRegression()})
     apart = replace(recipe, tune=deep, assign=PictureShare(0.6), context="frozen")
     made = Data(tmp_path / "data")
-    run(apart, made, tmp_path / "run", Hands("cpu"), EVERY)
+    run(apart, made, tmp_path / "run", Compute("cpu"), EVERY)
     true = block_state(tmp_path / "run", 0)
-    this, _, scene = load_run(tmp_path / "run")
+    loaded, _, scene = load_run(tmp_path / "run")
     _, plan = coarse_and_plan(tmp_path / "run")
     others = {view.name for view in scene.train} - set(plan.blocks[0].views)
     assert others
     for path in (map_path(made.path, name) for name in [*others, *(view.name for view in scene.held_out)]):
         confidence_path(path).unlink()
         path.unlink()
-    checkpoint.discard(this.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    os.unlink(this.out / "blocks" / "000" / "state.json")
-    site = tuning.Site(this, scene, select("cpu")[0], EVERY, Store())
-    assert tuning.guarded(site, plan, 0) == 0
+    checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
+    os.unlink(loaded.out / "blocks" / "000" / "state.json")
+    ctx = tuning.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
+    assert tuning.guarded(ctx, plan, 0) == 0
     again = block_state(tmp_path / "run", 0)
     assert all(torch.equal(value, again.points.params[name]) for name, value in true.points.params.items())
     map_path(made.path, plan.blocks[0].views[0]).unlink()
-    os.unlink(this.out / "blocks" / "000" / "state.json")
-    checkpoint.discard(this.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert tuning.guarded(site, plan, 0) == 2, "its own it does need"
+    os.unlink(loaded.out / "blocks" / "000" / "state.json")
+    checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
+    assert tuning.guarded(ctx, plan, 0) == 2, "its own it does need"
 
 
 @dataclass(frozen=True)
@@ -215,27 +215,27 @@ class Found:
 
 
 def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: F811
-    this, _, scene = load_run(runs["frozen"])
+    loaded, _, scene = load_run(runs["frozen"])
     coarse, plan = coarse_and_plan(runs["frozen"])
     found = {}
     for context in runs:
-        place = replace(this, out=tmp_path / context, recipe=replace(growing, context=context))
+        place = replace(loaded, out=tmp_path / context, recipe=replace(growing, context=context))
         (place.out / "pretrain").mkdir(parents=True)
         os.link(runs["frozen"] / "pretrain" / "checkpoint.safetensors", place.out / "pretrain/checkpoint.safetensors")
-        site = tuning.Site(place, scene, select("cpu")[0], EVERY, Store())
+        ctx = tuning.RunContext(place, scene, select("cpu")[0], EVERY, CacheSettings())
         block = plan.blocks[0]
-        told = need(site, [block], coarse, [])
-        found[context] = Found(memory_of(site, block), told.least_bytes, told.disk_bytes, told.seconds)
+        told = need(ctx, [block], coarse, [])
+        found[context] = Found(memory_of(ctx, block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.points, block.begins
         wanted = {
-            "densified": Begun(both, 0, False),
-            "tuned": Begun(own, both - own, False),
-            "frozen": Begun(own, both - own, True),
+            "densified": InitialModel(both, 0, False),
+            "tuned": InitialModel(own, both - own, False),
+            "frozen": InitialModel(own, both - own, True),
         }
-        assert begun(site, block) == wanted[context]
-        write_state(site.place(0), begun_points=own + 7 if context == "frozen" else both + 7)
+        assert begun(ctx, block) == wanted[context]
+        write_state(ctx.place(0), begun_points=own + 7 if context == "frozen" else both + 7)
         more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * foresight.POINT_BYTES
-        assert memory_of(site, block) - found[context].memory == more
+        assert memory_of(ctx, block) - found[context].memory == more
     around = plan.blocks[0].begins - plan.blocks[0].points
     assert found["densified"].memory - found["tuned"].memory == 2 * around * foresight.POINT_BYTES
     less = foresight.POINT_BYTES - foresight.FROZEN_BYTES

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from surfkit import pipeline
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
@@ -20,14 +20,14 @@ from surfkit.core.tree import evolve
 from surfkit.execute import Pool
 from surfkit.export.ply import read_splats
 from surfkit.partition import QuantileGrid
-from surfkit.pipeline import Every, load_run, run, with_steps
+from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.run import stage as optimise
 from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 STEPS = 60
 
@@ -206,7 +206,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
 def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(optimise.checkpoint, "save", lambda path, state: written.append(state.index))
-    run(with_steps(recipe, 10), data, tmp_path, every=Every(4))
+    run(with_steps(recipe, 10), data, tmp_path, intervals=Intervals(4))
     assert written == [4, 8, 10]
 
 
@@ -239,14 +239,14 @@ def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data,
 @pytest.mark.parametrize(("name", "primitive"), [("2dgs", Surfel2D()), ("citygs2-coarse", Flat3D())])
 def test_points_multiply_in_a_short_run(data, tmp_path, name, primitive):
     recipe = replace(with_steps(recipes()[name], 120), primitive=primitive, mesh=None)
-    run(recipe, data, tmp_path, every=Every(pictures=0))
+    run(recipe, data, tmp_path, intervals=Intervals(pictures=0))
     lines = map(json.loads, (tmp_path / "events.jsonl").read_text().splitlines())
     edits = [line for line in lines if line["event"] == "PointsEdited"]
     assert sum(line["cloned"] + line["split"] > 0 for line in edits) >= 2
 
 
 def test_an_executor_without_blocks_is_told(data, recipe, tmp_path, capsys):
-    run(with_steps(recipe, 2), data, tmp_path, Hands(workers=Pool()))
+    run(with_steps(recipe, 2), data, tmp_path, Compute(workers=Pool()))
     assert "no blocks, so the executor has nothing to do" in capsys.readouterr().err
 
 
@@ -278,20 +278,20 @@ def test_bad_data_leaves_nothing_behind(recipe, tmp_path):
 
 
 def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
-    this, state, scene = load_run(finished[0])
-    assert this.recipe == recipe and this.data == data and state.index == STEPS and len(scene.train) == 10
+    loaded, state, scene = load_run(finished[0])
+    assert loaded.recipe == recipe and loaded.data == data and state.index == STEPS and len(scene.train) == 10
     with pytest.raises(BadInput, match="no run folder"):
         load_run(tmp_path)
 
 
 @pytest.mark.parametrize("copies", [False, True])
 def test_the_budget_of_the_cache_changes_nothing(finished, data, recipe, tmp_path, copies):
-    metrics = run(recipe, data, tmp_path, store=Store("20KB", copies))  # two photographs of 64 x 48
+    metrics = run(recipe, data, tmp_path, caches=CacheSettings("20KB", copies))  # two photographs of 64 x 48
     assert (data.path / "resized").exists() == copies
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished[0] / "point_cloud.ply").read_bytes()
     assert metrics["images"] == finished[1]["images"]
     with pytest.raises(BadInput, match="--cache lots: give a size such as 4GB"):
-        run(recipe, data, tmp_path, store=Store("lots"))
+        run(recipe, data, tmp_path, caches=CacheSettings("lots"))
 
 
 def test_masks_train_end_to_end(data, recipe, tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.lock import USED, held, is_used, used
@@ -30,7 +30,7 @@ from surfkit.readers.made_maps import folder_of, located, read_made
 from surfkit.recipe import Recipe
 from surfkit.start.stereo import StereoStart
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Stage
 
 SWEEP = PlaneSweep(longest=32, neighbours=2, max_planes=16)
@@ -173,15 +173,15 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
             raise KeyboardInterrupt
         return take(self, state)
 
-    from surfkit.run.stage import Every
+    from surfkit.run.stage import Intervals
 
     with monkeypatch.context() as patch:
         patch.setattr(optimise.Trainer, "step", stopped)
         with pytest.raises(KeyboardInterrupt):
-            run(recipe, farm, tmp_path / "run", every=Every(checkpoint=2))
+            run(recipe, farm, tmp_path / "run", intervals=Intervals(checkpoint=2))
     shutil.rmtree(own_cache / "depth")
     with pytest.raises(BadInput, match="leave out --no-prepare to make them again"):
-        run(recipe, farm, tmp_path / "run", store=Store(maps=None))
+        run(recipe, farm, tmp_path / "run", caches=CacheSettings(maps=None))
     seen = counting(monkeypatch)
     run(recipe, farm, tmp_path / "run")
     assert len(seen) == 7
@@ -197,10 +197,10 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
 def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, recipe, tmp_path, own_cache, monkeypatch):
     seen = counting(monkeypatch)
     with pytest.raises(BadInput, match="surfkit prepare depth .*depth:patch-match, or choose start:sparse") as refused:
-        run(recipe, farm, tmp_path / "a", store=Store(maps=None))
+        run(recipe, farm, tmp_path / "a", caches=CacheSettings(maps=None))
     assert "\n" not in str(refused.value) and not (tmp_path / "a").exists()
     sparse = replace(recipe, start=Recipe().start)
-    metrics = run(sparse, farm, tmp_path / "b", store=Store(maps=None))
+    metrics = run(sparse, farm, tmp_path / "b", caches=CacheSettings(maps=None))
     (note,) = record(tmp_path / "b")["notes"]
     assert "has no depth priors, so what needs them is off" in note and metrics["prepare_cpu_seconds"] is None
     assert not seen and not (own_cache / "depth").exists()
@@ -221,10 +221,10 @@ def test_a_loss_of_normals_that_the_maps_do_not_have_is_warned_of(farm, recipe, 
 
 def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, own_cache):
     sparse = replace(recipe, start=Recipe().start)
-    run(sparse, farm, tmp_path / "run", store=Store(maps=None))
-    saved = json.loads((tmp_path / "run/recipe.json").read_text())
-    del saved["depth"], saved["start"]  # as surfkit of before wrote it
-    (tmp_path / "run/recipe.json").write_text(json.dumps(saved))
+    run(sparse, farm, tmp_path / "run", caches=CacheSettings(maps=None))
+    load_state = json.loads((tmp_path / "run/recipe.json").read_text())
+    del load_state["depth"], load_state["start"]  # as surfkit of before wrote it
+    (tmp_path / "run/recipe.json").write_text(json.dumps(load_state))
     (tmp_path / "run/metrics.json").unlink()
     longer = evolve(sparse, "pretrain.steps", 16)
     assert run(longer, farm, tmp_path / "run")["steps"] == 16
@@ -321,15 +321,15 @@ def test_those_longest_unused_go_when_the_cache_is_full(own_cache):
 
 def test_making_maps_makes_room(farm, recipe, tmp_path, own_cache):
     other = entry(own_cache, "other", 10_000, 50)
-    run(recipe, farm, tmp_path / "run", store=Store(maps="1MB"))
+    run(recipe, farm, tmp_path / "run", caches=CacheSettings(maps="1MB"))
     assert other.exists()
-    run(evolve(recipe, "depth.window", 7), farm, tmp_path / "b", store=Store(maps="1KB"))
+    run(evolve(recipe, "depth.window", 7), farm, tmp_path / "b", caches=CacheSettings(maps="1KB"))
     (left,) = (own_cache / "depth").iterdir()
     assert str(left) == record(tmp_path / "b")["data"]["priors"]
     with pytest.raises(BadInput, match="--prepare-cache lots: give a size"):
-        run(recipe, farm, tmp_path / "c", store=Store(maps="lots"))
+        run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="lots"))
     with pytest.raises(BadInput, match="--prepare-cache auto: give a size such as 20GB"):
-        run(recipe, farm, tmp_path / "c", store=Store(maps="auto"))
+        run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="auto"))
 
 
 def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
@@ -351,7 +351,7 @@ def test_blocks_in_processes_of_their_own_find_the_maps(farm, recipe, tmp_path, 
     tune = replace(recipe.pretrain, steps=6, sh_every=1)
     recipe = replace(recipe, partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=tune, min_views=1)
     out = tmp_path / "run"
-    run(recipe, farm, out, Hands("cpu", Pool(2)))
+    run(recipe, farm, out, Compute("cpu", Pool(2)))
     assert not [note for note in record(out)["notes"] if not note.startswith("depth maps of 7")]
     run(recipe, farm, tmp_path / "inline")
     assert (out / "point_cloud.ply").read_bytes() == (tmp_path / "inline/point_cloud.ply").read_bytes()

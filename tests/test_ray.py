@@ -16,7 +16,7 @@ from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # no
 
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.schedule import Hands, Unfinished
+from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.core.check import BadInput
 from surfkit.execute import Ray
 from surfkit.execute.base import LOG, Job
@@ -129,29 +129,29 @@ def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, r
     """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
     guarded, command = blocks.guarded, blocks.job_of
 
-    def stopped(site, plan, index):
+    def stopped(ctx, plan, index):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
-            return guarded(site, plan, index)
+            return guarded(ctx, plan, index)
 
-    def failing(site, plan, index, hands):
-        made = command(site, plan, index, hands)
+    def failing(ctx, plan, index, compute):
+        made = command(ctx, plan, index, compute)
         return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(blocks, "guarded", stopped)
-        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert read_state(tmp_path / "blocks" / "000").step == 6
     with (
         pytest.MonkeyPatch.context() as patch,
         pytest.raises(Unfinished, match="1 failed: machine .*elsewhere") as told,
     ):
         patch.setattr(blocks, "job_of", failing)
-        run(recipe, data, tmp_path, Hands("cpu", workers), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu", workers), EVERY)
     states = [read_state(tmp_path / "blocks" / f"00{at}") for at in (0, 1)]
     assert told.value.status == 3 and [state.status for state in states] == ["done", "failed"]
     assert "going on after step 6 of 12" in (tmp_path / "blocks" / "000" / LOG).read_text()
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert same(tmp_path, undisturbed)
 
 
@@ -169,8 +169,8 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
-    def lingering(site, plan, index, hands):
-        made = command(site, plan, index, hands)
+    def lingering(ctx, plan, index, compute):
+        made = command(ctx, plan, index, compute)
         return replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
 
     def lose():
@@ -182,7 +182,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     thread = threading.Thread(target=lose)
     thread.start()
     monkeypatch.setattr(blocks, "job_of", lingering)
-    run(recipe, data, tmp_path / "run", Hands("cpu", workers), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu", workers), EVERY)
     thread.join()
     assert gone.exists() and same(tmp_path / "run", undisturbed)
     assert "is tried again" not in capsys.readouterr().err, "Ray did that, and waits where no machine is free"

@@ -24,7 +24,7 @@ from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
 from surfkit.evaluate.images import measure as images
 from surfkit.losses.depth import DepthRegression
-from surfkit.pipeline import Every, load_run, run, with_steps
+from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.run import journal
@@ -97,7 +97,7 @@ def interrupted(recipe, data, out, at, monkeypatch, **settings):
 
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(finished, recipe, tmp_path, monkeypatch, capsys):
     (data, whole), out = finished, tmp_path / "run"
-    interrupted(recipe, data, out, 17, monkeypatch, every=Every(8))
+    interrupted(recipe, data, out, 17, monkeypatch, intervals=Intervals(8))
     path = out / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-40])
     run(recipe, data, out)
@@ -108,7 +108,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(finished, recipe, tmp
 
 
 def test_a_damaged_checkpoint_does_not_push_out_the_good_one(data, recipe, tmp_path, monkeypatch):
-    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, every=Every(8))
+    interrupted(recipe, data, tmp_path / "run", 17, monkeypatch, intervals=Intervals(8))
     path = tmp_path / "run" / "pretrain" / "checkpoint.safetensors"
     path.write_bytes(b"")
     interrupted(recipe, data, tmp_path / "run", 18, monkeypatch)
@@ -298,7 +298,7 @@ def spoilt(recipe, at, above, monkeypatch):
 def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data, recipe, tmp_path, monkeypatch):
     out = tmp_path / "run"
     rate = recipe.pretrain.rates["scales"].start
-    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, every=Every(10))
+    metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, intervals=Intervals(10))
     assert metrics["steps"] == STEPS and checkpoint.load(out / "pretrain" / "checkpoint.safetensors").halvings == 2
     assert [("(1 of 2" in text, "(2 of 2" in text) for text in notes(out)] == [(True, False), (False, True)]
     for text in notes(out):
@@ -313,7 +313,7 @@ def test_a_third_time_is_the_last(data, recipe, tmp_path, monkeypatch, at):
         with pytest.raises(
             Fault, match=rf"step {at}, view view_0\d\d.png: the scales are not finite, also after .* 2 t"
         ):
-            run(bad, data, out, every=Every(10))
+            run(bad, data, out, intervals=Intervals(10))
     state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
     assert state.halvings == 2 and state.index == (10 if at == 13 else 0) and len(notes(out)) == 2
     assert all(torch.isfinite(value).all() for value in state.points.params.values())
@@ -327,7 +327,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size // 2, limits[1]))
     try:
         with pytest.raises(Fault, match=r"the disk is full .* last checkpoint in .*run is whole: free some space"):
-            run(recipe, data, out, every=Every(5))
+            run(recipe, data, out, intervals=Intervals(5))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert checkpoint.load(path).index == 9 and not list(out.rglob(".*"))
@@ -345,7 +345,7 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr(optimise.Trainer, "step", short)
         with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
-            run(recipe, data, tmp_path / "run", every=Every(10))
+            run(recipe, data, tmp_path / "run", intervals=Intervals(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
     run(recipe, data, tmp_path / "run")
 
@@ -365,7 +365,7 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
     given, read_ahead = [], pipeline.read_ahead
     monkeypatch.setattr(pipeline, "read_ahead", lambda *args: given.append(read_ahead(*args)) or given[-1])
     monkeypatch.setattr(stage, "adam_step", short)
-    run(recipe, data, out, every=Every(10))
+    run(recipe, data, out, intervals=Intervals(10))
     times = {3: 1, 1: 2}[photographs]
     assert len(notes(out)) == times and kept[-1] <= photographs * 40 * 30 * 3 < kept[11]
     assert all(text.startswith("step 13: out of memory; photographs, masks and depth priors in") for text in notes(out))
@@ -433,8 +433,8 @@ def test_checkpoints_can_be_read_by_whom_the_umask_lets(data, recipe, tmp_path):
 
 
 def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
-    a = run(recipe, data, tmp_path / "a", every=Every(pictures=0))
-    b = run(recipe, data, tmp_path / "b", every=Every(pictures=10))
+    a = run(recipe, data, tmp_path / "a", intervals=Intervals(pictures=0))
+    b = run(recipe, data, tmp_path / "b", intervals=Intervals(pictures=10))
     assert a["images"] == b["images"] and not (tmp_path / "a" / "progress").exists()
     found = sorted(p.relative_to(tmp_path / "b" / "progress").as_posix() for p in (tmp_path / "b").rglob("0000*/*.png"))
     assert found == [f"0000{step}/view_00{view}.png.png" for step in (10, 20) for view in (0, 8)]
@@ -444,6 +444,6 @@ def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
 
 
 def test_the_psnr_along_the_way_is_that_of_the_end(data, recipe, tmp_path):
-    metrics = run(recipe, data, tmp_path / "run", every=Every(pictures=STEPS - 1))
+    metrics = run(recipe, data, tmp_path / "run", intervals=Intervals(pictures=STEPS - 1))
     line = next(line for line in journal.read(tmp_path / "run" / "events.jsonl") if line["event"] == "Measured")
     assert images.statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)

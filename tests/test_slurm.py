@@ -14,11 +14,11 @@ from needs import needs
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
 
 from surfkit.blocks import schedule as blocks
-from surfkit.blocks.schedule import Hands, Unfinished
+from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.core.check import BadInput
 from surfkit.execute import Slurm, slurm
 from surfkit.execute.base import LOG, Job
-from surfkit.execute.remote import Errand
+from surfkit.execute.remote import RemoteJob
 from surfkit.execute.state import read_state
 from surfkit.pipeline import run
 
@@ -97,7 +97,7 @@ def leave(tmp_path, monkeypatch):
 def test_it_is_saved_before_it_is_queued_again(tmp_path):
     """What Slurm is asked to queue again, it ends at once."""
     (tmp_path / "000").mkdir()
-    given = Errand(job(tmp_path, 0, SAVING).command, tmp_path / "000" / LOG)
+    given = RemoteJob(job(tmp_path, 0, SAVING).command, tmp_path / "000" / LOG)
     given.begin()
     wait_for(lambda: (tmp_path / "000" / "began").exists())
     again = given.checkpoint().function
@@ -131,8 +131,8 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
-    def lingering(site, plan, index, hands):
-        made = command(site, plan, index, hands)
+    def lingering(ctx, plan, index, compute):
+        made = command(ctx, plan, index, compute)
         if index == 0 and not reached.exists():
             made = replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
         return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
@@ -145,12 +145,12 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
     thread.start()
     with monkeypatch.context() as patch, pytest.raises(Unfinished, match="block 1 failed: machine .* is not there"):
         patch.setattr(blocks, "job_of", lingering)
-        run(recipe, data, tmp_path / "run", Hands("cpu", Slurm("local", cpus=1, parallel=2)), EVERY)
+        run(recipe, data, tmp_path / "run", Compute("cpu", Slurm("local", cpus=1, parallel=2)), EVERY)
     thread.join()
     log = (tmp_path / "run" / "blocks" / "000" / LOG).read_text()
     assert "stopped after step 7 of 12" in log and "going on after step 7 of 12" in log
     assert read_state(tmp_path / "run" / "blocks" / "000").attempts == 2
-    run(recipe, data, tmp_path / "run", Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
     assert same(tmp_path / "run", undisturbed)
 
 
@@ -245,5 +245,5 @@ def test_without_slurm_or_the_package(monkeypatch, tmp_path):
 def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BadInput, match="sbatch is not on this machine"):
-        run(recipe, data, tmp_path / "run", Hands("cpu", Slurm()), EVERY)
+        run(recipe, data, tmp_path / "run", Compute("cpu", Slurm()), EVERY)
     assert not (tmp_path / "run").exists()

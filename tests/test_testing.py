@@ -143,8 +143,8 @@ class Unseeded(Surfel2D):
 
 
 class Thick(Surfel2D):
-    def shape(self, params, degree):
-        splats = Surfel2D.shape(self, params, degree)
+    def activate(self, params, degree):
+        splats = Surfel2D.activate(self, params, degree)
         return replace(splats, scales=torch.ones(len(splats), 3))
 
 

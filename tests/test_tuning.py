@@ -12,11 +12,11 @@ from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fi
 
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.blocks.worker import signs
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.execute.base import Ended, Job
+from surfkit.execute.base import Job, JobResult
 from surfkit.execute.remote import DRIVER
 from surfkit.execute.state import STALE_S, read_state, write_state
 from surfkit.pipeline import run
@@ -70,21 +70,21 @@ def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
 
 def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
     """Its signs of life would otherwise be those of a block that nobody works on."""
-    site = SimpleNamespace(place=lambda index: folder / "blocks" / f"{index:03}")
-    lost = Ended(Job(0, Path(), lambda: 0, ()), 70, "its machine is gone")
+    ctx = SimpleNamespace(place=lambda index: folder / "blocks" / f"{index:03}")
+    lost = JobResult(Job(0, Path(), lambda: 0, ()), 70, "its machine is gone")
     for seconds, status in ((10, "running"), (STALE_S, "failed")):
         folder = elsewhere(seconds)
-        assert blocks.told(site, lost) == "failed: its machine is gone"
+        assert blocks.told(ctx, lost) == "failed: its machine is gone"
         assert read_state(folder / "blocks" / "000").status == status
 
 
 def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):  # noqa: F811
     monkeypatch.setattr(blocks, "LEAVE_S", 0.2)
     folder = elsewhere(STALE_S - 3)
-    run(recipe, data, folder, Hands("cpu"), EVERY)
+    run(recipe, data, folder, Compute("cpu"), EVERY)
     assert same(folder, undisturbed)
     elsewhere(0)
     monkeypatch.setattr(blocks, "STALE_S", 0.2)
     (folder / "tune" / "checkpoint.safetensors").unlink()
     with pytest.raises(BadInput, match="000: process 7 on far works on the block; wait for its end"):
-        run(recipe, data, folder, Hands("cpu"), EVERY)
+        run(recipe, data, folder, Compute("cpu"), EVERY)

@@ -27,7 +27,7 @@ PLAIN_EVERY_S = 30.0
 
 
 @dataclass(frozen=True)
-class Standing:
+class BlockProgress:
     """Where all blocks stand.
 
     Attributes:
@@ -66,10 +66,10 @@ def state_since(folder: Path, since: float) -> BlockState:
     return replace(state, status="planned") if state.heard < since and state.status != "done" else state
 
 
-class Board:
+class BlockDisplay:
     """Looks at the folders of blocks every so often, in a thread, and shows how far they are."""
 
-    def __init__(self, look: Callable[[], Standing], console: Console | None = None) -> None:
+    def __init__(self, look: Callable[[], BlockProgress], console: Console | None = None) -> None:
         """Show what `look` tells."""
         self.look = look
         self.console = console or Console(stderr=True)
@@ -78,7 +78,7 @@ class Board:
         self.over = threading.Event()
         self.thread = threading.Thread(target=self.watch, name="board", daemon=True)
 
-    def __enter__(self) -> Board:
+    def __enter__(self) -> BlockDisplay:
         if self.outer is None and self.console.is_terminal:
             self.live = Live(console=self.console, auto_refresh=False, transient=True)
             self.live.start()
@@ -93,11 +93,11 @@ class Board:
 
     def watch(self) -> None:
         """Show, until it is over."""
-        every = DRAW_EVERY_S if self.live or self.outer else PLAIN_EVERY_S
-        while not self.over.wait(every):
+        intervals = DRAW_EVERY_S if self.live or self.outer else PLAIN_EVERY_S
+        while not self.over.wait(intervals):
             self.show(self.look())
 
-    def show(self, now: Standing) -> None:
+    def show(self, now: BlockProgress) -> None:
         """Show where the blocks stand."""
         if self.outer is not None:
             made = sum(min(state.step, now.steps) for state in now.states.values())
@@ -108,7 +108,7 @@ class Board:
             self.console.print(now.line(), highlight=False, soft_wrap=True)
 
 
-def table(now: Standing) -> Table | Text:
+def table(now: BlockProgress) -> Table | Text:
     """A row for each block that is worked on or has failed; the others are only counted."""
     told = {index: state for index, state in now.states.items() if state.status in ("running", "failed")}
     if not told:
@@ -120,7 +120,7 @@ def table(now: Standing) -> Table | Text:
         times = [clock(s) if s is not None else "" for s in (so_far(state), seconds_left(state))]
         silent = time.time() - state.heard
         word = (state.error or "") if state.status == "failed" else f"silent for {clock(silent)}" * (silent > 60)
-        notes = "; ".join(filter(None, (word, *state.eased)))
+        notes = "; ".join(filter(None, (word, *state.reduced)))
         bar = ProgressBar(max(1, state.steps), state.step, width=20)
         drawn.add_row(str(index), bar, f"{state.step:,}/{state.steps:,}", *times, notes)
     return drawn

@@ -12,7 +12,7 @@ from surfkit.core.events import Warned, emit, say
 from surfkit.core.memory import size
 from surfkit.execute.state import read_state
 from surfkit.partition.plan import Block
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run
 from surfkit.scene.memory import free_bytes
 from surfkit.train.stage import StageState
@@ -48,7 +48,7 @@ class Need:
 
 
 @dataclass(frozen=True)
-class Begun:
+class BlockPoints:
     """Points that a block begins with.
 
     Attributes:
@@ -71,36 +71,40 @@ class Begun:
         return (self.growing + (FROZEN_PACE if self.frozen else 1) * self.still) / max(1, self.growing + self.still)
 
 
-def begun(site: Site, block: Block) -> Begun:
+def begun(ctx: RunContext, block: Block) -> BlockPoints:
     """The points that a block begins with, from its plan; from its state, if it has been begun."""
-    context, known = site.this.recipe.context, read_state(site.place(block.index)).begun_points
+    around_is, known = ctx.run.recipe.context, read_state(ctx.place(block.index)).begun_points
     around = max(0, block.begins - block.points)
-    if context == "frozen":
-        return Begun(known or block.points, around, True)
+    if around_is == "frozen":
+        return BlockPoints(known or block.points, around, True)
     both = known or block.points + around
-    return Begun(both, 0, False) if context == "densified" else Begun(block.points, max(0, both - block.points), False)
+    return (
+        BlockPoints(both, 0, False)
+        if around_is == "densified"
+        else BlockPoints(block.points, max(0, both - block.points), False)
+    )
 
 
-def memory_of(site: Site, block: Block) -> int:
+def memory_of(ctx: RunContext, block: Block) -> int:
     """Bytes of memory that the points of a block may come to."""
-    grown = GROWN if site.this.recipe.tune.densify is not None else 1.0
-    return begun(site, block).bytes(POINT_BYTES, FROZEN_BYTES, grown)
+    grown = GROWN if ctx.run.recipe.tune.densify is not None else 1.0
+    return begun(ctx, block).bytes(POINT_BYTES, FROZEN_BYTES, grown)
 
 
-def need(site: Site, left: Sequence[Block], coarse: StageState, memory: Sequence[int]) -> Need:
+def need(ctx: RunContext, left: Sequence[Block], coarse: StageState, memory: Sequence[int]) -> Need:
     """What blocks will take.
 
     Args:
-        site: Run and data.
+        ctx: Run and data.
         left: Blocks with steps to make.
         coarse: The coarse model.
         memory: Bytes that each of them is expected to need, where they are tuned on this machine.
     """
-    tune = site.this.recipe.tune
-    steps = [max(0, tune.steps - read_state(site.place(block.index)).step) for block in left]
-    whole = replace(site.this, part="pretrain").checkpoint.stat().st_size
+    tune = ctx.run.recipe.tune
+    steps = [max(0, tune.steps - read_state(ctx.place(block.index)).step) for block in left]
+    whole = replace(ctx.run, part="pretrain").checkpoint.stat().st_size
     each = whole / max(1, len(coarse.points))
-    begins, there = [begun(site, block) for block in left], [size_of(site.block(block.index)) for block in left]
+    begins, there = [begun(ctx, block) for block in left], [size_of(ctx.block(block.index)) for block in left]
     grown = GROWN if tune.densify is not None else 1.0
     least, most = ([points.bytes(each, each / 3, times) for points in begins] for times in (1.0, grown))
     return Need(
@@ -120,13 +124,13 @@ def size_of(block: Run) -> int:
     return sum(path.stat().st_size for path in folder.glob("*.safetensors")) if folder.exists() else 0
 
 
-def tell(site: Site, found: Need) -> None:
+def tell(ctx: RunContext, found: Need) -> None:
     """Say what blocks will take, and warn where that is more than there is.
 
     Raises:
         BadInput: The disk is certainly too small.
     """
-    disk, memory = shutil.disk_usage(site.this.out).free, free_bytes()
+    disk, memory = shutil.disk_usage(ctx.run.out).free, free_bytes()
     text = (
         f"{found.steps:,} steps to tune, about {clock(found.seconds)} at the pace of the coarse model; "
         f"checkpoints take about {size(found.disk_bytes)} of disk, {size(disk)} are free"
@@ -136,7 +140,7 @@ def tell(site: Site, found: Need) -> None:
     say(text)
     if found.least_bytes > disk:
         raise BadInput(
-            f"{site.this.out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "
+            f"{ctx.run.out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "
             f"{size(disk)} are free; make room, and give the same command again"
         )
     if found.disk_bytes > disk:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from surfkit.blocks.oom_retry import lesser
+from surfkit.blocks.oom_retry import shortfall
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
@@ -15,7 +15,7 @@ from surfkit.execute.state import read_state, write_state
 from surfkit.partition.merge import Merge, Pieces, Share
 from surfkit.partition.plan import Plan
 from surfkit.primitives.points import Points
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.train import checkpoint
 from surfkit.train import streaming as pieces
 from surfkit.train.look import fresh_looks
@@ -24,24 +24,24 @@ from surfkit.train.streaming import Stored
 from surfkit.train.views import Order
 
 
-def put_together(site: Site, blocks: Plan, coarse: Stored) -> bool:
+def put_together(ctx: RunContext, blocks: Plan, coarse: Stored) -> bool:
     """Write all blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
 
     False if a result is not what its state says; that block is planned again.
     """
-    recipe, final = site.this.recipe, replace(site.this, part="tune")
+    recipe, final = ctx.run.recipe, replace(ctx.run, part="tune")
     skipped = frozenset(block.index for block in blocks.blocks if not block.views)
-    results = {index: sound(site, index) for index in range(len(blocks.blocks)) if index not in skipped}
+    results = {index: sound(ctx, index) for index in range(len(blocks.blocks)) if index not in skipped}
     found = {index: result for index, result in results.items() if result is not None}
     if len(found) < len(results):
         return False
     tuned_pieces = {index: finished(recipe.tune, result) for index, result in found.items()}
     merge = Merge(blocks.cells, finished(recipe.pretrain, coarse), tuned_pieces, skipped)
     shares = merge.shares()
-    note(site, shares)
+    note(ctx, shares)
     points = sum(share.kept for share in shares)
     parts = [result.state for result in (coarse, *found.values())]
-    pieces.save(final.checkpoint, together(site, parts, points), merge.pieces())
+    pieces.save(final.checkpoint, together(ctx, parts, points), merge.pieces())
     emit(FileWritten(final.checkpoint, "merged blocks"))
     return True
 
@@ -51,27 +51,27 @@ def finished(stage: Stage, stored: Stored) -> Pieces:
     return lambda: (stage.finished(piece) for piece in stored.pieces())
 
 
-def together(site: Site, parts: Sequence[StageState], points: int) -> StageState:
+def together(ctx: RunContext, parts: Sequence[StageState], points: int) -> StageState:
     """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
-    recipe = site.this.recipe
+    recipe = ctx.run.recipe
     like = parts[0].points.params
     params = {
         name: torch.empty(points, *value.shape[1:], dtype=value.dtype, device="meta") for name, value in like.items()
     }
-    order, generator = Order(len(site.scene.train)), torch.Generator().manual_seed(recipe.seed)
+    order, generator = Order(len(ctx.scene.train)), torch.Generator().manual_seed(recipe.seed)
     state = StageState(Points(params, {}, {}), order, generator, index=recipe.tune.steps)
     state.seconds = sum(part.seconds for part in parts)
     state.cpu_seconds = sum(part.cpu_seconds for part in parts)
     state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
     state.sh_degree = max(part.sh_degree for part in parts)
     if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
-        state.looks = fresh_looks(recipe.tune.appearance, len(site.scene.train))
+        state.looks = fresh_looks(recipe.tune.appearance, len(ctx.scene.train))
     return state
 
 
-def sound(site: Site, index: int) -> Stored | None:
+def sound(ctx: RunContext, index: int) -> Stored | None:
     """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
-    path, steps = site.block(index).checkpoint, site.this.recipe.tune.steps
+    path, steps = ctx.block(index).checkpoint, ctx.run.recipe.tune.steps
     try:
         found = pieces.open_last(path)
     except BadInput as error:
@@ -82,15 +82,15 @@ def sound(site: Site, index: int) -> Stored | None:
     if found is not None and step >= steps:
         return found[0]
     emit(Warned(f"block {index} has lost steps: its checkpoint is of {step}, not of {steps}"))
-    write_state(site.place(index), status="planned", step=step)
+    write_state(ctx.place(index), status="planned", step=step)
     return None
 
 
-def note(site: Site, shares: Sequence[Share]) -> None:
+def note(ctx: RunContext, shares: Sequence[Share]) -> None:
     """Write down what each block gave, and say where the coarse model had to fill in."""
-    write_json(site.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
+    write_json(ctx.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
     for share in shares:
-        less = lesser(read_state(site.place(share.index)))
+        less = shortfall(read_state(ctx.place(share.index)))
         if less and not share.filled:
             emit(Warned(f"block {share.index} was tuned with less than the recipe says, for want of memory: {less}"))
     if filled := [str(share.index) for share in shares if share.filled]:

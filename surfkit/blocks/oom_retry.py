@@ -13,13 +13,13 @@ from surfkit.densify.filters import CountCap
 from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.run.folder import Run
 from surfkit.train import checkpoint
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
-BARE, HELD, ANEW = 1, 2, 3
+NO_CACHE, NO_GROWTH, START_AGAIN = 1, 2, 3
 
 
 @dataclass(frozen=True)
-class Rung:
+class Fallback:
     """One step down.
 
     Attributes:
@@ -31,40 +31,40 @@ class Rung:
     text: str
 
 
-LADDER = (
-    Rung(BARE, "photographs are not kept in memory, which takes longer and leaves the result as it is"),
-    Rung(HELD, "it goes on with no more points than it has in its last checkpoint"),
-    Rung(ANEW, "it begins anew, and with no more points than it begins with"),
+FALLBACKS = (
+    Fallback(NO_CACHE, "photographs are not kept in memory, which takes longer and leaves the result as it is"),
+    Fallback(NO_GROWTH, "it goes on with no more points than it has in its last checkpoint"),
+    Fallback(START_AGAIN, "it begins anew, and with no more points than it begins with"),
 )
 
 
-def following(state: BlockState, densify: Densify | None) -> Rung | None:
+def next_fallback(state: BlockState, densify: Densify | None) -> Fallback | None:
     """The rung after the one that a block is on; None if there is nothing more that would need less.
 
     Args:
         state: Of the block.
         densify: How its points multiply.
     """
-    rung = LADDER[state.rung] if state.rung < len(LADDER) else None
-    if rung is None or (rung.number > BARE and densify is None):
+    fallback = FALLBACKS[state.fallback] if state.fallback < len(FALLBACKS) else None
+    if fallback is None or (fallback.number > NO_CACHE and densify is None):
         return None
-    if rung.number == ANEW and (state.most_points or 0) <= state.begun_points:
+    if fallback.number == START_AGAIN and (state.most_points or 0) <= state.begun_points:
         return None  # it has not grown
-    return rung
+    return fallback
 
 
-def climb(block: Run) -> None:
+def take_fallback(block: Run) -> None:
     """Put a block on its next rung if memory gave out when it was last worked on, and say so."""
     state = read_state(block.out)
-    rung = following(state, block.recipe.tune.densify) if state.kind == "oom" else None
-    if rung is None:
+    fallback = next_fallback(state, block.recipe.tune.densify) if state.kind == "oom" else None
+    if fallback is None:
         return
     most, text = state.most_points, "photographs not kept in memory"
-    if rung.number == HELD:
+    if fallback.number == NO_GROWTH:
         found = checkpoint.load_last(block.checkpoint)
         step, most = (found[0].index, len(found[0].points)) if found else (0, max(1, state.begun_points))
         text = f"at most {most:,} points from step {step:,} on"
-    elif rung.number == ANEW:
+    elif fallback.number == START_AGAIN:
         checkpoint.discard(block.checkpoint)
         most, text = state.begun_points, f"begun anew, at most {state.begun_points:,} points"
     emit(Warned(f"for want of memory: {text}"))
@@ -73,22 +73,22 @@ def climb(block: Run) -> None:
         status="planned",
         kind=None,
         error=None,
-        rung=rung.number,
+        fallback=fallback.number,
         most_points=most,
-        eased=(*state.eased, text),
+        reduced=(*state.reduced, text),
     )
 
 
-def eased(block: Run, store: Store) -> tuple[Run, Store]:
+def reduced(block: Run, caches: CacheSettings) -> tuple[Run, CacheSettings]:
     """A block, and where its photographs are kept, as its rung has them."""
     state = read_state(block.out)
-    if state.rung >= BARE:
-        store = replace(store, cache="0")
+    if state.fallback >= NO_CACHE:
+        caches = replace(caches, cache="0")
     tune = block.recipe.tune
     if state.most_points is not None and tune.densify is not None:
         tune = replace(tune, densify=capped(tune.densify, state.most_points))
         block = replace(block, recipe=replace(block.recipe, tune=tune))
-    return block, store
+    return block, caches
 
 
 def capped(densify: Densify, points: int) -> Densify | None:
@@ -101,6 +101,6 @@ def capped(densify: Densify, points: int) -> Densify | None:
     return None
 
 
-def lesser(state: BlockState) -> str | None:
+def shortfall(state: BlockState) -> str | None:
     """In what the result of a block is less than its recipe wants; None if it is not."""
-    return state.eased[-1] if state.rung >= HELD else None
+    return state.reduced[-1] if state.fallback >= NO_GROWTH else None

@@ -15,17 +15,17 @@ from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from surfkit.blocks.display import Board, Standing, state_since
+from surfkit.blocks.display import BlockDisplay, BlockProgress, state_since
 from surfkit.blocks.forecast import memory_of, need, tell
 from surfkit.blocks.merge import put_together
-from surfkit.blocks.oom_retry import following
-from surfkit.blocks.worker import BUSY, FULL, coarse_model, guarded, sight_of
+from surfkit.blocks.oom_retry import next_fallback
+from surfkit.blocks.worker import BUSY, FULL, coarse_model, coarse_model_of, guarded
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.execute import base as executor
-from surfkit.execute.base import Ended, Executor, Inline
+from surfkit.execute.base import Executor, Inline, JobResult
 from surfkit.execute.remote import POLL_S
 from surfkit.execute.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
 from surfkit.partition.picture import plan_picture
@@ -33,7 +33,7 @@ from surfkit.partition.plan import Fewest, Plan, plan
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.readers.depth_prior import alignment
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results, relay
 from surfkit.run.notes import naming
 from surfkit.scene.memory import oom_kills
@@ -59,7 +59,7 @@ ARRIVE_S = 90.0
 
 
 @dataclass(frozen=True)
-class Hands:
+class Compute:
     """Who computes.
 
     Attributes:
@@ -92,60 +92,58 @@ class Record:
     plan: Plan
 
 
-def tuned(site: Site, hands: Hands) -> tuple[Run, StageState]:
+def tune_blocks(ctx: RunContext, compute: Compute) -> tuple[Run, StageState]:
     """The run with the state of all blocks together; what is done already is not done again.
 
     Args:
-        site: Run, data and means; the coarse model is in its folder.
-        hands: Who tunes the blocks.
+        ctx: Run, data and means; the coarse model is in its folder.
+        compute: Who tunes the blocks.
 
     Raises:
         Unfinished: Blocks failed, also when they were tried again.
         KeyboardInterrupt: Someone asked to stop; every block has saved its state.
     """
-    final = replace(site.this, part="tune")
-    if not site.folder.exists() and (state := whole(final)):  # deleted to make room
+    final = replace(ctx.run, part="tune")
+    if not ctx.folder.exists() and (state := whole(final)):  # deleted to make room
         return final, state
-    coarse = coarse_model(site.this)
-    sweep(site.folder, deep=False)  # a block's own folder is its worker's
-    record = planned(site, coarse)
-    state = merged(site, record)
+    coarse = coarse_model(ctx.run)
+    sweep(ctx.folder, deep=False)  # a block's own folder is its worker's
+    record = planned(ctx, coarse)
+    state = merged(ctx, record)
     if state is not None:
         return final, state
     discard_results(final)
     while state is None:
-        await_workers(site)
-        foresee(site, record.plan, coarse, hands)
-        extract_views(site, record.plan)
-        work(site, record.plan, hands)
-        for folder in site.folders():  # also of blocks that were tuned by hand
-            relay(site.this.out, folder, f"block {int(folder.name)}: ")
-        if put_together(site, record.plan, coarse):
+        await_workers(ctx)
+        foresee(ctx, record.plan, coarse, compute)
+        extract_views(ctx, record.plan)
+        work(ctx, record.plan, compute)
+        for folder in ctx.folders():  # also of blocks that were tuned by hand
+            relay(ctx.run.out, folder, f"block {int(folder.name)}: ")
+        if put_together(ctx, record.plan, coarse):
             state = checkpoint.load(final.checkpoint)
     return final, state
 
 
-def planned(site: Site, coarse: Stored) -> Record:
+def planned(ctx: RunContext, coarse: Stored) -> Record:
     """The plan in the folder, or a new one; blocks of another coarse model are put aside."""
-    path = site.folder / "plan.json"
+    path = ctx.folder / "plan.json"
     if path.exists():
         record = read_json(path, Record)
-        known = {view.name for view in site.scene.train}
+        known = {view.name for view in ctx.scene.train}
         if unknown := {name for block in record.plan.blocks for name in block.views} - known:
-            raise BadInput(
-                f"{path}: names a view that is not there, {min(unknown)}; delete {site.folder} to plan again"
-            )
+            raise BadInput(f"{path}: names a view that is not there, {min(unknown)}; delete {ctx.folder} to plan again")
         if record.coarse_steps == coarse.state.index:
             return record
-    if site.folders():  # of another coarse model, or of a plan that is gone
-        await_workers(site)
-        aside = put_aside(site)
-        checkpoint.discard(replace(site.this, part="tune").checkpoint)
+    if ctx.folders():  # of another coarse model, or of a plan that is gone
+        await_workers(ctx)
+        aside = put_aside(ctx)
+        checkpoint.discard(replace(ctx.run, part="tune").checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
-    recipe = site.this.recipe
-    sight = sight_of(site, checkpoint.load(coarse.path))
+    recipe = ctx.run.recipe
+    sight = coarse_model_of(ctx, checkpoint.load(coarse.path))
     made = Record(coarse.state.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
-    picture = site.folder / "plan.png"
+    picture = ctx.folder / "plan.png"
     plan_picture(picture, sight, made.plan)
     emit(FileWritten(picture, "picture of the blocks"))
     write_json(path, made)
@@ -158,32 +156,32 @@ def planned(site: Site, coarse: Stored) -> Record:
     return made
 
 
-def extract_views(site: Site, blocks: Plan) -> None:
+def extract_views(ctx: RunContext, blocks: Plan) -> None:
     """Write the views of each block into its folder, with the alignment of their depth priors if a loss asks for any.
 
     The priors are aligned as those of the whole scene: a block's own views would give another scale to its loss, and
     another judgement of failed alignments.
     """
-    missing = [block for block in blocks.blocks if block.views and not extract.is_whole(site.views(block.index))]
+    missing = [block for block in blocks.blocks if block.views and not extract.is_whole(ctx.views(block.index))]
     priors = None
-    if missing and needs_priors(losses := site.this.recipe.tune.losses):
+    if missing and needs_priors(losses := ctx.run.recipe.tune.losses):
         with naming("blocks: "):  # what the coarse stage has said already is not said again
-            priors = alignment(site.this.data, site.scene, needs_normals(losses))
+            priors = alignment(ctx.run.data, ctx.scene, needs_normals(losses))
     for block in missing:
-        extract.save(site.views(block.index), extract.of(site.scene, block.views, priors))
+        extract.save(ctx.views(block.index), extract.of(ctx.scene, block.views, priors))
 
 
-def put_aside(site: Site) -> Path:
+def put_aside(ctx: RunContext) -> Path:
     """Rename the folder of the blocks, and leave alone what was put aside before; its new name."""
     names = itertools.chain(["blocks-before"], (f"blocks-before-{number}" for number in itertools.count(2)))
-    aside = next(path for path in (site.this.out / name for name in names) if not path.exists())
-    os.replace(site.folder, aside)
+    aside = next(path for path in (ctx.run.out / name for name in names) if not path.exists())
+    os.replace(ctx.folder, aside)
     return aside
 
 
-def merged(site: Site, record: Record) -> StageState | None:
+def merged(ctx: RunContext, record: Record) -> StageState | None:
     """The state of all blocks together, if it was made and none has been tuned for longer since."""
-    return whole(replace(site.this, part="tune")) if done(site, record.plan) else None
+    return whole(replace(ctx.run, part="tune")) if done(ctx, record.plan) else None
 
 
 def whole(final: Run) -> StageState | None:
@@ -192,70 +190,70 @@ def whole(final: Run) -> StageState | None:
     return None if found is None or found[0].index < final.stage.steps else found[0]
 
 
-def done(site: Site, blocks: Plan) -> bool:
+def done(ctx: RunContext, blocks: Plan) -> bool:
     """Whether every block has all its steps."""
-    return not left(site, blocks)
+    return not left(ctx, blocks)
 
 
-def left(site: Site, blocks: Plan) -> list[int]:
+def left(ctx: RunContext, blocks: Plan) -> list[int]:
     """Blocks that still have steps to make."""
-    steps = site.this.recipe.tune.steps
+    steps = ctx.run.recipe.tune.steps
     found = []
     for block in blocks.blocks:
-        state = read_state(site.place(block.index))
+        state = read_state(ctx.place(block.index))
         if block.views and not (state.status == "done" and state.step >= steps):
             found.append(block.index)
     return found
 
 
-def await_workers(site: Site) -> None:
+def await_workers(ctx: RunContext) -> None:
     """Wait for workers of an earlier driver, which stop when they notice that it is gone.
 
     Those of another machine may have died with it; this shows when they have not been heard of for long enough.
     """
     began = time.monotonic()
-    while busy := [folder for folder in site.folders() if worked_on(folder)]:
+    while busy := [folder for folder in ctx.folders() if worked_on(folder)]:
         patience = LEAVE_S + (STALE_S if any(map(heard_elsewhere, busy)) else 0)
         if time.monotonic() - began > patience:
             raise BadInput(f"{busy[0]}: {worked_on(busy[0])} works on the block; wait for its end, or stop it")
         time.sleep(POLL_S)
 
 
-def foresee(site: Site, blocks: Plan, coarse: Stored, hands: Hands) -> None:
+def foresee(ctx: RunContext, blocks: Plan, coarse: Stored, compute: Compute) -> None:
     """Say what the blocks that are left will take; BadInput if there is certainly no room for them."""
-    indices, here = left(site, blocks), hands.workers.at_once is not None
-    memory = [job_of(site, blocks, index, hands).memory_bytes for index in indices] if here else []
+    indices, here = left(ctx, blocks), compute.workers.at_once is not None
+    memory = [job_of(ctx, blocks, index, compute).memory_bytes for index in indices] if here else []
     if indices:
-        tell(site, need(site, [blocks.blocks[index] for index in indices], coarse.state, memory))
+        tell(ctx, need(ctx, [blocks.blocks[index] for index in indices], coarse.state, memory))
 
 
-def work(site: Site, blocks: Plan, hands: Hands) -> None:
+def work(ctx: RunContext, blocks: Plan, compute: Compute) -> None:
     """Have all blocks tuned that are not.
 
     One that crashes is tried again, and one whose memory gave out too, with less and with the machine for itself.
     """
-    waiting = left(site, blocks)
+    waiting = left(ctx, blocks)
     attempts, kills = dict.fromkeys(waiting, 0), oom_kills()
-    look = looking(site, hands, waiting)
+    look = looking(ctx, compute, waiting)
     failed: dict[int, str] = {}
     while waiting:
-        batch = [index for index in waiting if not short(site, index)]
-        batch = batch or (waiting[:1] if (hands.workers.at_once or 1) > 1 else list(waiting))
+        batch = [index for index in waiting if not short(ctx, index)]
+        batch = batch or (waiting[:1] if (compute.workers.at_once or 1) > 1 else list(waiting))
         waiting = [index for index in waiting if index not in batch]
         say(f"{len(batch)} of {len(blocks.blocks)} blocks to tune")
-        for ended in done_by(hands, [job_of(site, blocks, index, hands) for index in batch], look):
+        for ended in done_by(compute, [job_of(ctx, blocks, index, compute) for index in batch], look):
             index = ended.job.index
             attempts[index] += 1
-            relay(site.this.out, site.place(index), f"block {index}: ")
-            if ended.status == 0 and arrived(site, blocks, index):
+            relay(ctx.run.out, ctx.place(index), f"block {index}: ")
+            if ended.status == 0 and arrived(ctx, blocks, index):
                 say(f"block {index} is done; {look().heading()}")
                 continue
             starved = ended.status == -signal.SIGKILL and oom_kills() > kills
             kills += starved
-            reason = told(site, ended, starved)
+            reason = told(ctx, ended, starved)
             if ended.status == FULL:
-                raise DiskFull(site.place(index), f"block {index} {reason}")
-            again = another_way(site, index, ended.status, attempts[index])
+                raise DiskFull(ctx.place(index), f"block {index} {reason}")
+            again = another_way(ctx, index, ended.status, attempts[index])
             emit(Warned(f"block {index} {reason}" + (f"; {again}" if again else "")))
             if again:
                 waiting.append(index)
@@ -263,100 +261,100 @@ def work(site: Site, blocks: Plan, hands: Hands) -> None:
                 failed[index] = reason
     if failed:
         what = "; ".join(f"block {index} {reason}" for index, reason in sorted(failed.items()))
-        if any(short(site, index) for index in failed):
+        if any(short(ctx, index) for index in failed):
             what += "; more blocks or smaller photographs need less memory, in a folder of their own"
-        raise Unfinished(f"{site.this.out}: {what}; the others are done, and the same command tries these again")
+        raise Unfinished(f"{ctx.run.out}: {what}; the others are done, and the same command tries these again")
 
 
-def arrived(site: Site, blocks: Plan, index: int) -> bool:
+def arrived(ctx: RunContext, blocks: Plan, index: int) -> bool:
     """Whether a block that is done somewhere is so here; a network's file system may take a while."""
     until = time.monotonic() + ARRIVE_S
-    while index in left(site, blocks):
+    while index in left(ctx, blocks):
         if time.monotonic() > until:
             return False
         time.sleep(POLL_S)
     return True
 
 
-def done_by(hands: Hands, jobs: Sequence[executor.Job], look: Callable[[], Standing]) -> Iterator[Ended]:
+def done_by(compute: Compute, jobs: Sequence[executor.Job], look: Callable[[], BlockProgress]) -> Iterator[JobResult]:
     """The jobs as they end; where others do them, it is shown how far they are."""
-    shown = nullcontext() if isinstance(hands.workers, Inline) else Board(look)
-    with shown, closing(hands.workers.run(jobs)) as ended:
+    shown = nullcontext() if isinstance(compute.workers, Inline) else BlockDisplay(look)
+    with shown, closing(compute.workers.run(jobs)) as ended:
         yield from ended
 
 
-def looking(site: Site, hands: Hands, indices: Iterable[int]) -> Callable[[], Standing]:
+def looking(ctx: RunContext, compute: Compute, indices: Iterable[int]) -> Callable[[], BlockProgress]:
     """What tells where blocks stand that are tuned from now on."""
     since, indices = time.time(), tuple(indices)
 
-    def look() -> Standing:
-        states = {index: state_since(site.place(index), since) for index in indices}
-        return Standing(states, site.this.recipe.tune.steps, hands.workers.at_once or len(indices))
+    def look() -> BlockProgress:
+        states = {index: state_since(ctx.place(index), since) for index in indices}
+        return BlockProgress(states, ctx.run.recipe.tune.steps, compute.workers.at_once or len(indices))
 
     return look
 
 
-def short(site: Site, index: int) -> bool:
+def short(ctx: RunContext, index: int) -> bool:
     """Whether memory gave out when a block was last worked on."""
-    return read_state(site.place(index)).kind == "oom"
+    return read_state(ctx.place(index)).kind == "oom"
 
 
-def another_way(site: Site, index: int, status: int, attempts: int) -> str | None:
+def another_way(ctx: RunContext, index: int, status: int, attempts: int) -> str | None:
     """How a block that failed is tried again, in a few words; None if it is not."""
-    if short(site, index):
-        rung = following(read_state(site.place(index)), site.this.recipe.tune.densify)
-        return f"it is tried again: {rung.text}" if rung else None
+    if short(ctx, index):
+        fallback = next_fallback(read_state(ctx.place(index)), ctx.run.recipe.tune.densify)
+        return f"it is tried again: {fallback.text}" if fallback else None
     return "it is tried again" if status not in (1, 2) and attempts < ATTEMPTS else None
 
 
-def told(site: Site, ended: Ended, starved: bool = False) -> str:
+def told(ctx: RunContext, ended: JobResult, starved: bool = False) -> str:
     """What became of a block, in a few words; also noted in its state.
 
     `starved`: the system has ended processes for want of memory meanwhile.
     """
     index, status = ended.job.index, ended.status
-    state = read_state(site.place(index))
+    state = read_state(ctx.place(index))
     if ended.why is not None or status == 0:
-        why = ended.why or f"nothing of its work has come to {site.place(index)}"
+        why = ended.why or f"nothing of its work has come to {ctx.place(index)}"
         kind = "oom" if any(word in why for word in STARVED) else "data" if status == 2 else "crash"
-        if not heard_elsewhere(site.place(index)):  # it may only be cut off, and the next one must wait for its end
-            write_state(site.place(index), status="failed", kind=kind, error=why)
+        if not heard_elsewhere(ctx.place(index)):  # it may only be cut off, and the next one must wait for its end
+            write_state(ctx.place(index), status="failed", kind=kind, error=why)
         return f"failed: {why}"
     if status < 0:
         error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved
-        write_state(site.place(index), status="failed", kind="oom" if starved else "crash", error=error)
+        write_state(ctx.place(index), status="failed", kind="oom" if starved else "crash", error=error)
         return f"was {error}"
     if status == BUSY:
         return "is worked on by another process"
     if state.status != "failed":
-        log = site.place(index) / executor.LOG
-        write_state(site.place(index), status="failed", kind="crash", error=f"exit status {status}")
+        log = ctx.place(index) / executor.LOG
+        write_state(ctx.place(index), status="failed", kind="crash", error=f"exit status {status}")
         return f"ended with status {status}; see {log}"
     return f"failed: {state.error}"
 
 
-def job_of(site: Site, blocks: Plan, index: int, hands: Hands) -> executor.Job:
+def job_of(ctx: RunContext, blocks: Plan, index: int, compute: Compute) -> executor.Job:
     """The work on one block."""
     block = blocks.blocks[index]
-    elsewhere = hands.workers.at_once is None
-    share = site.store.bytes() // (hands.workers.at_once or 1)
-    command = ["-m", "surfkit.cli", "tune", str(site.this.out.resolve()), str(index), "--device", hands.device]
-    command += ["--cache", site.store.cache if elsewhere else f"{share}"]
-    command += ["--checkpoint-every", f"{site.every.checkpoint}"]
-    command += ["--resized-copies"] * site.store.copies + ["--tensorboard"] * hands.tensorboard
+    elsewhere = compute.workers.at_once is None
+    share = ctx.caches.bytes() // (compute.workers.at_once or 1)
+    command = ["-m", "surfkit.cli", "tune", str(ctx.run.out.resolve()), str(index), "--device", compute.device]
+    command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
+    command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
+    command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
     command += ["--patience", f"{PATIENCE_S}"] * elsewhere
-    pixels = max(view.camera.width * view.camera.height for view in site.scene.train)
-    mine = [view for view in site.scene.train if view.name in block.views]
+    pixels = max(view.camera.width * view.camera.height for view in ctx.scene.train)
+    mine = [view for view in ctx.scene.train if view.name in block.views]
     photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
     return executor.Job(
         index=index,
-        folder=site.place(index),
-        call=lambda: guarded(site, blocks, index),
+        folder=ctx.place(index),
+        call=lambda: guarded(ctx, blocks, index),
         command=tuple(command),
         cost=block.work,
         memory_bytes=PROGRAM_BYTES
-        + memory_of(site, block)
+        + memory_of(ctx, block)
         + PIXEL_BYTES * pixels
-        + (photos if elsewhere and site.store.cache == "auto" else min(share, photos)),
-        needs=(site.this.data.path, mine[0].path),
+        + (photos if elsewhere and ctx.caches.cache == "auto" else min(share, photos)),
+        needs=(ctx.run.data.path, mine[0].path),
     )

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from surfkit.blocks.oom_retry import climb, eased
+from surfkit.blocks.oom_retry import reduced, take_fallback
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import StageBegan, StepDone, say
 from surfkit.core.files import sweep
@@ -25,15 +25,15 @@ from surfkit.core.registry import hookimpl, plugins
 from surfkit.execute.base import terminable
 from surfkit.execute.remote import CRASHED, DRIVER, INTERRUPTED, POLL_S
 from surfkit.execute.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
-from surfkit.partition.base import Sight
+from surfkit.partition.base import CoarseModel
 from surfkit.partition.plan import Plan
 from surfkit.primitives.points import Columns
 from surfkit.readers import extract
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, refuse_file
 from surfkit.run.journal import kept
 from surfkit.run.notes import naming
-from surfkit.run.stage import Begun, Job, optimise, saved
+from surfkit.run.stage import InitialModel, Job, load_state, optimise
 from surfkit.scene.scene import View
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.material import read_ahead
@@ -47,16 +47,16 @@ FULL, BUSY = 74, 75
 """Exit statuses beside those of `surfkit train` and of errands: a full disk, and a block that another works on."""
 
 
-def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> int:
+def guarded(ctx: RunContext, blocks: Plan, index: int, patience_s: float = 0.0) -> int:
     """Tune a block and return an exit status; what goes wrong is told, and is in the block's state.
 
     Args:
-        site: Where.
+        ctx: Where.
         blocks: All of them.
         index: Which one.
         patience_s: How long to wait for another process that works on it.
     """
-    folder, until = site.place(index), time.monotonic() + patience_s
+    folder, until = ctx.place(index), time.monotonic() + patience_s
     refuse_file(folder)
     read_state(folder)  # or BadInput: what is damaged cannot be written on
     while time.monotonic() < until and worked_on(folder):
@@ -65,18 +65,18 @@ def guarded(site: Site, blocks: Plan, index: int, patience_s: float = 0.0) -> in
         with held(folder):
             if other := heard_elsewhere(folder):
                 raise BadInput(f"{folder}: {other} was heard of in the last {STALE_S:.0f} s; wait for its end")
-            return _begun(site, blocks, index)
+            return _begun(ctx, blocks, index)
     except BadInput as error:  # another process works there, and the state is its
         say(f"surfkit: block {index}: {error}")
         return BUSY
 
 
-def _begun(site: Site, blocks: Plan, index: int) -> int:
-    folder = site.place(index)
+def _begun(ctx: RunContext, blocks: Plan, index: int) -> int:
+    folder = ctx.place(index)
     sweep(folder)
     try:
         with naming(f"block {index}: "), kept(folder), signs(folder), in_one_line(folder):
-            tune(site, blocks, index)
+            tune(ctx, blocks, index)
     except (BadInput, Fault) as error:
         brief = error.what if isinstance(error, (OutOfMemory, DiskFull)) else str(error)
         reason = " ".join(brief.split())
@@ -96,17 +96,17 @@ def _begun(site: Site, blocks: Plan, index: int) -> int:
     return 0
 
 
-def tune(site: Site, blocks: Plan, index: int) -> None:
+def tune(ctx: RunContext, blocks: Plan, index: int) -> None:
     """Tune one block from where it stands to its end."""
-    climb(site.block(index))
-    block, store = eased(site.block(index), site.store)
-    part = extract.load(site.views(index))
+    take_fallback(ctx.block(index))
+    block, caches = reduced(ctx.block(index), ctx.caches)
+    part = extract.load(ctx.views(index))
     scene, steps, folder = part.scene, block.stage.steps, block.out
-    context, state = block.recipe.context, saved(block, scene, repair=True)
-    if state is not None and bool(state.frozen) != (context == "frozen"):
+    around_is, state = block.recipe.context, load_state(block, scene, repair=True)
+    if state is not None and bool(state.frozen) != (around_is == "frozen"):
         there = "frozen points" if state.frozen else "no frozen points"
         raise BadInput(
-            f"{block.checkpoint} has {there}, and the recipe --context {context}; delete {folder} to tune it anew"
+            f"{block.checkpoint} has {there}, and the recipe --context {around_is}; delete {folder} to tune it anew"
         )
     begun = read_state(folder).attempts + 1
     done = state.index if state else 0
@@ -114,13 +114,13 @@ def tune(site: Site, blocks: Plan, index: int) -> None:
         folder, status="running", step=done, steps=steps, attempts=begun, error=None, kind=None, first=done, began=0.0
     )
     if state is None or state.index < steps:
-        given = read_ahead(site.this.data, scene, block.stage.losses, store, part.priors)
-        every = replace(site.every, pictures=0)
-        start, frozen = Start(site, blocks, index, scene.train), None
-        if context == "frozen":
+        given = read_ahead(ctx.run.data, scene, block.stage.losses, caches, part.priors)
+        intervals = replace(ctx.intervals, pictures=0)
+        start, frozen = Start(ctx, blocks, index, scene.train), None
+        if around_is == "frozen":
             start, frozen = replace(start, part="own"), replace(start, part="around")
-        owns = None if context == "densified" else start.owns
-        job = Job(block, scene, site.rasterizer, every, given, Meter(), start, frozen=frozen, owns=owns)
+        owns = None if around_is == "densified" else start.owns
+        job = Job(block, scene, ctx.rasterizer, intervals, given, Meter(), start, frozen=frozen, owns=owns)
         state = optimise(job, state)
     else:
         say(f"block {index} has all its {steps} steps already")
@@ -134,26 +134,28 @@ class Start:
     The latter, its context, are drawn with the block, so that it need not explain what others own; they are not merged.
     """
 
-    site: Site
+    ctx: RunContext
     blocks: Plan
     index: int
     views: Sequence[View]
     part: Literal["both", "own", "around"] = "both"
 
-    def __call__(self) -> Begun:
+    def __call__(self) -> InitialModel:
         """Their raw parameters, and the degree of harmonics that the coarse model has come to."""
-        coarse = coarse_model(self.site.this)
+        coarse = coarse_model(self.ctx.run)
         kept = [self.wanted(piece) for piece in coarse.pieces()]
-        return Begun({name: torch.cat([part[name] for part in kept]) for name in kept[0]}, coarse.state.sh_degree)
+        return InitialModel(
+            {name: torch.cat([part[name] for part in kept]) for name in kept[0]}, coarse.state.sh_degree
+        )
 
     def wanted(self, piece: StageState) -> Columns:
         """Those among some points of the coarse model."""
-        site = self.site
-        params, sight = site.this.recipe.pretrain.finished(piece), sight_of(site, piece)
+        ctx = self.ctx
+        params, sight = ctx.run.recipe.pretrain.finished(piece), coarse_model_of(ctx, piece)
         own = self.owns(params["means"])
         rows = own.clone()
         for view in self.views if self.part != "own" else ():
-            rows |= site.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+            rows |= ctx.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
         rows &= ~own if self.part == "around" else True
         return {name: value[rows] for name, value in params.items()}
 
@@ -162,20 +164,20 @@ class Start:
         return self.blocks.cells.owner(means) == self.index
 
 
-def coarse_model(this: Run) -> Stored:
+def coarse_model(run: Run) -> Stored:
     """The coarse model of a run, which stays on disk."""
-    found = open_last(replace(this, part="pretrain").checkpoint)
+    found = open_last(replace(run, part="pretrain").checkpoint)
     if found is None:
-        raise BadInput(f"{this.out}: the coarse model is gone; give its surfkit train command again")
+        raise BadInput(f"{run.out}: the coarse model is gone; give its surfkit train command again")
     return found[0]
 
 
-def sight_of(site: Site, coarse: StageState) -> Sight:
+def coarse_model_of(ctx: RunContext, coarse: StageState) -> CoarseModel:
     """The coarse model, or some points of it, to be looked at."""
-    stage = site.this.recipe.pretrain
-    splats = site.this.recipe.primitive.shape(stage.finished(coarse), coarse.sh_degree)
+    stage = ctx.run.recipe.pretrain
+    splats = ctx.run.recipe.primitive.activate(stage.finished(coarse), coarse.sh_degree)
     splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})
-    return Sight(splats, site.scene.train, site.rasterizer, stage.near)
+    return CoarseModel(splats, ctx.scene.train, ctx.rasterizer, stage.near)
 
 
 @contextmanager

@@ -80,35 +80,35 @@ class Evaluate:
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
             with held(self.target), full_disk_in_one_line(self.target):
-                this, state, scene = load_run(self.target)
+                run, state, scene = load_run(self.target)
                 zones.refuse_too_many(scene)
-                seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
+                seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
                 rasterizer, _ = drawer(self.device)
-                metrics = evaluate(this, state, scene, rasterizer, lpips_weights=self.lpips_weights)
+                metrics = evaluate(run, state, scene, rasterizer, lpips_weights=self.lpips_weights)
                 if zones != Zones():
-                    draw = drawing(this, state, rasterizer)
+                    draw = drawing(run, state, rasterizer)
                     found = measure_zones(scene, draw, zones, rendered_depths(draw), seams)
-                    metrics = note_metrics(this.metrics, {"images": metrics["images"] | found})
-                show(this, metrics)
+                    metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
+                show(run, metrics)
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):
             raise BadInput("--lpips-weights and --device are for photographs: leave them out, or --gt")
-        this = opened(self.target) if self.target.is_dir() else None
-        if this is None and zones != Zones():
+        run = opened(self.target) if self.target.is_dir() else None
+        if run is None and zones != Zones():
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
-        if this is not None:
-            refuse_no_mesh(this)
-        out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if this is None else this.out)
-        scene = self._scene(this)
+        if run is not None:
+            refuse_no_mesh(run)
+        out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else run.out)
+        scene = self._scene(run)
         if scene is not None:
             zones.refuse_too_many(scene)
         surface = read_surface(truth) if self.seen else None
         if surface is not None and surface.faces is None:
             raise BadInput(f"{truth}: a cloud of points; --seen needs a mesh, or leave --gt out to use rendered depth")
-        seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
+        seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         found = measure_geometry(
-            (self.target if this is None else this.mesh, truth),
+            (self.target if run is None else run.mesh, truth),
             self.geometry,
             out / "geometry",
             scene.train if scene else (),
@@ -125,30 +125,30 @@ class Evaluate:
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
         with held(self.target), full_disk_in_one_line(self.target):
-            this, state, scene = load_run(self.target)
-            draw = drawing(this, state, drawer(self.device)[0])
+            run, state, scene = load_run(self.target)
+            draw = drawing(run, state, drawer(self.device)[0])
             depths = rendered_depths(draw) if truth is None else true_depths(truth, scene.frame, matrix)
-            seams = None if self.seams is None else seams_of(this, scene.frame, self.seams)
+            seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
             return measure_zones(scene, draw, zones, depths, seams)
 
-    def _scene(self, this: Run | None) -> Scene | None:
+    def _scene(self, run: Run | None) -> Scene | None:
         """The scene whose views make the crop volume; None where nobody names one."""
-        if this is not None and self.views is not None:
+        if run is not None and self.views is not None:
             raise BadInput(f"--views {self.views}: a run has views of its own; leave it out, or name a file")
-        if this is not None:
-            return read(this.data)
+        if run is not None:
+            return read(run.data)
         if self.views is None:
             return None
         return read(opened(self.views).data if (self.views / "run.json").exists() else Data(self.views))
 
 
-def refuse_no_mesh(this: Run) -> None:
+def refuse_no_mesh(run: Run) -> None:
     """BadInput if a run has no mesh of its model."""
-    if not this.mesh.exists():
-        raise BadInput(f"{this.out}: no {this.mesh.name} in it; make it with surfkit mesh, or name a file")
-    if not this.mesh_record.exists():
+    if not run.mesh.exists():
+        raise BadInput(f"{run.out}: no {run.mesh.name} in it; make it with surfkit mesh, or name a file")
+    if not run.mesh_record.exists():
         raise BadInput(
-            f"{this.mesh}: without {this.mesh_record.name} it is of an earlier model, or half made; make it with "
+            f"{run.mesh}: without {run.mesh_record.name} it is of an earlier model, or half made; make it with "
             "surfkit mesh, or name the file"
         )
 

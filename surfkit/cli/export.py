@@ -38,13 +38,13 @@ class Export:
             self._write()
 
     def _write(self) -> None:
-        this, state, scene = load_run(self.run_folder)
-        path = self.out or this.cloud
+        run, state, scene = load_run(self.run_folder)
+        path = self.out or run.cloud
         if path.suffix.lower() != ".ply":
             raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
         if path.exists() and self.out is not None and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        table = to_table(this.primitive, this.stage.finished(state)).in_input_frame(scene.frame)
+        table = to_table(run.primitive, run.stage.finished(state)).in_input_frame(scene.frame)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
         print(f"wrote {len(state.points):,} points to {path}")

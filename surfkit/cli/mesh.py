@@ -21,13 +21,13 @@ from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
 from surfkit.run.journal import kept
-from surfkit.run.mesh import Delivery, deliver, subject
+from surfkit.run.mesh import MeshOutput, make_mesh, subject
 from surfkit.run.notes import noted
 from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 
 def named_mesher() -> Mesher:
@@ -53,7 +53,7 @@ class MeshOf:
     mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=named_mesher)
     """How the splats become triangles."""
 
-    delivery: Annotated[Delivery, tyro.conf.arg(name="")] = Delivery()
+    delivery: Annotated[MeshOutput, tyro.conf.arg(name="")] = MeshOutput()
     """What is written."""
 
     memory: str = "auto"
@@ -79,26 +79,26 @@ class MeshOf:
     def run(self) -> None:
         """Mesh, and show what came out."""
         budget = cache_bytes(self.memory, "--memory")
-        store = Store(maps=self.prepare_cache if self.prepare else None)
-        store.maps_bytes()  # or BadInput, before anything is done
+        caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
+        caches.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
         with noted(), bars():
-            this, state, scene = load_run(self.run_folder)
+            run, state, scene = load_run(self.run_folder)
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             rasterizer, _ = drawer(self.device)
             with (
-                held(this.out),
-                full_disk_in_one_line(this.out),
-                with_maps_to_mesh(this, self.mesh, scene, store, self.device) as this,
-                kept(this.out),
+                held(run.out),
+                full_disk_in_one_line(run.out),
+                with_maps_to_mesh(run, self.mesh, scene, caches, self.device) as run,
+                kept(run.out),
             ):
-                what = subject(this, state, scene, rasterizer, budget, self.mesh)
-                record = deliver(this, self.mesh, self.delivery, what, state.index)
-        show(this, record)
+                what = subject(run, state, scene, rasterizer, budget, self.mesh)
+                record = make_mesh(run, self.mesh, self.delivery, what, state.index)
+        show(run, record)
 
 
-def show(this: Run, record: dict[str, Any]) -> None:
+def show(run: Run, record: dict[str, Any]) -> None:
     """Print what the mesh is, and the paths of what was written."""
     cleaning, lengths = record["cleaning"], record["lengths"]
     rows = [
@@ -112,8 +112,8 @@ def show(this: Run, record: dict[str, Any]) -> None:
     ]
     print_table(("mesh", "value"), rows)
     print()
-    paths = [("mesh", this.out / name) for name in record["files"]] + [("facts", this.mesh_record)]
-    paths += [("picture", path) for path in sorted(this.mesh_pictures.glob("*.png"))]
+    paths = [("mesh", run.out / name) for name in record["files"]] + [("facts", run.mesh_record)]
+    paths += [("picture", path) for path in sorted(run.mesh_pictures.glob("*.png"))]
     print_table(("written", "path"), [(what, str(path)) for what, path in paths])
 
 

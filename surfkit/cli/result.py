@@ -20,30 +20,30 @@ LPIPS = {
 """Names in metrics.json, and on the screen."""
 
 
-def show(this: Run, metrics: dict[str, Any]) -> None:
+def show(run: Run, metrics: dict[str, Any]) -> None:
     """Print a table of the metrics, and the paths of what was written.
 
     Raises:
         BadInput: An earlier process left the metrics, and they are damaged.
     """
-    with sound(this.metrics, "damaged; delete it, and the surfkit train command of the run measures again"):
+    with sound(run.metrics, "damaged; delete it, and the surfkit train command of the run measures again"):
         rows = result_rows(metrics)
     if "geometry" in metrics:
         remedy = "delete that part of it, and measure again with surfkit evaluate --gt"
-        with sound(this.metrics, f"geometry is damaged; {remedy}"):
+        with sound(run.metrics, f"geometry is damaged; {remedy}"):
             rows += geometry_rows(metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
-    written = [("metrics", this.metrics), ("points", this.cloud)]
-    if this.mesh_record.exists():  # without it, what is there is of an earlier model
-        meshes = sorted(path for path in this.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
+    written = [("metrics", run.metrics), ("points", run.cloud)]
+    if run.mesh_record.exists():  # without it, what is there is of an earlier model
+        meshes = sorted(path for path in run.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
         written += [("mesh", path) for path in meshes]
-        written += [("picture of the mesh", path) for path in sorted(this.mesh_pictures.glob("*.png"))]
-    pictures = sorted(this.pictures.rglob("*.png")) if this.pictures.exists() else []
+        written += [("picture of the mesh", path) for path in sorted(run.mesh_pictures.glob("*.png"))]
+    pictures = sorted(run.pictures.rglob("*.png")) if run.pictures.exists() else []
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
-        print(f"... and {len(pictures) - 8} more pictures in {this.pictures}")
+        print(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
 
 
 def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:

@@ -25,8 +25,8 @@ chosen_table = tyro.conf.arg(constructor_factory=table_choice, name="")
 
 
 def _subcommand(name: str, table: Any) -> Any:
-    def this():
+    def run():
         return table
 
-    this.__annotations__["return"] = type(table)
-    return Annotated[type(table), tyro.conf.subcommand(f"table:{name}", constructor=this, description=table.about)]
+    run.__annotations__["return"] = type(table)
+    return Annotated[type(table), tyro.conf.subcommand(f"table:{name}", constructor=run, description=table.about)]

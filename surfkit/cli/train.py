@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 
 import surfkit
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import ARGV, chosen_recipe
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -24,8 +24,8 @@ from surfkit.readers.data import Reading
 from surfkit.recipe import Recipe
 from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run
-from surfkit.run.stage import CHECKPOINT_EVERY, Every
-from surfkit.train.material import Store
+from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
+from surfkit.train.material import CacheSettings
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
@@ -120,9 +120,9 @@ class Train:
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
-            every = Every(self.checkpoint_every, self.pictures_every)
-            store = Store(self.cache, self.resized_copies, self.prepare_cache if self.prepare else None)
-            metrics = run(recipe, data, out, Hands(self.device, self.executor, self.tensorboard), every, store)
+            intervals = Intervals(self.checkpoint_every, self.pictures_every)
+            caches = CacheSettings(self.cache, self.resized_copies, self.prepare_cache if self.prepare else None)
+            metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
 
     def _data(self) -> Path:

@@ -17,12 +17,12 @@ from surfkit.pipeline import opened
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.report.tensorboard import tensorboard
-from surfkit.run.context import Site, views_file
+from surfkit.run.context import RunContext, views_file
 from surfkit.run.notes import noted
-from surfkit.run.stage import CHECKPOINT_EVERY, Every, drawer
+from surfkit.run.stage import CHECKPOINT_EVERY, Intervals, drawer
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class Tune:
 
     def run(self) -> int:
         """Tune; the exit status is that of `surfkit train`."""
-        this, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
+        run, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
         if not path.exists():
             raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
         record = read_json(path, Record)
-        plan, steps = record.plan, this.recipe.pretrain.steps
+        plan, steps = record.plan, run.recipe.pretrain.steps
         if record.coarse_steps != steps:
             told = f"{path} is for a coarse model of {record.coarse_steps} steps, not {steps}"
             raise BadInput(f"{told}; give the surfkit train command again")
@@ -72,13 +72,13 @@ class Tune:
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:
             raise BadInput(f"block {self.block} has no views; it stays as it is in the coarse model")
-        store, every = Store(self.cache, self.resized_copies), Every(self.checkpoint_every, 0)
-        store.bytes()
+        caches, intervals = CacheSettings(self.cache, self.resized_copies), Intervals(self.checkpoint_every, 0)
+        caches.bytes()
         scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
         with scalars, noted(), in_one_line(self.run_folder), bars():
             rasterizer, _ = drawer(self.device)
-            scene = extract.load(views_file(this.out, self.block)).scene  # the data set may be much larger
-            return guarded(Site(this, scene, rasterizer, every, store), plan, self.block, self.patience)
+            scene = extract.load(views_file(run.out, self.block)).scene  # the data set may be much larger
+            return guarded(RunContext(run, scene, rasterizer, intervals, caches), plan, self.block, self.patience)
 
 
 COMMAND = Tune

@@ -82,7 +82,7 @@ class ADC(Densify):
         if self._due(step.index - 1):
             for column in columns:
                 column.zero_()
-        columns[0].add_(step.grad)
+        columns[0].add_(step.grad_norm)
         columns[1].add_(step.seen)
         if self.cull_screen > 0:
             torch.maximum(columns[2], step.radii / step.image_px, out=columns[2])
@@ -93,10 +93,10 @@ class ADC(Densify):
         cap = self.reset_opacity if reset else None
         if not self._due(step.index):
             return Edit(max_opacity=cap) if reset else None
-        size = step.shape.scales.amax(-1)
+        size = step.splats.scales.amax(-1)
         hot, small = self._hot(points, step), size <= self.small
         clone, split = hot & small, hot & ~small
-        drop = step.shape.opacities < self.cull_opacity
+        drop = step.splats.opacities < self.cull_opacity
         if step.index > self.reset_every:
             drop &= not 0 < step.index % self.reset_every < self.recovery
             if self.cull_scale > 0:

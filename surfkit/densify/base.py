@@ -16,7 +16,7 @@ from surfkit.raster.api import Splats
 
 
 @dataclass(frozen=True)
-class Tally:
+class Contribution:
     """What one pass over all training views tells of each point.
 
     Attributes:
@@ -39,7 +39,7 @@ class Views(Protocol):
     def __len__(self) -> int:
         """Training views, the length of an epoch."""
 
-    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
+    def contributions(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Contribution:
         """The tally of alpha^a T^b."""
 
     def each(self, alpha_power: float, transmittance_power: float) -> Iterator[tuple[Tensor, Tensor]]:
@@ -54,8 +54,8 @@ class Step:
         index: Steps done, this one included.
         steps: Of the whole stage.
         seen: (N,) bool, the point may touch a pixel of this step's view.
-        shape: The splats that were rendered, N of them, detached.
-        grad: (N,) length of the densification signal, as `Gradients.signal`; 0 where not seen.
+        splats: The splats that were rendered, N of them, detached.
+        grad_norm: (N,) length of the densification signal, as `Gradients.signal`; 0 where not seen.
         radii: (N,) pixels; 0 where not seen.
         image_px: Longer side of this step's view, pixels.
         views: All training views.
@@ -68,8 +68,8 @@ class Step:
     index: int
     steps: int
     seen: Tensor
-    shape: Splats
-    grad: Tensor
+    splats: Splats
+    grad_norm: Tensor
     radii: Tensor
     image_px: int
     views: Views
@@ -80,7 +80,7 @@ class Step:
 
     def may_multiply(self) -> Tensor:
         """(N,) bool, the points that stand where this block owns them now; a trainer copies and splits no others."""
-        means = self.shape.means
+        means = self.splats.means
         return torch.ones(len(means), dtype=torch.bool) if self.owns is None else self.owns(means)
 
 

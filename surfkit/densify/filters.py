@@ -29,7 +29,7 @@ class Elongation(Filter):
 
     def admits(self, step: Step, want: Tensor) -> Tensor:
         """(N,) bool, points that are no needles."""
-        longest, second = step.shape.scales.topk(2, dim=-1).values.unbind(-1)
+        longest, second = step.splats.scales.topk(2, dim=-1).values.unbind(-1)
         return second > self.min_ratio * longest
 
 

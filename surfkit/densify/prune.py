@@ -39,10 +39,10 @@ class Importance(Prune):
 
     def importance(self, step: Step) -> Tensor:
         """(N,) sum over views and pixels of the opacity, times (V / V90)^power."""
-        hits = step.views.survey().hits
-        volume = step.shape.scales.prod(-1)
+        hits = step.views.contributions().hits
+        volume = step.splats.scales.prod(-1)
         large = volume.sort(descending=True).values[int(0.9 * len(volume))]
-        return hits * step.shape.opacities * (volume / large) ** self.power
+        return hits * step.splats.opacities * (volume / large) ** self.power
 
 
 @dataclass(frozen=True)
@@ -72,4 +72,4 @@ class Faint(Prune):
         """Drop what is too faint."""
         if not self.start < step.index <= self.until or step.index % self.every or step.since_reset < self.recovery:
             return None
-        return Edit(drop=step.shape.opacities < self.below)
+        return Edit(drop=step.splats.opacities < self.below)

@@ -59,7 +59,7 @@ class Trim(Prune):
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Drop the lowest at the end of some epochs, and the unseen at the beginning."""
         if step.index == 1:
-            return Edit(drop=step.views.survey(self.gamma, 1 - self.gamma).views == 0)
+            return Edit(drop=step.views.contributions(self.gamma, 1 - self.gamma).views == 0)
         if step.index not in self.trims(len(step.views)) or step.since_reset < self.recovery:
             return None
         return Edit(drop=lowest(self._scores(step.views), self.ratio))
@@ -74,7 +74,7 @@ class Trim(Prune):
             return released_score(views)
         if self.score == "sum":
             return summed(views)
-        tally = views.survey(self.gamma, 1 - self.gamma)
+        tally = views.contributions(self.gamma, 1 - self.gamma)
         return tally.peak if self.score == "peak" else tally.mean
 
 

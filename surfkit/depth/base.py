@@ -17,7 +17,7 @@ from surfkit.scene.scene import View
 
 
 @dataclass(frozen=True)
-class Material:
+class DepthInput:
     """What there is to estimate depth from.
 
     Attributes:
@@ -67,7 +67,7 @@ class DepthEstimator(Component):
     version: ClassVar[int] = 1
 
     @abstractmethod
-    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+    def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         """Estimate the depth of the views at the positions `wanted`, one after the other, at any size."""
 
     def refuse_unfit(self, views: Sequence[View]) -> None:

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.scene.photos import read_photo
 
 LICENCES = {"small": "Apache-2.0", "base": "CC BY-NC 4.0", "large": "CC BY-NC 4.0"}
@@ -58,7 +58,7 @@ class DepthAnythingV2(DepthEstimator):
         use = "" if self.size == "small" else ", which forbids commercial use"
         return f"the weights {self.source} are under {LICENCES[self.size]}{use}"
 
-    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+    def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         network = self.network().to(given.device).eval()
         for at in wanted:
             camera = given.views[at].camera

@@ -15,7 +15,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
-from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
@@ -123,7 +123,7 @@ class PatchMatch(DepthEstimator):
         require_native()
         refuse_wide_window(self.window, self.longest, views)
 
-    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+    def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         work = Work(self, given, neighbours(given.views, given.observations, self.neighbours, self.angle))
         for at in wanted:
             found = work.consistent(at)
@@ -190,7 +190,7 @@ class Map:
 
 
 @dataclass(frozen=True)
-class Beginning(PlaneSweep):
+class InitialPoints(PlaneSweep):
     """The sweep in which planes begin; it also looks for what is nearer or further than all sparse points."""
 
     margin: float = 0.5
@@ -207,9 +207,9 @@ class Work:
     photometric consistency alone, and by geometric consistency too.
     """
 
-    def __init__(self, settings: PatchMatch, given: Material, pairs: list[list[int]]) -> None:
+    def __init__(self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]]) -> None:
         self.settings, self.given, self.pairs = settings, given, pairs
-        self.sweep = Beginning(longest=settings.coarsest)
+        self.sweep = InitialPoints(longest=settings.coarsest)
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * KEPT)(self.read)
         self.grey = lru_cache(KEPT)(self.halved)

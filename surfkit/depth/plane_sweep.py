@@ -14,7 +14,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.memory import size
-from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
@@ -103,7 +103,7 @@ class PlaneSweep(DepthEstimator):
         """See `DepthEstimator.refuse_unfit`."""
         refuse_wide_window(self.window, self.longest, views)
 
-    def estimate(self, given: Material, wanted: Sequence[int]) -> Iterator[Estimate]:
+    def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
 
         @lru_cache(KEPT)
@@ -131,14 +131,16 @@ class PlaneSweep(DepthEstimator):
             trusted[at_edge(inverse, self.window // 2, self.edge)] = 0
             yield Estimate(at, found.fused.cpu(), (trusted * matched).cpu())
 
-    def picture(self, given: Material, at: int) -> Picture:
+    def picture(self, given: DepthInput, at: int) -> Picture:
         """A photograph at the working size."""
         view = given.views[at]
         camera = view.camera.fitted(self.longest)
         rgb = read_photo(view.path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
         return Picture(camera, rgb)
 
-    def sweep(self, given: Material, at: int, here: Picture, others: Sequence[Picture]) -> tuple[Tensor, Tensor] | None:
+    def sweep(
+        self, given: DepthInput, at: int, here: Picture, others: Sequence[Picture]
+    ) -> tuple[Tensor, Tensor] | None:
         """(H, W) inverse depth and how well it matches, in [0, 1]; None without neighbours or sparse points."""
         span = depth_range(given.views[at], given.observations, self.margin)
         if span is None or not others:

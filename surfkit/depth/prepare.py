@@ -15,7 +15,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.version import own_version
-from surfkit.depth.base import DepthEstimator, Estimate, Material
+from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import (
@@ -81,7 +81,7 @@ class Preparation:
         """The photographs to estimate."""
         return scene.train if self.estimator.matched else (*scene.train, *scene.held_out)
 
-    def material(self, scene: Scene, tracks: Observations | None = None) -> Material:
+    def material(self, scene: Scene, tracks: Observations | None = None) -> DepthInput:
         """What the estimator works from; `tracks` are read if None.
 
         Raises:
@@ -89,7 +89,7 @@ class Preparation:
         """
         tracks = tracks or observations(self.data, scene)
         self.refuse_unfit(scene, tracks)
-        return Material(self.views(scene), tracks, self.device, self.work)
+        return DepthInput(self.views(scene), tracks, self.device, self.work)
 
     def refuse_unfit(self, scene: Scene, tracks: Observations) -> None:
         """BadInput if the settings do not fit the photographs, or the sparse model does not tell which to compare."""
@@ -147,7 +147,7 @@ class Preparation:
             "matched": [view.name for view in views] if self.estimator.matched else None,
         }
 
-    def run(self, scene: Scene, given: Material, wanted: Sequence[int]) -> Iterator[Prepared]:
+    def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
         """Estimate and save the views at the positions `wanted`, one after the other."""
         begun = time.perf_counter()
         for estimate in self.estimator.estimate(given, wanted):

@@ -49,7 +49,7 @@ DRAWN = 2_000
 
 
 @dataclass(frozen=True)
-class Churn(Prune):
+class EditStress(Prune):
     """Some points go and as many come, at given steps: memory is at its highest while a step edits its points."""
 
     at: tuple[int, ...] = ()
@@ -231,7 +231,7 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     generator, start = torch.Generator().manual_seed(recipe.seed), time.perf_counter()
     points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator))
     yield Started(photo_seconds, time.perf_counter() - start, held)
-    churn = Churn(tuple(part.index + 1 for part in job.parts))
+    churn = EditStress(tuple(part.index + 1 for part in job.parts))
     stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
     trainer = Trainer(
         stage, recipe.primitive, views, photos, select(job.device)[0], priors, masks, beside=_next_of(len(views))
@@ -300,7 +300,7 @@ def _written(trainer: Trainer, state: StageState) -> Written:
         folder, start = Path(name), time.perf_counter()
         checkpoint.save(folder / "checkpoint.safetensors", state)
         save_seconds, start = time.perf_counter() - start, time.perf_counter()
-        splats = trainer.primitive.shape(state.points.params, state.sh_degree)
+        splats = trainer.primitive.activate(state.points.params, state.sh_degree)
         maps = trainer.rasterizer.render(splats, view.camera, trainer.stage.near, True).maps
         write_picture(folder / "picture.png", panel(trainer.photos[0], maps))
         draw_seconds = time.perf_counter() - start

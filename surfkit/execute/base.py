@@ -47,7 +47,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Ended:
+class JobResult:
     """A job has come to an end.
 
     Attributes:
@@ -78,7 +78,7 @@ class Executor(Component):
         """
 
     @abstractmethod
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """Do the jobs and tell of each as it ends. On the way out, nothing is left running.
 
         Raises:
@@ -98,13 +98,13 @@ class Inline(Executor):
     def ready(self) -> None:
         """See `Executor.ready`; it always can."""
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         for job in jobs:
             status = job.call()
             if status == INTERRUPTED:
                 raise KeyboardInterrupt
-            yield Ended(job, status)
+            yield JobResult(job, status)
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Pool(Executor):
     def ready(self) -> None:
         """See `Executor.ready`; it always can."""
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         waiting = largest_first(jobs)
         crew = Crew(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
@@ -199,10 +199,10 @@ class Crew:
             )
         self.busy[process] = job
 
-    def ended(self) -> list[Ended]:
+    def ended(self) -> list[JobResult]:
         """The jobs that have ended since it was last asked."""
         over = [process for process in self.busy if process.poll() is not None]
-        return [Ended(self.busy.pop(process), process.returncode) for process in over]
+        return [JobResult(self.busy.pop(process), process.returncode) for process in over]
 
     def stop(self) -> None:
         """Ask every process to save its state and end, and wait until they have.

@@ -12,9 +12,9 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.execute.base import Ended, Executor, Job, largest_first, terminable
+from surfkit.execute.base import Executor, Job, JobResult, largest_first, terminable
 from surfkit.execute.remote import CRASHED, POLL_S, attend
-from surfkit.execute.shared import errand, marked
+from surfkit.execute.shared import marked, remote_job
 
 REACH_S = 10.0
 STORE_BYTES = 100 << 20
@@ -66,12 +66,12 @@ class Ray(Executor):
         """See `Executor.ready`."""
         _imported()
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         with _connected(self.address) as ray, marked(jobs) as mark:
             share = self.share([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
             task = ray.remote(max_retries=self.retries, **share)(attend)
-            what = {job.index: errand(job, mark, int(share["num_cpus"]), self.gpus > 0) for job in jobs}
+            what = {job.index: remote_job(job, mark, int(share["num_cpus"]), self.gpus > 0) for job in jobs}
             under_way = {task.remote(what[job.index]): job for job in largest_first(jobs)}
             try:
                 while under_way:
@@ -169,12 +169,12 @@ def _reach(address: str) -> None:
         ) from error
 
 
-def _ended(ray: ModuleType, ref: Any, job: Job) -> Ended:
+def _ended(ray: ModuleType, ref: Any, job: Job) -> JobResult:
     """What became of a job whose task is over."""
     try:
         found = ray.get(ref)
     except ray.exceptions.RayError as error:
         told = str(error).strip().splitlines()
         why = f"{type(error).__name__}: {told[0] if told else 'Ray says no more'}"
-        return Ended(job, CRASHED, f"Ray could not do it: {why}")
-    return Ended(job, found.status, found.why)
+        return JobResult(job, CRASHED, f"Ray could not do it: {why}")
+    return JobResult(job, found.status, found.why)

@@ -27,7 +27,7 @@ INTERRUPTED, CRASHED = 130, 70
 POLL_S = 0.2
 CARRIED = ("PYTHONPATH", "SURFKIT_PLUGINS")
 """Variables of whoever asks, without which another machine might run other code."""
-MINDER = f"""
+WATCHDOG = f"""
 import os, signal, subprocess, sys
 agent = int(os.environ["{DRIVER}"])
 for number in (signal.SIGUSR1, signal.SIGUSR2):
@@ -68,7 +68,7 @@ class Outcome:
 
 
 @dataclass
-class Errand:
+class RemoteJob:
     """A command, and what its machine has to have.
 
     Attributes:
@@ -123,7 +123,7 @@ class Errand:
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         with open(self.log, "ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-IS", "-c", MINDER, *self.words],
+                [sys.executable, "-IS", "-c", WATCHDOG, *self.words],
                 env={**os.environ, **self.carried, **limits, DRIVER: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -147,7 +147,7 @@ class Errand:
         return DelayedSubmission(replace(self, process=None))
 
 
-def attend(errand: Errand) -> Outcome:
+def attend(remote_job: RemoteJob) -> Outcome:
     """Run an errand; a function of its own, as Ray wants it.
 
     Ray cancels by a simulated Ctrl-C, which means nothing where that is ignored, as by all that a shell begins in the
@@ -155,7 +155,7 @@ def attend(errand: Errand) -> Outcome:
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    return errand()
+    return remote_job()
 
 
 def _carried() -> dict[str, str]:

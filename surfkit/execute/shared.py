@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.execute.base import LOG, Job
-from surfkit.execute.remote import Errand
+from surfkit.execute.remote import RemoteJob
 
 MARK = ".seen-from-all-"
 
@@ -28,7 +28,7 @@ def marked(jobs: Sequence[Job]) -> Iterator[Path]:
         yield Path(file.name)
 
 
-def errand(job: Job, mark: Path, threads: int, gpu: bool) -> Errand:
+def remote_job(job: Job, mark: Path, threads: int, gpu: bool) -> RemoteJob:
     """A job as another machine does it.
 
     Args:
@@ -40,5 +40,5 @@ def errand(job: Job, mark: Path, threads: int, gpu: bool) -> Errand:
     """
     folder = job.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    made = Errand(job.command, folder / LOG, (mark, *(path.absolute() for path in job.needs)), threads)
+    made = RemoteJob(job.command, folder / LOG, (mark, *(path.absolute() for path in job.needs)), threads)
     return made if gpu else replace(made, carried={**made.carried, "CUDA_VISIBLE_DEVICES": ""})

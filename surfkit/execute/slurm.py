@@ -20,9 +20,9 @@ from typing import Any, Literal
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.optional import needed
-from surfkit.execute.base import Ended, Executor, Job, largest_first, terminable
-from surfkit.execute.remote import CRASHED, POLL_S, Errand
-from surfkit.execute.shared import errand, marked
+from surfkit.execute.base import Executor, Job, JobResult, largest_first, terminable
+from surfkit.execute.remote import CRASHED, POLL_S, RemoteJob
+from surfkit.execute.shared import marked, remote_job
 from surfkit.execute.state import worked_on
 
 SLURM_POLL_S = 1.0
@@ -113,7 +113,7 @@ class Slurm(Executor):
                 "--executor.cluster local"
             )
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[Ended]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         self.ready()
         waiting, queue = largest_first(jobs), Queue(self.cluster)
@@ -130,10 +130,10 @@ class Slurm(Executor):
             finally:
                 queue.cancel()
 
-    def _errand(self, job: Job, mark: Path) -> Errand:
+    def _errand(self, job: Job, mark: Path) -> RemoteJob:
         if self.cluster == "slurm":
-            return replace(errand(job, mark, self.cpus, self.gpus > 0), hold_s=HOLD_S)
-        return errand(job, mark, min(self.cpus, max(1, len(os.sched_getaffinity(0)) // self._limit)), self.gpus > 0)
+            return replace(remote_job(job, mark, self.cpus, self.gpus > 0), hold_s=HOLD_S)
+        return remote_job(job, mark, min(self.cpus, max(1, len(os.sched_getaffinity(0)) // self._limit)), self.gpus > 0)
 
     def _submitter(self, folder: Path, jobs: Sequence[Job]) -> Any:
         """What submits the jobs."""
@@ -188,7 +188,7 @@ class Queue:
     states: dict[Any, tuple[str, float]] = field(default_factory=dict)
     asked: float = -math.inf
 
-    def submit(self, executor: Any, batch: Sequence[Job], errands: Sequence[Errand]) -> None:
+    def submit(self, executor: Any, batch: Sequence[Job], errands: Sequence[RemoteJob]) -> None:
         """Submit some jobs; to Slurm, as one array."""
         submitit = _imported()
         try:
@@ -201,7 +201,7 @@ class Queue:
         for handle, job in zip(handles, batch, strict=True):
             say(f"block {job.index}: job {handle.job_id}")
 
-    def ended(self) -> Iterator[Ended]:
+    def ended(self) -> Iterator[JobResult]:
         """The jobs that have ended since it was last asked."""
         if self.cluster == "slurm":
             self.ask()
@@ -213,7 +213,9 @@ class Queue:
             elif state and state.split()[0] not in ALIVE and time.monotonic() - since > ARRIVE_S:
                 del self.jobs[handle]
                 why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
-                yield Ended(job, 1 if state.startswith("CANCELLED") else CRASHED, why)  # what a person cancels stays so
+                yield JobResult(
+                    job, 1 if state.startswith("CANCELLED") else CRASHED, why
+                )  # what a person cancels stays so
 
     def ask(self) -> None:
         """Ask Slurm where the jobs are; by squeue, for not every cluster keeps accounts of what is over."""
@@ -249,12 +251,12 @@ def _imported() -> ModuleType:
     return submitit
 
 
-def _ended(handle: Any, job: Job) -> Ended:
+def _ended(handle: Any, job: Job) -> JobResult:
     """What became of a job that is over."""
     error = handle.exception()
     if error is None:
         found = handle.result()
-        return Ended(job, found.status, found.why)
+        return JobResult(job, found.status, found.why)
     told = [line for line in str(error).splitlines() if line.strip(" -")]
     last = next((line for line in reversed(told) if "Error" in line), told[0] if told else "no log")
-    return Ended(job, CRASHED, f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}")
+    return JobResult(job, CRASHED, f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}")

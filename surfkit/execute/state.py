@@ -41,9 +41,9 @@ class BlockState:
         began: When it was last begun.
         first: Step after which it was.
         begun_points: At its first step.
-        rung: Of the ladder that it has come down for want of memory; 0 for none.
+        fallback: Of the ladder that it has come down for want of memory; 0 for none.
         most_points: Beyond which it does not grow, on its rung.
-        eased: What each rung has changed, in a few words.
+        reduced: What each rung has changed, in a few words.
     """
 
     status: Status = "planned"
@@ -58,9 +58,9 @@ class BlockState:
     began: float = 0.0
     first: int = 0
     begun_points: int = 0
-    rung: int = 0
+    fallback: int = 0
     most_points: int | None = None
-    eased: tuple[str, ...] = ()
+    reduced: tuple[str, ...] = ()
 
 
 def worked_on(folder: Path) -> str | None:

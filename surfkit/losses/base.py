@@ -34,7 +34,7 @@ class Neighbour:
 
 
 @dataclass(frozen=True)
-class Sample:
+class Target:
     """What a rendered view is compared with.
 
     Attributes:
@@ -55,22 +55,22 @@ class Sample:
     seed: int = 0
 
 
-def ignoring(maps: Maps, sample: Sample) -> tuple[Maps, Sample]:
+def ignoring(maps: Maps, target: Target) -> tuple[Maps, Target]:
     """Maps and sample that teach nothing where the mask is False.
 
     There the photograph is what was rendered, no depth is known, and the maps are constants, so that no gradient
     reaches them through the windows of their neighbours either.
     """
-    keep = sample.mask
+    keep = target.mask
     if keep is None:
-        return maps, sample
+        return maps, target
     held = Maps(**{name: torch.where(keep, value, value.detach()) for name, value in maps.present().items()})
-    prior = sample.prior
+    prior = target.prior
     if prior is not None:
         names = ("inverse", "confidence", "normal")
         known = {n: torch.where(keep, value, 0) for n in names if (value := getattr(prior, n)) is not None}
         prior = replace(prior, **known)
-    return held, replace(sample, photo=torch.where(keep, sample.photo, held.color.detach()), prior=prior)
+    return held, replace(target, photo=torch.where(keep, target.photo, held.color.detach()), prior=prior)
 
 
 class Loss(Component):
@@ -92,7 +92,7 @@ class Loss(Component):
         """The term's weight in step `index` of 1..`steps`; 0 leaves the term out."""
 
     @abstractmethod
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
         """The unweighted loss, a scalar that is differentiable in the maps."""
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim_map
 
@@ -52,9 +52,9 @@ class DepthRegression(Loss):
     def weight_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
-        prior = sample.prior
+        prior = target.prior
         if prior is None:
             return 0 * depth.sum()
         there = (depth > 0) & (prior.inverse > 0)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import log_linear
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 
 SHORTEST = 1e-3
@@ -48,13 +48,13 @@ class NormalPrior(Loss):
     def weight_at(self, index: int, steps: int) -> float:
         return log_linear(self.start, self.end, index / steps)
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
-        if sample.prior is None or sample.prior.normal is None:
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        if target.prior is None or target.prior.normal is None:
             return 0 * maps.normal.sum()
-        estimated = sample.prior.normal.to(maps.normal)
+        estimated = target.prior.normal.to(maps.normal)
         square = maps.normal.square().sum(0)
         there = (square.detach() > SHORTEST**2) & (estimated != 0).any(0)
-        weight = torch.where(there, sample.prior.confidence * maps.alpha.detach(), 0)
+        weight = torch.where(there, target.prior.confidence * maps.alpha.detach(), 0)
         rendered = torch.where(there, maps.normal, 0) * torch.where(there, square, 1).rsqrt()
         error = torch.zeros_like(square)
         if self.error != "l1":

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim
 
@@ -21,8 +21,8 @@ class L1(Loss):
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
-        return (maps.color - sample.photo).abs().mean()
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        return (maps.color - target.photo).abs().mean()
 
 
 @dataclass(frozen=True)
@@ -35,5 +35,5 @@ class SSIM(Loss):
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
-        return 1 - ssim(maps.color, sample.photo)
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        return 1 - ssim(maps.color, target.photo)

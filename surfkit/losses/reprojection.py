@@ -8,7 +8,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Target
 from surfkit.losses.two_views import Opposite, TwoViews, agreement, round_trip, spread, surface_depth
 from surfkit.raster.api import Maps
 
@@ -35,13 +35,13 @@ class Reprojection(TwoViews, Loss):
         if self.stride < 1:
             raise BadInput(f"Reprojection has stride {self.stride}; it must be 1 or more")
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
-        depth, neighbour = surface_depth(maps, self.depth), sample.neighbour
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        depth, neighbour = surface_depth(maps, self.depth), target.neighbour
         if neighbour is None:
             return 0 * depth.sum()
         height, width = depth.shape
-        camera = sample.view.camera
-        y, x = spread((height, width), self.stride, sample.seed)
+        camera = target.view.camera
+        y, x = spread((height, width), self.stride, target.seed)
         at = y * width + x
         rays = camera.rays(depth.dtype).flatten(1)[:, at]
         error, valid = round_trip(depth.flatten()[at], rays, camera, Opposite.of(neighbour, self.depth))

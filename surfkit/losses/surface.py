@@ -9,7 +9,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps, log_linear
-from surfkit.losses.base import Loss, Sample
+from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
 
@@ -45,9 +45,9 @@ class NormalConsistency(Loss):
             return self.weight
         return log_linear(self.weight, self.end, (index - self.start) / max(1, steps - self.start))
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
-        return disagreement(depth, maps.alpha, maps.normal, sample.view.camera)
+        return disagreement(depth, maps.alpha, maps.normal, target.view.camera)
 
 
 @dataclass(frozen=True)
@@ -68,5 +68,5 @@ class Distortion(Loss):
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight if index > self.start else 0.0
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
         return maps.distortion.mean() * self.unit**2

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.losses.base import Loss, Neighbour, Sample
+from surfkit.losses.base import Loss, Neighbour, Target
 from surfkit.losses.two_views import (
     TINY,
     Opposite,
@@ -61,10 +61,10 @@ class WarpedPatches(TwoViews, Loss):
         if self.pixels < 1 or self.radius < 1:
             raise BadInput(f"WarpedPatches has pixels {self.pixels}, radius {self.radius}; both must be 1 or more")
 
-    def __call__(self, maps: Maps, sample: Sample) -> Tensor:
-        depth, camera, neighbour = surface_depth(maps, self.depth), sample.view.camera, sample.neighbour
+    def __call__(self, maps: Maps, target: Target) -> Tensor:
+        depth, camera, neighbour = surface_depth(maps, self.depth), target.view.camera, target.neighbour
         nothing = 0 * (depth.sum() + maps.normal.sum())
-        at = self.centres(sample)
+        at = self.centres(target)
         if neighbour is None or not len(at):
             return nothing
         z, normal = depth.flatten()[at], maps.normal.flatten(1)[:, at]
@@ -76,14 +76,14 @@ class WarpedPatches(TwoViews, Loss):
         kept = (counts & facing & (normal != 0).any(0)).nonzero()[:, 0]
         plane = normal[:, kept] / ((normal[:, kept] * rays[:, kept]).sum(0) * z[kept])  # plane . point = 1
         found, inside = self.warped(plane, rays[:, kept], camera, neighbour)
-        correlation, textured = ncc(self.patches(sample, at[kept]).to(found), found)
+        correlation, textured = ncc(self.patches(target, at[kept]).to(found), found)
         right = inside & textured
         terms = torch.where(right, weight[kept] * (1 - correlation), 0.0)
         return nothing + terms.sum() / right.sum().clamp_min(1)
 
-    def centres(self, sample: Sample) -> Tensor:
+    def centres(self, target: Target) -> Tensor:
         """(K,) flat positions of the central pixels, spread over the picture; all of their patches counts."""
-        height, width = sample.photo.shape[1:]
+        height, width = target.photo.shape[1:]
         r = self.radius
         inner = (height - 2 * r, width - 2 * r)
         if min(inner) < 1:
@@ -91,20 +91,20 @@ class WarpedPatches(TwoViews, Loss):
         side = max(1, math.ceil(math.sqrt(inner[0] * inner[1] / self.pixels)))
         while math.ceil(inner[0] / side) * math.ceil(inner[1] / side) > self.pixels:
             side += 1
-        y, x = spread(inner, side, sample.seed)
+        y, x = spread(inner, side, target.seed)
         at = (y + r) * width + x + r
-        if sample.mask is None:
+        if target.mask is None:
             return at
-        return at[sample.mask.flatten()[at[:, None] + self.offsets(width)].all(1)]
+        return at[target.mask.flatten()[at[:, None] + self.offsets(width)].all(1)]
 
     def offsets(self, width: int) -> Tensor:
         """(S,) what to add to the flat position of a pixel to get those of its patch, in rows."""
         steps = torch.arange(-self.radius, self.radius + 1)
         return (steps[:, None] * width + steps).flatten()
 
-    def patches(self, sample: Sample, at: Tensor) -> Tensor:
+    def patches(self, target: Target, at: Tensor) -> Tensor:
         """(K, S) grey values of the photograph around the pixels `at`."""
-        return grey(sample.photo).flatten()[at[:, None] + self.offsets(sample.photo.shape[2])]
+        return grey(target.photo).flatten()[at[:, None] + self.offsets(target.photo.shape[2])]
 
     def warped(self, plane: Tensor, rays: Tensor, camera: Camera, neighbour: Neighbour) -> tuple[Tensor, Tensor]:
         """(K, S) grey values of the neighbour where planes take the pixels of patches, and whether all S are there.

@@ -36,7 +36,7 @@ class Mesh:
 
 
 @dataclass(frozen=True)
-class Subject:
+class MeshInput:
     """What is to be meshed.
 
     Attributes:
@@ -85,7 +85,7 @@ class Mesher(Component):
     """Whether the mesher looks at depth priors, where there are any; settings of some decide."""
 
     @abstractmethod
-    def mesh(self, subject: Subject) -> Mesh:
+    def mesh(self, subject: MeshInput) -> Mesh:
         """The surface.
 
         Raises:

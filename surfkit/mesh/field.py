@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.events import Progress, emit
-from surfkit.mesh.base import Subject
+from surfkit.mesh.base import MeshInput
 
 NEAR_SURFACE = 0.01
 """A vertex is seen where its depth is that of the picture, to this share of it."""
@@ -26,7 +26,7 @@ class Field:
             it best, that is one; then a single wrong view cuts a hole.)
     """
 
-    subject: Subject
+    subject: MeshInput
     level: float
     agree: float
 
@@ -58,7 +58,7 @@ def shown(image: Tensor, places: Tensor) -> Tensor:
     return found if image.ndim == 3 else found[:, 0]
 
 
-def vertex_colors(subject: Subject, vertices: np.ndarray) -> np.ndarray:
+def vertex_colors(subject: MeshInput, vertices: np.ndarray) -> np.ndarray:
     """(V, 3) uint8 means over the views in which (V, 3) vertices are seen; grey where there is none."""
     points = torch.from_numpy(vertices).double()
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points), 1)

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.mesh.base import Subject
+from surfkit.mesh.base import MeshInput
 from surfkit.mesh.picture import Which, depth_of
 from surfkit.scene.scene import Frame
 
@@ -37,7 +37,7 @@ def check_length(name: str, value: Length) -> None:
 
 
 def resolve(
-    voxel: Length, truncation: Length, limit: Length, subject: Subject, which: Which, truncation_voxels: float = 4.0
+    voxel: Length, truncation: Length, limit: Length, subject: MeshInput, which: Which, truncation_voxels: float = 4.0
 ) -> Lengths:
     """The lengths in local units; automatic ones follow from what the views see, the truncation from the voxel.
 
@@ -78,7 +78,7 @@ def told(length: float, frame: Frame) -> str:
     return f"{length / frame.scale:.3g} units"
 
 
-def look(subject: Subject, which: Which) -> tuple[float, float]:
+def look(subject: MeshInput, which: Which) -> tuple[float, float]:
     """Median over some views of their median depth, and of the width of a pixel there; local units.
 
     Views without depth are passed over for others.

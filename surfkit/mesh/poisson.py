@@ -11,7 +11,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.simplify import require
 
 ENOUGH = 100
@@ -45,7 +45,7 @@ class Poisson(Mesher):
         """See `Mesher.ready`."""
         require("mesh:poisson")
 
-    def mesh(self, subject: Subject) -> Mesh:
+    def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
         open3d = require("mesh:poisson")
         found = [self._seen(subject, at) for at in range(len(subject.views))]
@@ -70,7 +70,7 @@ class Poisson(Mesher):
             (np.asarray(made.vertex_colors) * 255).round().astype(np.uint8),
         )
 
-    def _seen(self, subject: Subject, at: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _seen(self, subject: MeshInput, at: int) -> tuple[Tensor, Tensor, Tensor]:
         """(P, 3) positions, outward normals and colours in [0, 1] of some pixels of a view."""
         view = subject.views[at]
         camera, maps = view.camera, subject.draw(view)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.readers.depth_prior import DepthPrior
@@ -36,7 +36,7 @@ class Stereo(Mesher):
         if not 0 < self.min_confidence <= 1:
             raise BadInput(f"mesh.min_confidence is {self.min_confidence:g}; it must be more than 0 and at most 1")
 
-    def mesh(self, subject: Subject) -> Mesh:
+    def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
         if subject.priors is None:
             raise BadInput(

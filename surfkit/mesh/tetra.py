@@ -15,7 +15,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.delaunay import EDGES, crossing
 from surfkit.mesh.field import Field, vertex_colors
 from surfkit.raster.footprints import rotations
@@ -69,7 +69,7 @@ class Tetra(Mesher):
                 f"give 0 to {FINEST}, 1 or more, 0 or more"
             )
 
-    def mesh(self, subject: Subject) -> Mesh:
+    def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
         points, sizes = self._points(subject)
         field = Field(subject, self.level, self.agree)
@@ -100,7 +100,7 @@ class Tetra(Mesher):
         vertices, faces = used(vertices.numpy(), faces)
         return Mesh(vertices.astype(np.float32), faces.astype(np.int32), vertex_colors(subject, vertices))
 
-    def _points(self, subject: Subject) -> tuple[Tensor, Tensor]:
+    def _points(self, subject: MeshInput) -> tuple[Tensor, Tensor]:
         """(P, 3) float64 centres and corners of boxes, and (P,) the half diagonals of these boxes."""
         splats = subject.splats
         kept = splats.opacities >= self.faint

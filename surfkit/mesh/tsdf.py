@@ -12,7 +12,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
-from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
 from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, told
@@ -75,7 +75,7 @@ class TSDF(Mesher):
         """See `Mesher.needs_prior`."""
         return self.trust is not None and self.trust.needs_prior
 
-    def mesh(self, subject: Subject) -> Mesh:
+    def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
         if not len(subject.splats) or not subject.views:
             raise BadInput("nothing to mesh: there are no splats or no views")
@@ -103,7 +103,7 @@ class TSDF(Mesher):
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | counts)
 
-    def _eyes(self, subject: Subject, lengths: Lengths) -> Callable[[int], Picture]:
+    def _eyes(self, subject: MeshInput, lengths: Lengths) -> Callable[[int], Picture]:
         """What gives what the view at a position sees."""
 
         def see(at: int) -> Picture:
@@ -122,7 +122,7 @@ class TSDF(Mesher):
 
         return see
 
-    def _lengths(self, subject: Subject) -> tuple[Lengths, Estimate]:
+    def _lengths(self, subject: MeshInput) -> tuple[Lengths, Estimate]:
         """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
         lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth, self.truncation_voxels)
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
@@ -147,13 +147,13 @@ class TSDF(Mesher):
         return lengths, found
 
 
-def words(lengths: Lengths, subject: Subject) -> str:
+def words(lengths: Lengths, subject: MeshInput) -> str:
     """The lengths for a person."""
     voxel, cut, far = (told(value, subject.frame) for value in (lengths.voxel, lengths.truncation, lengths.limit))
     return f"voxels of {voxel}, truncation {cut}, depth up to {far}"
 
 
-def facts(lengths: Lengths, subject: Subject) -> dict[str, Any]:
+def facts(lengths: Lengths, subject: MeshInput) -> dict[str, Any]:
     """The lengths for mesh.json, in units of the data set and in metres where they are known."""
     values = {"voxel": lengths.voxel, "truncation": lengths.truncation, "depth_limit": lengths.limit}
     metres = subject.frame.local_metres
@@ -161,7 +161,7 @@ def facts(lengths: Lengths, subject: Subject) -> dict[str, Any]:
     return found | ({f"{name}_m": value * metres for name, value in values.items()} if metres else {})
 
 
-def refuse_too_fine(lengths: Lengths, subject: Subject, farthest: float) -> None:
+def refuse_too_fine(lengths: Lengths, subject: MeshInput, farthest: float) -> None:
     """BadInput if the voxels cannot be numbered."""
     blocks = farthest / (lengths.voxel * SIDE)
     if blocks > MOST - 2:
@@ -173,12 +173,12 @@ def refuse_too_fine(lengths: Lengths, subject: Subject, farthest: float) -> None
         )
 
 
-def for_mesh(subject: Subject) -> int:
+def for_mesh(subject: MeshInput) -> int:
     """Bytes of the budget that are not the grid's."""
     return int((1 - SHARE) * subject.budget_bytes)
 
 
-def refuse_too_large(lengths: Lengths, subject: Subject, blocks: int) -> None:
+def refuse_too_large(lengths: Lengths, subject: MeshInput, blocks: int) -> None:
     """BadInput if the triangles alone would not fit into the memory."""
     needed, most = blocks * MESH_BYTES, for_mesh(subject)
     if needed > most:

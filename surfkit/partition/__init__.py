@@ -6,7 +6,7 @@ from surfkit.core.registry import Component, hookimpl
 from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import Assign, PictureShare, SSIMDifference
 from surfkit.partition.balanced import Balanced
-from surfkit.partition.base import Cells, Partition, Sight
+from surfkit.partition.base import Cells, CoarseModel, Partition
 from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
 
@@ -36,5 +36,5 @@ __all__ = [
     "PictureShare",
     "QuantileGrid",
     "SSIMDifference",
-    "Sight",
+    "CoarseModel",
 ]

@@ -10,7 +10,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.partition.assign import Assign, check_threshold
-from surfkit.partition.base import Ground, Sight
+from surfkit.partition.base import CoarseModel, Ground
 from surfkit.scene.camera import Camera
 
 SIDE = 48
@@ -45,7 +45,7 @@ class Airspace(Assign):
         """See `Assign.least`."""
         return self.threshold
 
-    def measure(self, sight: Sight, owner: Tensor, count: int) -> Tensor:
+    def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
         """Shoot rays through the pictures; 1 for a camera inside."""
         axes = Ground.under(sight.centres, sight.splats.means).axes
         places, spaces = sight.splats.means.double() @ axes.T, {}

@@ -11,7 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.registry import Component
-from surfkit.partition.base import Sight
+from surfkit.partition.base import CoarseModel
 from surfkit.raster.ssim import ssim
 
 
@@ -19,7 +19,7 @@ class Assign(Component):
     """A way to find the views that a block matters to; those with their camera inside always join."""
 
     @abstractmethod
-    def measure(self, sight: Sight, owner: Tensor, count: int) -> Tensor:
+    def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
         """(V, B) how much each of `count` blocks matters to each view; `owner` is the block of each splat, (N,)."""
 
     @property
@@ -43,7 +43,7 @@ class SSIMDifference(Assign):
         """See `Assign.least`."""
         return self.threshold
 
-    def measure(self, sight: Sight, owner: Tensor, count: int) -> Tensor:
+    def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
         """Draw each view once whole, and once without each block of which it shows anything."""
         difference = torch.zeros(len(sight.views), count)
         for at, view in enumerate(sight.views):
@@ -75,7 +75,7 @@ class PictureShare(Assign):
         """See `Assign.least`."""
         return self.threshold
 
-    def measure(self, sight: Sight, owner: Tensor, count: int) -> Tensor:
+    def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
         """Sum the shares of the splats of each block."""
         share = torch.zeros(len(sight.views), count)
         for at in range(len(sight.views)):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.partition.base import Box, Cells, Ground, Partition, Sight
+from surfkit.partition.base import Box, Cells, CoarseModel, Ground, Partition
 
 FINE = 48
 """Strips along each axis between whose borders cuts are sought."""
@@ -31,7 +31,7 @@ class Balanced(Partition):
         if not 0 <= self.threshold < 1:
             raise BadInput(f"partition: balanced.threshold is {self.threshold}; it must be 0 or more and below 1")
 
-    def cells(self, sight: Sight) -> Cells:
+    def cells(self, sight: CoarseModel) -> Cells:
         """See `Partition.cells`."""
         ground = Ground.under(sight.centres, sight.splats.means)
         if len(sight.splats) < self.count:
@@ -79,7 +79,7 @@ class Load:
     threshold: float
 
     @classmethod
-    def of(cls, sight: Sight, ground: Ground, threshold: float) -> Load:
+    def of(cls, sight: CoarseModel, ground: Ground, threshold: float) -> Load:
         """Look once through every view."""
         flat = ground.flat(sight.splats.means)
         parts = torch.arange(1, FINE) * len(flat) // FINE

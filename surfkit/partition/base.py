@@ -146,7 +146,7 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class Sight:
+class CoarseModel:
     """A coarse model and the views it was trained on.
 
     Attributes:
@@ -181,7 +181,7 @@ class Partition(Component):
     """A way to cut a scene into blocks."""
 
     @abstractmethod
-    def cells(self, sight: Sight) -> Cells:
+    def cells(self, sight: CoarseModel) -> Cells:
         """The cells; they depend on nothing but the model and the cameras.
 
         Raises:

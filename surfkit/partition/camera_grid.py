@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.partition.base import Cells, Ground, Partition, Sight
+from surfkit.partition.base import Cells, CoarseModel, Ground, Partition
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class CameraGrid(Partition):
         if min(self.blocks) < 1:
             raise BadInput(f"partition: camera-grid.blocks is {self.blocks}; give 1 or more along each axis")
 
-    def cells(self, sight: Sight) -> Cells:
+    def cells(self, sight: CoarseModel) -> Cells:
         """See `Partition.cells`."""
         ground = Ground.under(sight.centres, sight.splats.means)
         x, y = ground.flat(sight.centres).T.contiguous()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.partition.base import Box, Cells, Contraction, Ground, Partition, Sight
+from surfkit.partition.base import Box, Cells, CoarseModel, Contraction, Ground, Partition
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ContractedGrid(Partition):
                 f"partition: contracted-grid.foreground is {self.foreground}; its upper corner must be above"
             )
 
-    def cells(self, sight: Sight) -> Cells:
+    def cells(self, sight: CoarseModel) -> Cells:
         """See `Partition.cells`."""
         ground = Ground.under(sight.centres, sight.splats.means)
         cameras = ground.flat(sight.centres)
@@ -57,7 +57,7 @@ class QuantileGrid(Partition):
     def __post_init__(self) -> None:
         _check_blocks(self.blocks, "quantile-grid")
 
-    def cells(self, sight: Sight) -> Cells:
+    def cells(self, sight: CoarseModel) -> Cells:
         """See `Partition.cells`."""
         ground = Ground.under(sight.centres, sight.splats.means)
         flat = ground.flat(sight.splats.means).sort(0).values

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from surfkit.core.files import replacing
-from surfkit.partition.base import Sight
+from surfkit.partition.base import CoarseModel
 from surfkit.partition.plan import Plan
 
 SIDE = 1000
@@ -21,7 +21,7 @@ SHOWN = 0.99
 MOST = 200_000
 
 
-def plan_picture(path: Path, sight: Sight, plan: Plan) -> None:
+def plan_picture(path: Path, sight: CoarseModel, plan: Plan) -> None:
     """Draw points in the colour of their block, cameras as rings, and the number of each block in the middle of it."""
     ground = plan.cells.ground
     points, cameras = ground.flat(sight.splats.means), ground.flat(sight.centres)

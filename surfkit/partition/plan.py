@@ -11,7 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.partition.assign import Assign
-from surfkit.partition.base import Cells, Partition, Sight
+from surfkit.partition.base import Cells, CoarseModel, Partition
 
 LOOKS = 16
 """Views by which the points around a block are counted."""
@@ -74,7 +74,7 @@ class Fewest:
         return max(1, min(self.views, round(self.share * views / blocks)))
 
 
-def plan(sight: Sight, partition: Partition, assign: Assign, fewest: Fewest | None = None) -> Plan:
+def plan(sight: CoarseModel, partition: Partition, assign: Assign, fewest: Fewest | None = None) -> Plan:
     """Cut, find the views of every block, and join blocks with too few of them to their neighbours.
 
     Raises:
@@ -93,7 +93,7 @@ def plan(sight: Sight, partition: Partition, assign: Assign, fewest: Fewest | No
     return Plan(cells, blocks_of(sight, cells, joins, inside))
 
 
-def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:
+def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:
     """What there is to say of every block, from (V, B) views that join and that stand inside."""
     owner = cells.owner(sight.splats.means)
     points = torch.bincount(owner, minlength=cells.count)
@@ -113,7 +113,7 @@ def blocks_of(sight: Sight, cells: Cells, joins: Tensor, inside: Tensor) -> tupl
     )
 
 
-def begins(sight: Sight, own: Tensor, joins: Tensor) -> int:
+def begins(sight: CoarseModel, own: Tensor, joins: Tensor) -> int:
     """Points that a block begins with, by (N,) those that it owns and what some of its (V,) views show."""
     views, seen = joins.nonzero()[:, 0].tolist(), own.clone()
     for at in views[:: -(-len(views) // LOOKS) or 1]:

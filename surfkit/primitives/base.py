@@ -40,7 +40,7 @@ class Primitive(Component):
         """Raw parameters of one point per cloud point."""
 
     @abstractmethod
-    def shape(self, params: Columns, degree: int) -> Splats:
+    def activate(self, params: Columns, degree: int) -> Splats:
         """Activated splats, with the autograd graph to `params`, using harmonics up to `degree`."""
 
     @abstractmethod
@@ -100,7 +100,7 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
 
 def to_table(primitive: Primitive, params: Columns) -> SplatTable:
     """The points as files hold them, local frame."""
-    splats = primitive.shape({name: value.detach() for name, value in params.items()}, 0)
+    splats = primitive.activate({name: value.detach() for name, value in params.items()}, 0)
     return SplatTable(
         kind=splats.kind,
         means=splats.means,
@@ -115,7 +115,7 @@ def to_table(primitive: Primitive, params: Columns) -> SplatTable:
 
 def _nudged(points: Points, edit: Edit) -> Points:
     """Points whose parameters have been moved and whose moments have been forgotten, where the edit asks for it."""
-    params, moments = points.params, [points.first, points.second]
+    params, moments = points.params, [points.exp_avg, points.exp_avg_sq]
     if edit.nudge is not None:
         params = params | {name: params[name] + shift for name, shift in edit.nudge.items()}
     if edit.forget is not None and edit.forget.any():
@@ -130,7 +130,7 @@ def _dimmed(points: Points, most: float) -> Points:
     zero = torch.zeros_like(points.params["opacities"])
     return Points(
         points.params | {"opacities": points.params["opacities"].clamp_max(logit)},
-        points.first | {"opacities": zero},
-        points.second | {"opacities": zero.clone()},
+        points.exp_avg | {"opacities": zero},
+        points.exp_avg_sq | {"opacities": zero.clone()},
         points.stats,
     )

@@ -40,7 +40,7 @@ class Flat3D(Primitive):
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)
         return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
 
-    def shape(self, params: Columns, degree: int) -> Splats:
+    def activate(self, params: Columns, degree: int) -> Splats:
         """Gaussians."""
         return Splats(
             kind="gaussian",

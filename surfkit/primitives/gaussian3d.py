@@ -25,7 +25,7 @@ class Gaussian3D(Primitive):
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
         return seeds(cloud, axes=3, sh_degree=self.sh_degree) | {"quats": quats}
 
-    def shape(self, params: Columns, degree: int) -> Splats:
+    def activate(self, params: Columns, degree: int) -> Splats:
         """Gaussians."""
         return Splats(
             kind="gaussian",

@@ -17,14 +17,14 @@ class Points:
 
     Attributes:
         params: Trainable raw values, each (N, ...).
-        first: Adam's running mean of each parameter's gradient, same shapes.
-        second: Adam's running mean of the squared gradient, same shapes.
+        exp_avg: Adam's running mean of each parameter's gradient, same shapes.
+        exp_avg_sq: Adam's running mean of the squared gradient, same shapes.
         stats: What policies accumulate between edits, each (N,).
     """
 
     params: Columns
-    first: Columns
-    second: Columns
+    exp_avg: Columns
+    exp_avg_sq: Columns
     stats: Columns = field(default_factory=dict)
 
     @classmethod
@@ -55,7 +55,7 @@ class Points:
             return {name: torch.cat([v, v.new_zeros(count, *v.shape[1:])]) for name, v in group.items()}
 
         joined = {name: torch.cat([value, params[name]]) for name, value in self.params.items()}
-        return Points(joined, padded(self.first), padded(self.second), padded(self.stats))
+        return Points(joined, padded(self.exp_avg), padded(self.exp_avg_sq), padded(self.stats))
 
     def to(self, device: torch.device | str) -> Points:
         """These points on another device."""

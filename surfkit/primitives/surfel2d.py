@@ -23,7 +23,7 @@ class Surfel2D(Primitive):
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)  # uniform over all rotations
         return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
 
-    def shape(self, params: Columns, degree: int) -> Splats:
+    def activate(self, params: Columns, degree: int) -> Splats:
         """Surfels."""
         return Splats(
             kind="surfel",

@@ -17,8 +17,8 @@ from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
-from surfkit.refine.light import Distil, Recover
-from surfkit.train.adam import Rate
+from surfkit.refine.light import DistilSH, PruneAndRecover
+from surfkit.train.adam import LearningRate
 from surfkit.train.stage import RATES, Stage
 
 FILTERS = (Elongation(min_ratio=0.01),)
@@ -60,7 +60,7 @@ CITY = replace(
         COARSE.pretrain,
         losses=TUNED_LOSSES,
         prune=(Trim(ratio=0.025),),
-        rates=RATES | {"means": Rate(6.4e-5, 6.4e-7), "scales": Rate(4e-3)},
+        rates=RATES | {"means": LearningRate(6.4e-5, 6.4e-7), "scales": LearningRate(4e-3)},
     ),
     # The paper does not say what becomes of points around a block. On shibuya-synth at an eighth of the size, two
     # blocks, 300 steps each stage, two seeds: densified 17.75 and 17.57 dB, tuned 18.13 and 18.22, frozen 17.94 and
@@ -102,7 +102,7 @@ STREET = replace(
         COARSE.pretrain,
         losses=LOSSES | {"depth": DepthRegression(start=1.0, end=0.1)},
         densify=ADC(threshold=5e-5, start=4_000, every=1_000, reset_every=20_000, filters=FILTERS),
-        rates=RATES | {"means": Rate(1.6e-5, 1.6e-6), "scales": Rate(1e-3)},
+        rates=RATES | {"means": LearningRate(1.6e-5, 1.6e-6), "scales": LearningRate(1e-3)},
     ),
     partition=ContractedGrid(blocks=(5, 4)),
     assign=SSIMDifference(threshold=0.01),
@@ -112,7 +112,7 @@ STREET = replace(
         losses=TUNED_LOSSES | {"depth": DepthRegression(start=0.5, end=0.025)},
         densify=ADC(threshold=7.5e-5, until=30_000, every=1_000, reset_every=30_000, filters=FILTERS),
         prune=(),
-        rates=RATES | {"means": Rate(8e-6, 8e-7), "scales": Rate(2.5e-3)},
+        rates=RATES | {"means": LearningRate(8e-6, 8e-7), "scales": LearningRate(2.5e-3)},
     ),
 )
 
@@ -122,5 +122,5 @@ FIRST = Recipe(
     primitive=Gaussian3D(),
     partition=ContractedGrid(blocks=(2, 2)),
     tune=Stage(rates=CITY.tune.rates),
-    refine=(Recover(), Distil()),
+    refine=(PruneAndRecover(), DistilSH()),
 )

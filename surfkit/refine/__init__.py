@@ -4,13 +4,13 @@ from collections.abc import Mapping
 
 from surfkit.core.registry import Component, hookimpl
 from surfkit.refine.base import Refine
-from surfkit.refine.light import Distil, Recover
+from surfkit.refine.light import DistilSH, PruneAndRecover
 
 
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """What this folder offers."""
-    return {"recover": Recover, "distil": Distil}
+    return {"recover": PruneAndRecover, "distil": DistilSH}
 
 
 __all__ = ["Distil", "Recover", "Refine"]

@@ -14,27 +14,30 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 from surfkit.refine.base import Refine
 from surfkit.scene.scene import View
-from surfkit.train.adam import Rate
+from surfkit.train.adam import LearningRate
 from surfkit.train.stage import RATES, Stage
 
 
-def slowing(rates: dict[str, float], to: float) -> dict[str, Rate]:
+def slowing(rates: dict[str, float], to: float) -> dict[str, LearningRate]:
     """Rates that fall to a share of themselves, in three digits."""
-    return {name: Rate(rate, float(f"{rate * to:.3g}")) if rate else Rate(0.0) for name, rate in rates.items()}
+    return {
+        name: LearningRate(rate, float(f"{rate * to:.3g}")) if rate else LearningRate(0.0)
+        for name, rate in rates.items()
+    }
 
 
 STARTS = {name: rate.start for name, rate in RATES.items()}
 # CityGaussian's: all rates fall by 5 % every 400 steps of recovery and by 10 % every 500 of distillation; positions
 # hardly move, and their rate goes on falling from one to the other.
-RECOVERY = slowing(STARTS | {"scales": 7.5e-5}, 0.95**75) | {"means": Rate(3e-7, 3e-9)}
-DISTILLATION = slowing(STARTS | {"scales": 7.5e-5, "opacities": 0.0}, 0.9**20) | {"means": Rate(9.5e-9, 3e-9)}
+RECOVERY = slowing(STARTS | {"scales": 7.5e-5}, 0.95**75) | {"means": LearningRate(3e-7, 3e-9)}
+DISTILLATION = slowing(STARTS | {"scales": 7.5e-5, "opacities": 0.0}, 0.9**20) | {"means": LearningRate(9.5e-9, 3e-9)}
 
 MOST_COPIES = 1000
 """Of each camera."""
 
 
 @dataclass(frozen=True)
-class Recover(Refine):
+class PruneAndRecover(Refine):
     """Drop the points of least importance, and let the others make up for them."""
 
     stage: Stage = field(
@@ -44,7 +47,7 @@ class Recover(Refine):
 
 
 @dataclass(frozen=True)
-class Distil(Refine):
+class DistilSH(Refine):
     """Cut the harmonics of the colours, and learn from what the model drew before, also beside the photographs."""
 
     taught: ClassVar[bool] = True

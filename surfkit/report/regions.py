@@ -18,7 +18,7 @@ from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.parts import by_seams, by_views, measure_parts
 from surfkit.evaluate.images.seams import Seams
-from surfkit.evaluate.images.seen import Depths, Sight, sights
+from surfkit.evaluate.images.seen import Counted, Depths, count_views
 from surfkit.mesh.depths import mesh_depth
 from surfkit.mesh.picture import depth_of
 from surfkit.partition.borders import border_places
@@ -69,13 +69,13 @@ class Zones:
             raise BadInput(f"--seen {most}: there are {len(scene.train)} training views, so give that many or fewer")
 
 
-def seams_of(this: Run, frame: Frame, distance: Distance) -> Seams:
+def seams_of(run: Run, frame: Frame, distance: Distance) -> Seams:
     """The borders of the blocks of a run.
 
     Raises:
         BadInput: It has none, or the distance is in metres and nobody knows how long a unit is.
     """
-    path = this.out / "blocks" / "plan.json"
+    path = run.out / "blocks" / "plan.json"
     if not path.exists():
         raise BadInput(f"--seams: no {path}: the run is not one in blocks, or they are deleted; leave --seams out")
     cells = read_json(path, Record).plan.cells
@@ -137,18 +137,18 @@ def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: Depths, seams:
     zones.refuse_too_many(scene)
     wanted = tuple(sorted(set(zones.seen)))
 
-    def near(sight: Sight) -> Tensor:
+    def near(sight: Counted) -> Tensor:
         flat = sight.places.reshape(-1, 3)
         known = torch.isfinite(flat[:, 0])
         found = torch.zeros(len(flat), dtype=torch.bool)
         found[known] = torch.from_numpy(seams.near(flat[known].numpy()))
         return found.reshape(sight.counts.shape)
 
-    def parts(sight: Sight) -> dict[str, Tensor]:
+    def parts(sight: Counted) -> dict[str, Tensor]:
         return by_views(wanted)(sight) | ({} if seams is None else by_seams(near)(sight))
 
     found = measure_parts(
-        sights(scene.held_out, scene.train if wanted else (), depths),
+        count_views(scene.held_out, scene.train if wanted else (), depths),
         parts,
         draw,
         lambda sight: view_photo(sight.view),

@@ -37,7 +37,7 @@ class Block:
         first: Step after which it was last begun.
         began: When, seconds since 1970.
         heard: When it last gave a sign of life, likewise.
-        eased: What it was given less of when memory gave out, one after the other.
+        reduced: What it was given less of when memory gave out, one after the other.
     """
 
     index: int
@@ -51,7 +51,7 @@ class Block:
     first: int = 0
     began: float = 0.0
     heard: float = 0.0
-    eased: tuple[str, ...] = ()
+    reduced: tuple[str, ...] = ()
 
 
 KNOWN = tuple(field.name for field in fields(Block) if field.name not in ("index", "views"))

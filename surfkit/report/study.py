@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 
 from surfkit import pipeline
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump, read_json, write_json, write_text
 from surfkit.core.registry import records
@@ -189,7 +189,7 @@ def attempt(trial: Trial, plan: Plan) -> Outcome:
     trace, found = trial.folder / TRACE, finished(trial.folder)
     try:
         if found is None:
-            found = figures(pipeline.run(trial.recipe, plan.data, trial.folder, Hands(plan.device)))
+            found = figures(pipeline.run(trial.recipe, plan.data, trial.folder, Compute(plan.device)))
         if plan.truth is not None:
             with noted():
                 found = figures(plan.truth.measure(trial.folder, plan.out))

@@ -66,13 +66,13 @@ class Truth:
         Raises:
             BadInput: There is no mesh, or it is nowhere near the truth.
         """
-        this = opened(folder)
-        if not this.mesh_record.exists():
+        run = opened(folder)
+        if not run.mesh_record.exists():
             raise BadInput(f"{folder}: no mesh that could be compared with {self.path}")
-        crop, scene = self.crop(out), read(this.data)
+        crop, scene = self.crop(out), read(run.data)
         settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
-        files = (this.mesh, self.path)
+        files = (run.mesh, self.path)
         found = measure_geometry(files, settings, folder / "geometry", scene.train, scene.frame)
         if not crop.exists():
             write_json(crop, read_json(folder / "geometry" / "crop.json", Any))
-        return note_metrics(this.metrics, {"geometry": found})
+        return note_metrics(run.metrics, {"geometry": found})

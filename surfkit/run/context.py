@@ -7,33 +7,33 @@ from pathlib import Path
 
 from surfkit.raster.api import Rasterizer
 from surfkit.run.folder import Run
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.scene.scene import Scene
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 
 
 @dataclass(frozen=True)
-class Site:
+class RunContext:
     """Where blocks are worked on.
 
     Attributes:
-        this: The run.
+        run: The run.
         scene: Its data, or those of the block that is worked on.
         rasterizer: What draws.
-        every: When a block writes what.
-        store: Where its photographs are kept at hand.
+        intervals: When a block writes what.
+        caches: Where its photographs are kept at hand.
     """
 
-    this: Run
+    run: Run
     scene: Scene
     rasterizer: Rasterizer
-    every: Every
-    store: Store
+    intervals: Intervals
+    caches: CacheSettings
 
     @property
     def folder(self) -> Path:
         """Of all blocks."""
-        return self.this.out / "blocks"
+        return self.run.out / "blocks"
 
     def place(self, index: int) -> Path:
         """The folder of one block."""
@@ -41,7 +41,7 @@ class Site:
 
     def views(self, index: int) -> Path:
         """Where the views of a block are."""
-        return views_file(self.this.out, index)
+        return views_file(self.run.out, index)
 
     def folders(self) -> list[Path]:
         """Those of the blocks that somebody has begun."""
@@ -49,7 +49,7 @@ class Site:
 
     def block(self, index: int) -> Run:
         """One block as a run of its own."""
-        return Run(self.place(index), self.this.recipe, self.this.data, "tune", index)
+        return Run(self.place(index), self.run.recipe, self.run.data, "tune", index)
 
 
 def views_file(out: Path, index: int) -> Path:

@@ -204,10 +204,10 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
         raise BadInput(f"{path}: {name} is not a list of texts; {path.parent} is damaged, begin in another folder")
 
 
-def refuse_other(this: Run) -> None:
+def refuse_other(run: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
-    there = recipe_before(this.out / "recipe.json", this.recipe)
-    now = dump(this.recipe)
+    there = recipe_before(run.out / "recipe.json", run.recipe)
+    now = dump(run.recipe)
     remesh = isinstance(there, dict) and there.get("mesh") != now["mesh"]
     if isinstance(there, dict):
         there |= {"mesh": now["mesh"]}  # training is the same
@@ -216,25 +216,25 @@ def refuse_other(this: Run) -> None:
         if prefix and there.get("pretrain") == now["pretrain"]:
             there |= {"refine": now["refine"]}  # the model that is there can be refined further
     found = None if there is None else difference(there, now)
-    if found and not (found := longer(this, there)):
+    if found and not (found := longer(run, there)):
         emit(
             Warned(
-                f"the run is made longer, from {there['pretrain']['steps']} steps to {this.recipe.pretrain.steps}: "
+                f"the run is made longer, from {there['pretrain']['steps']} steps to {run.recipe.pretrain.steps}: "
                 "steps still to come follow the schedules of the new length, those already made followed the old ones, "
                 "so the result is not that of a run of this length from the start"
             )
         )
-    if not found and this.record.exists():
-        before = dump(read_data(this.out))  # with defaults of newer settings
-        found = difference(before | {"priors": None}, dump(this.data) | {"priors": None}, "data")
+    if not found and run.record.exists():
+        before = dump(read_data(run.out))  # with defaults of newer settings
+        found = difference(before | {"priors": None}, dump(run.data) | {"priors": None}, "data")
     if found:
         at, old, new = found
         raise BadInput(
-            f"--out {this.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
+            f"--out {run.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
             "name another folder, or delete that one"
         )
     if remesh:
-        this.mesh_record.unlink(missing_ok=True)
+        run.mesh_record.unlink(missing_ok=True)
 
 
 def recipe_before(path: Path, now: Recipe) -> Any:
@@ -251,21 +251,21 @@ def recipe_before(path: Path, now: Recipe) -> Any:
         return there  # the difference will tell
 
 
-def longer(this: Run, there: Any) -> tuple[str, Any, Any] | None:
+def longer(run: Run, there: Any) -> tuple[str, Any, Any] | None:
     """What else than its length distinguishes a longer recipe from the one in the folder; None if nothing does.
 
     Longer with all schedules scaled along (`--steps`), or with none (`--pretrain.steps`).
     """
-    plain = difference(there, dump(this.recipe))
-    now = this.recipe.pretrain.steps
+    plain = difference(there, dump(run.recipe))
+    now = run.recipe.pretrain.steps
     stage = there.get("pretrain") if isinstance(there, dict) else None
     before = stage.get("steps") if isinstance(stage, dict) else None
     if not isinstance(before, int) or not 0 < before < now:
         return plain
-    old = replace(load(Recipe, there, f"{this.out / 'recipe.json'}"), about=this.recipe.about)
-    if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(this.recipe):
+    old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
+    if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
         return None
-    return difference(dump(rescale_like(old, now / before, this.recipe)), dump(this.recipe))
+    return difference(dump(rescale_like(old, now / before, run.recipe)), dump(run.recipe))
 
 
 def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
@@ -283,39 +283,39 @@ def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
     return None if old == new else (at, old, new)
 
 
-def refuse_changed(this: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
+def refuse_changed(run: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
     """The fingerprint of the data, or BadInput if it is not that of the data which the run began with.
 
     Args:
-        this: The run.
+        run: The run.
         scene: Its data.
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
-    before = read_json(this.inputs, Fingerprint) if this.inputs.exists() else None
-    own = replace(this.data, priors=None)  # of maps that were made for the run, the name of their folder tells
-    now = fingerprint(scene, before, prior_files(own, scene) if this.needs_priors else None)
+    before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
+    own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
+    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None)
     if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise BadInput(
-            f"--out {this.out}: the data in {this.data.path} are not those that the run began with: {found[0].what}"
+            f"--out {run.out}: the data in {run.data.path} are not those that the run began with: {found[0].what}"
             f"{more}; put them back, name another folder, or delete that one"
         )
     return now
 
 
-def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
+def claim(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
     """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
-    before = read_record(this.out)
+    before = read_record(run.out)
     notes.begin(
-        this.record,
+        run.record,
         {
             "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
             "plugins": [str(plugin) for plugin in records() if plugin.distribution],
             "device": backend,
             "threads": torch.get_num_threads(),
-            "seed": this.recipe.seed,
-            "data": this.data,
-            "prepare_cpu_seconds": prepare_cpu_seconds(this, before),
+            "seed": run.recipe.seed,
+            "data": run.data,
+            "prepare_cpu_seconds": prepare_cpu_seconds(run, before),
             "frame": {
                 "origin": frame.origin.tolist(),
                 "scale": frame.scale,
@@ -326,17 +326,17 @@ def claim(this: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Fra
         },
         before,
     )
-    write_json(this.inputs, prints)
-    write_json(this.out / "recipe.json", this.recipe)
+    write_json(run.inputs, prints)
+    write_json(run.out / "recipe.json", run.recipe)
 
 
-def prepare_cpu_seconds(this: Run, before: dict[str, Any]) -> float | None:
+def prepare_cpu_seconds(run: Run, before: dict[str, Any]) -> float | None:
     """What the depth maps have cost that were made for a run; None where it uses those of the data set, or none."""
-    if this.data.priors is None:
+    if run.data.priors is None:
         return None
-    if not is_there(this.data.priors):
+    if not is_there(run.data.priors):
         return before.get("prepare_cpu_seconds")
-    return round(read_made(located(this.data.priors)).cpu_seconds, 2)
+    return round(read_made(located(run.data.priors)).cpu_seconds, 2)
 
 
 def relay(out: Path, folder: Path, prefix: str) -> None:
@@ -361,12 +361,12 @@ def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     return metrics
 
 
-def discard_results(this: Run) -> None:
+def discard_results(run: Run) -> None:
     """Delete what further steps of a stage make wrong: results, and the states of the stages after it."""
-    for path in (this.metrics, this.cloud, this.mesh_record):
+    for path in (run.metrics, run.cloud, run.mesh_record):
         path.unlink(missing_ok=True)
-    for part in this.parts[this.parts.index(this.part) + 1 :]:
-        later = replace(this, part=part).checkpoint
+    for part in run.parts[run.parts.index(run.part) + 1 :]:
+        later = replace(run, part=part).checkpoint
         checkpoint.discard(later)
         (later.parent / journal.NAME).unlink(missing_ok=True)
 

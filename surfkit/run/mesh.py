@@ -15,7 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.evaluate.images.pictures import write_picture
-from surfkit.mesh.base import Mesh, Mesher, Subject
+from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
@@ -37,7 +37,7 @@ LONGEST = 800
 
 
 @dataclass(frozen=True)
-class Delivery:
+class MeshOutput:
     """What becomes of the triangles of a mesher."""
 
     formats: tuple[Format, ...] = ("ply",)
@@ -84,20 +84,20 @@ class Delivery:
 
 
 def subject(
-    this: Run,
+    run: Run,
     state: StageState,
     scene: Scene,
     rasterizer: Rasterizer,
     budget_bytes: int,
     mesher: Mesher | None = None,
-) -> Subject:
+) -> MeshInput:
     """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
-    stage = this.stage
-    splats = this.primitive.shape(stage.finished(state), state.sh_degree)
+    stage = run.stage
+    splats = run.primitive.activate(stage.finished(state), state.sh_degree)
     masks = mask_cache(scene.train, budget_bytes // 4)
     wanted = mesher is not None and mesher.needs_prior
-    priors = read_priors(this.data, scene, budget_bytes // 4) if wanted else None
-    return Subject(
+    priors = read_priors(run.data, scene, budget_bytes // 4) if wanted else None
+    return MeshInput(
         splats=splats,
         views=scene.train,
         draw=lambda view: rasterizer.render(splats, view.camera, stage.near, distortion=False).maps,
@@ -105,19 +105,19 @@ def subject(
         near=stage.near,
         frame=scene.frame,
         budget_bytes=budget_bytes,
-        generator=torch.Generator().manual_seed(this.recipe.seed),
-        scratch=this.out,
+        generator=torch.Generator().manual_seed(run.recipe.seed),
+        scratch=run.out,
         keep=lambda at: None if masks is None else masks[at],
         priors=priors,
         photo=lambda at: view_photo(scene.train[at]),
     )
 
 
-def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, steps: int) -> dict[str, Any]:
+def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput, steps: int) -> dict[str, Any]:
     """Make the mesh of a run, write it into the run's folder, and return what mesh.json says.
 
     Args:
-        this: The run.
+        run: The run.
         mesher: How.
         delivery: What to write.
         subject: What to mesh.
@@ -127,15 +127,15 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
         BadInput: There is no surface, or nothing is left of it.
     """
     began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
-    for left in this.out.glob(TILES):
+    for left in run.out.glob(TILES):
         shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     facts = dict(raw.facts)
     del raw
-    forget(this)
-    written = list(write_files(this, mesh, delivery, subject))
+    forget(run)
+    written = list(write_files(run, mesh, delivery, subject))
     record = {
         "mesher": mesher,
         "delivery": delivery,
@@ -147,25 +147,25 @@ def deliver(this: Run, mesher: Mesher, delivery: Delivery, subject: Subject, ste
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }
-    look(this, mesh, subject)
-    write_json(this.mesh_record, record)
-    emit(FileWritten(this.mesh_record, "facts of the mesh"))
+    look(run, mesh, subject)
+    write_json(run.mesh_record, record)
+    emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
 
 
-def describe(report: Report, subject: Subject) -> dict[str, Any]:
+def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
     """The report with lengths in units of the data set."""
     return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
 
 
-def forget(this: Run) -> None:
+def forget(run: Run) -> None:
     """Delete what an earlier mesh left; its record goes first."""
-    this.mesh_record.unlink(missing_ok=True)
-    for path in (*this.out.glob("mesh.*"), *this.out.glob("mesh-lod*"), *this.mesh_pictures.rglob("*.png")):
+    run.mesh_record.unlink(missing_ok=True)
+    for path in (*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*"), *run.mesh_pictures.rglob("*.png")):
         path.unlink(missing_ok=True)
 
 
-def write_files(this: Run, mesh: Mesh, delivery: Delivery, subject: Subject) -> Iterator[Path]:
+def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> Iterator[Path]:
     """Write the mesh in all formats and levels, and give the paths."""
     meshes = [("mesh", mesh)]
     for at, share in enumerate(delivery.lods, 1):
@@ -173,17 +173,17 @@ def write_files(this: Run, mesh: Mesh, delivery: Delivery, subject: Subject) -> 
         emit(Progress("simplifying", at, len(delivery.lods)))
     for name, each in meshes:
         for kind in dict.fromkeys(delivery.formats):
-            for path in write_mesh(this.out / f"{name}.{kind}", each, subject.frame):
+            for path in write_mesh(run.out / f"{name}.{kind}", each, subject.frame):
                 emit(FileWritten(path, "mesh"))
                 yield path
 
 
-def look(this: Run, mesh: Mesh, subject: Subject) -> None:
+def look(run: Run, mesh: Mesh, subject: MeshInput) -> None:
     """Write pictures of the mesh: beside the renders of a few training views, and from above."""
     count = min(SHOWN, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]
-    path = this.mesh_pictures / "above.png"
+    path = run.mesh_pictures / "above.png"
     write_picture(path, from_above(mesh, up_of(mesh, cameras), LONGEST))
     emit(FileWritten(path, "picture"))
     for at, view in enumerate(views):
@@ -192,18 +192,18 @@ def look(this: Run, mesh: Mesh, subject: Subject) -> None:
         if camera != view.camera:
             size = (camera.height, camera.width)
             color = torch.nn.functional.interpolate(color[None], size, mode="area")[0]
-        path = this.mesh_pictures / f"view-{at + 1}.png"
+        path = run.mesh_pictures / f"view-{at + 1}.png"
         write_picture(path, torch.cat([color, shaded(mesh, camera)], dim=2))
         emit(FileWritten(path, "picture"))
 
 
-def meshed(this: Run, steps: int) -> bool:
+def has_mesh(run: Run, steps: int) -> bool:
     """Whether the mesh of a recipe is there, made from splats of so many steps; the recipe may want none."""
-    if this.recipe.mesh is None:
+    if run.recipe.mesh is None:
         return True
-    if not this.mesh_record.exists():
+    if not run.mesh_record.exists():
         return False
     remedy = "delete it, and the mesh is made anew"
-    record = read_keys(this.mesh_record, {"files": tuple[str, ...], "steps": int}, remedy)
-    there = all((this.out / name).exists() for name in record["files"])
+    record = read_keys(run.mesh_record, {"files": tuple[str, ...], "steps": int}, remedy)
+    there = all((run.out / name).exists() for name in record["files"])
     return there and record["steps"] == steps

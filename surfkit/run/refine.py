@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from surfkit.raster.api import Rasterizer
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results
 from surfkit.run.journal import kept
 from surfkit.run.notes import naming
-from surfkit.run.stage import Begun, Job, drawing, optimise, saved
+from surfkit.run.stage import InitialModel, Job, drawing, load_state, optimise
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import Scene
-from surfkit.train.material import Material, read_ahead
+from surfkit.train.material import TrainingData, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
 
@@ -23,47 +23,47 @@ DRAWN_AHEAD = 2
 """Pictures of the model that are kept: each is drawn when its turn comes."""
 
 
-def refined(site: Site, state: StageState) -> tuple[Run, StageState]:
+def refine_model(ctx: RunContext, state: StageState) -> tuple[Run, StageState]:
     """The run and its state after all that the recipe refines; what is done already is not done again.
 
     Args:
-        site: The run, as it stands before the first of them.
+        context: The run, as it stands before the first of them.
         state: Its state then.
     """
-    this = site.this
-    for part in this.parts[this.parts.index(this.part) + 1 :]:
-        now = replace(this, part=part)
-        state = _gone_through(replace(site, this=now), this, state)
-        this = now
-    return this, state
+    run = ctx.run
+    for part in run.parts[run.parts.index(run.part) + 1 :]:
+        now = replace(run, part=part)
+        state = _gone_through(replace(ctx, run=now), run, state)
+        run = now
+    return run, state
 
 
-def _gone_through(site: Site, before: Run, given: StageState) -> StageState:
+def _gone_through(ctx: RunContext, before: Run, given: StageState) -> StageState:
     """The state after one of them, from the state before it."""
-    this, refine, scene = site.this, site.this.refined[-1], seen_by(site.this, site.scene)
-    state = saved(this, scene, repair=True)
-    if state is not None and state.index >= this.stage.steps:
+    run, refine, scene = ctx.run, ctx.run.refined[-1], seen_by(ctx.run, ctx.scene)
+    state = load_state(run, scene, repair=True)
+    if state is not None and state.index >= run.stage.steps:
         return state
-    discard_results(this)
+    discard_results(run)
 
-    def start() -> Begun:
+    def start() -> InitialModel:
         params = refine.params(before.stage.finished(given))
-        return Begun({name: value.clone() for name, value in params.items()}, given.sh_degree)
+        return InitialModel({name: value.clone() for name, value in params.items()}, given.sh_degree)
 
-    every, folder = replace(site.every, pictures=0), this.checkpoint.parent
+    intervals, folder = replace(ctx.intervals, pictures=0), run.checkpoint.parent
     folder.mkdir(exist_ok=True)
-    with kept(folder), naming(f"{this.title}: "):  # its steps are counted anew, and what is known is not told again
-        shown = _drawn(before, given, scene, site.rasterizer) if refine.taught else None
-        shown = shown or read_ahead(this.data, scene, this.stage.losses, site.store)
-        return optimise(Job(this, scene, site.rasterizer, every, shown, Meter(), start, given), state)
+    with kept(folder), naming(f"{run.title}: "):  # its steps are counted anew, and what is known is not told again
+        shown = _drawn(before, given, scene, ctx.rasterizer) if refine.taught else None
+        shown = shown or read_ahead(run.data, scene, run.stage.losses, ctx.caches)
+        return optimise(Job(run, scene, ctx.rasterizer, intervals, shown, Meter(), start, given), state)
 
 
-def seen_by(this: Run, scene: Scene) -> Scene:
+def seen_by(run: Run, scene: Scene) -> Scene:
     """The scene with the views that the stage which is spoken of looks from."""
-    return replace(scene, train=this.refined[-1].views(scene.train, this.recipe.seed)) if this.refined else scene
+    return replace(scene, train=run.refined[-1].views(scene.train, run.recipe.seed)) if run.refined else scene
 
 
-def _drawn(before: Run, given: StageState, scene: Scene, rasterizer: Rasterizer) -> Material:
+def _drawn(before: Run, given: StageState, scene: Scene, rasterizer: Rasterizer) -> TrainingData:
     """Pictures that the model before draws of the views of a scene."""
     draw = drawing(before, given, rasterizer, geometry=False)
 
@@ -71,4 +71,4 @@ def _drawn(before: Run, given: StageState, scene: Scene, rasterizer: Rasterizer)
         return (draw(scene.train[at]).color.clamp(0, 1) * 255).round().to("cpu", dtype=torch.uint8)
 
     sizes = [3 * view.camera.width * view.camera.height for view in scene.train]
-    return Material(Cache(picture, sizes, DRAWN_AHEAD * max(sizes), threads=1))
+    return TrainingData(Cache(picture, sizes, DRAWN_AHEAD * max(sizes), threads=1))

@@ -24,7 +24,7 @@ from surfkit.scene.scene import Cloud, Scene
 from surfkit.train import checkpoint
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
-from surfkit.train.material import Material
+from surfkit.train.material import TrainingData
 from surfkit.train.meter import Meter
 from surfkit.train.progress import Display
 from surfkit.train.stage import StageState, Trainer
@@ -37,7 +37,7 @@ LEAST_FREE = 256 << 20
 
 
 @dataclass(frozen=True)
-class Every:
+class Intervals:
     """Steps between what is written while a stage runs.
 
     Attributes:
@@ -50,7 +50,7 @@ class Every:
 
 
 @dataclass(frozen=True)
-class Begun:
+class InitialModel:
     """What a stage begins with where it goes on from a model.
 
     Attributes:
@@ -67,10 +67,10 @@ class Job:
     """What the steps of a run are made with.
 
     Attributes:
-        this: The run.
+        run: The run.
         scene: Its data.
         rasterizer: What draws.
-        every: When to write what.
+        intervals: When to write what.
         given: What to look at.
         meter: Sees what memory is taken by.
         start: Gives the points to begin with; if None, those of the `cloud`.
@@ -80,35 +80,35 @@ class Job:
         owns: As for `Trainer`.
     """
 
-    this: Run
+    run: Run
     scene: Scene
     rasterizer: Rasterizer
-    every: Every
-    given: Material
+    intervals: Intervals
+    given: TrainingData
     meter: Meter
-    start: Callable[[], Begun] | None = None
+    start: Callable[[], InitialModel] | None = None
     before: StageState | None = None
     cloud: Callable[[], Cloud] | None = None
-    frozen: Callable[[], Begun] | None = None
+    frozen: Callable[[], InitialModel] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
 
 
-def saved(this: Run, scene: Scene, repair: bool = False) -> StageState | None:
+def load_state(run: Run, scene: Scene, repair: bool = False) -> StageState | None:
     """The state of the last whole checkpoint, if there is one and the data is still what it was.
 
     `repair`: put it in the place of a damaged one.
     """
-    found = checkpoint.load_last(this.checkpoint)
+    found = checkpoint.load_last(run.checkpoint)
     if found is None:
         return None
     state, damage = found
     if damage is not None:
         emit(Warned(f"{damage.partition(';')[0]}; the one before it, of step {state.index}, is used instead"))
         if repair:
-            checkpoint.restore(this.checkpoint)
+            checkpoint.restore(run.checkpoint)
     if state.order.count != len(scene.train):
         raise BadInput(
-            f"--out {this.out} was trained on {state.order.count} photographs and {this.data.path} now gives "
+            f"--out {run.out} was trained on {state.order.count} photographs and {run.data.path} now gives "
             f"{len(scene.train)}; name another folder, or delete that one"
         )
     return state
@@ -120,17 +120,17 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     After numbers that are not finite it goes back to its last checkpoint with half the learning rates, twice at most.
     When memory gives out, it goes back with a smaller cache, until there is none.
     """
-    this, given = job.this, job.given
-    stage, primitive = this.stage, this.primitive
+    run, given = job.run, job.given
+    stage, primitive = run.stage, run.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
-    along = Along(this.out / "progress", job.scene.held_out) if job.every.pictures and job.scene.held_out else None
+    along = Along(run.out / "progress", job.scene.held_out) if job.intervals.pictures and job.scene.held_out else None
 
     def begin() -> StageState:
-        generator = torch.Generator().manual_seed(this.recipe.seed)
+        generator = torch.Generator().manual_seed(run.recipe.seed)
         began = time.perf_counter(), time.process_time()
         cloud = job.cloud() if job.cloud else job.scene.cloud
-        begun = job.start() if job.start else Begun(primitive.init(cloud, generator), 0)
+        begun = job.start() if job.start else InitialModel(primitive.init(cloud, generator), 0)
         fresh = trainer.begin(Points.fresh(begun.params), generator, job.frozen().params if job.frozen else None)
         fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         if job.cloud:
@@ -141,57 +141,57 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         return fresh
 
     if state is not None:
-        say(f"{this.out}: going on after step {state.index} of {stage.steps}")
+        say(f"{run.out}: going on after step {state.index} of {stage.steps}")
     state = state or begin()
     while True:
         try:
             return take_steps(job, trainer, state, along)
         except Diverged as error:
-            state = rolled_back(this, state.halvings, error, begin)
+            state = rolled_back(run, state.halvings, error, begin)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
             if not lower(given, f"step {state.index + 1}: out of memory"):
-                raise out_of_memory(this.out, ", though photographs are no longer kept in it") from error
+                raise out_of_memory(run.out, ", though photographs are no longer kept in it") from error
             state = None  # the error and all that it holds go first
-        state = state or last_good(this, begin)
+        state = state or last_good(run, begin)
 
 
 def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | None) -> StageState:
     """Take the steps that are left, and write checkpoints and pictures on the way."""
-    this, every, meter = job.this, job.every, job.meter
+    run, intervals, meter = job.run, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
-    emit(StageBegan(this.part, steps, len(state.points), state.index + 1, this.block))
-    with graceful() as request, Display(this.title, steps) as display:
+    emit(StageBegan(run.part, steps, len(state.points), state.index + 1, run.block))
+    with graceful() as request, Display(run.title, steps) as display:
         for done in trainer.run(state):
             display.show(done)
             meter.step(state, job.given)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
                 lower(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
-            if along is not None and done.index % every.pictures == 0 and done.index < steps:
+            if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
-                    along.look(done.index, drawing(this, state, trainer.rasterizer))
-            if request.asked or done.index % every.checkpoint == 0 or done.index == steps:
-                save(this, state, meter)
+                    along.look(done.index, drawing(run, state, trainer.rasterizer))
+            if request.asked or done.index % intervals.checkpoint == 0 or done.index == steps:
+                save(run, state, meter)
             if request.asked:
                 break
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
-    emit(StageEnded(this.part, steps, len(state.points), state.seconds - seconds))
+    emit(StageEnded(run.part, steps, len(state.points), state.seconds - seconds))
     return state
 
 
-def save(this: Run, state: StageState, meter: Meter) -> None:
+def save(run: Run, state: StageState, meter: Meter) -> None:
     """Write a checkpoint, and what the memory is taken by."""
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
     with meter.adding("checkpoints"):
-        checkpoint.save(this.checkpoint, state)
-    emit(FileWritten(this.checkpoint, "checkpoint"))
+        checkpoint.save(run.checkpoint, state)
+    emit(FileWritten(run.checkpoint, "checkpoint"))
     emit(MemoryTaken(meter.report()))
 
 
-def lower(given: Material, why: str) -> bool:
+def lower(given: TrainingData, why: str) -> bool:
     """Make the caches smaller, and say so; False if they are as small as can be."""
     found = given.lower()
     if found is not None:
@@ -200,15 +200,15 @@ def lower(given: Material, why: str) -> bool:
     return found is not None
 
 
-def last_good(this: Run, begin: Callable[[], StageState]) -> StageState:
+def last_good(run: Run, begin: Callable[[], StageState]) -> StageState:
     """The state of the last checkpoint, or a new beginning."""
-    found = checkpoint.load_last(this.checkpoint)
+    found = checkpoint.load_last(run.checkpoint)
     state = found[0] if found else begin()
-    say(f"{this.out}: going on after step {state.index} of {this.stage.steps}")
+    say(f"{run.out}: going on after step {state.index} of {run.stage.steps}")
     return state
 
 
-def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], StageState]) -> StageState:
+def rolled_back(run: Run, halvings: int, error: Diverged, begin: Callable[[], StageState]) -> StageState:
     """The last good state, or a new beginning, with half the learning rates; it is saved, so that nothing forgets it.
 
     Raises:
@@ -216,22 +216,22 @@ def rolled_back(this: Run, halvings: int, error: Diverged, begin: Callable[[], S
     """
     if halvings >= MOST_HALVINGS:
         raise NotFinite(
-            f"{this.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
-            f"and its camera, or lower {this.setting}.rates in another folder; the last checkpoint is whole"
+            f"{run.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
+            f"and its camera, or lower {run.setting}.rates in another folder; the last checkpoint is whole"
         ) from error
-    found = checkpoint.load_last(this.checkpoint)
+    found = checkpoint.load_last(run.checkpoint)
     state = found[0] if found else begin()
     state.halvings = halvings + 1
     times = f"{state.halvings} of {MOST_HALVINGS} times"
     emit(Warned(f"{error}; back to step {state.index}, with learning rates halved ({times})"))
-    checkpoint.save(this.checkpoint, state)
+    checkpoint.save(run.checkpoint, state)
     return state
 
 
-def drawing(this: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
+def drawing(run: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
     """What draws the points of a state, as they are to be looked at."""
-    stage = this.stage
-    splats = this.primitive.shape(stage.finished(state), state.sh_degree)
+    stage = run.stage
+    splats = run.primitive.activate(stage.finished(state), state.sh_degree)
     return lambda view: rasterizer.render(splats, view.camera, stage.near, geometry).maps
 
 

@@ -10,66 +10,66 @@ from surfkit.core.check import BadInput
 from surfkit.readers.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Cloud, Scene
-from surfkit.start.base import Known
-from surfkit.train.material import Material, needs_normals, needs_priors
+from surfkit.start.base import StartInput
+from surfkit.train.material import TrainingData, needs_normals, needs_priors
 
 AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""
 
 
 @dataclass(frozen=True)
-class Beginning:
+class InitialPoints:
     """Where a run begins.
 
     Attributes:
-        this: The run.
+        run: The run.
         scene: Its data.
         given: Its photographs and masks.
         known: How the depth priors are aligned, if the start needs any.
     """
 
-    this: Run
+    run: Run
     scene: Scene
-    given: Material
+    given: TrainingData
     known: Alignment | None
 
     def __call__(self) -> Cloud:
         """The points."""
-        start, scene, given = self.this.recipe.start, self.scene, self.given
+        start, scene, given = self.run.recipe.start, self.scene, self.given
         priors = None
         if start.needs_prior:
             largest = max(view.camera.width * view.camera.height for view in scene.train)
-            priors = read_priors(self.this.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
-        generator = torch.Generator().manual_seed(self.this.recipe.seed)
+            priors = read_priors(self.run.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
+        generator = torch.Generator().manual_seed(self.run.recipe.seed)
         try:
-            return start.cloud(Known(scene, given.photos, given.masks, priors, generator))
+            return start.cloud(StartInput(scene, given.photos, given.masks, priors, generator))
         finally:
             if priors is not None:
                 priors.close()
 
 
-def priors_of(this: Run, scene: Scene, begun: bool) -> Alignment | None:
+def priors_of(run: Run, scene: Scene, begun: bool) -> Alignment | None:
     """How the depth priors of a run fit its scene, if pretraining needs any.
 
     Raises:
         BadInput: The run is still to begin, at depth maps, and there are none that can be used.
     """
-    needed, losses = this.recipe.start.needs_prior and not begun, this.recipe.pretrain.losses
+    needed, losses = run.recipe.start.needs_prior and not begun, run.recipe.pretrain.losses
     if not needed and not needs_priors(losses):
         return None
-    known = alignment(this.data, scene, needs_normals(losses))
+    known = alignment(run.data, scene, needs_normals(losses))
     if needed and not known.fits:
         raise BadInput(
-            f"{this.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "
-            f"{remedy(this, scene)}, or choose start:sparse"
+            f"{run.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "
+            f"{remedy(run, scene)}, or choose start:sparse"
         )
     return known
 
 
-def remedy(this: Run, scene: Scene) -> str:
+def remedy(run: Run, scene: Scene) -> str:
     """How to get depth maps that can be used, after those that there are cannot."""
-    if this.data.priors is not None:
+    if run.data.priors is not None:
         return "see whether photographs and cameras belong together, and which points they share"
-    if prior_files(this.data, scene):
-        return f"make others with `surfkit prepare depth {this.data.path} {WITH_NORMALS} --again`"
-    return f"make some with `surfkit prepare depth {this.data.path}`, let the run make them with depth:patch-match"
+    if prior_files(run.data, scene):
+        return f"make others with `surfkit prepare depth {run.data.path} {WITH_NORMALS} --again`"
+    return f"make some with `surfkit prepare depth {run.data.path}`, let the run make them with depth:patch-match"

@@ -16,7 +16,7 @@ from surfkit.scene.scene import Cloud, Scene
 
 
 @dataclass(frozen=True)
-class Known:
+class StartInput:
     """What is known before the first step.
 
     Attributes:
@@ -40,7 +40,7 @@ class Start(Component):
     needs_prior: ClassVar[bool] = False
 
     @abstractmethod
-    def cloud(self, known: Known) -> Cloud:
+    def cloud(self, known: StartInput) -> Cloud:
         """The points, the same for the same settings, data and state of the generator.
 
         Raises:

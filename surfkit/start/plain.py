@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.scene.scene import Cloud
-from surfkit.start.base import Known, Start
+from surfkit.start.base import Start, StartInput
 
 GREY = 128
 """Colour of a random point."""
@@ -20,7 +20,7 @@ OUTLIERS = 0.01
 class SparseStart(Start):
     """Begin at the sparse points of the data set, as 3DGS does (Kerbl et al. 2023)."""
 
-    def cloud(self, known: Known) -> Cloud:
+    def cloud(self, known: StartInput) -> Cloud:
         """See `Start.cloud`."""
         return known.scene.cloud
 
@@ -40,7 +40,7 @@ class RandomStart(Start):
         if self.points < 1:
             raise BadInput(f"start.points is {self.points}; it must be 1 or more")
 
-    def cloud(self, known: Known) -> Cloud:
+    def cloud(self, known: StartInput) -> Cloud:
         """See `Start.cloud`."""
         xyz = known.scene.cloud.xyz.sort(0).values
         cut = int(OUTLIERS * len(xyz))

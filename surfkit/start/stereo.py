@@ -17,7 +17,7 @@ from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.scene.vectors import unit
-from surfkit.start.base import Known, Start
+from surfkit.start.base import Start, StartInput
 from surfkit.start.voxels import Collected, Samples, Thinned, lonely, thinned_to
 
 EDGE = 0.02
@@ -70,7 +70,7 @@ class StereoStart(Start):
         if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
             raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
 
-    def cloud(self, known: Known) -> Cloud:
+    def cloud(self, known: StartInput) -> Cloud:
         """See `Start.cloud`."""
         stereo = self.fused(known)
         if not len(stereo):
@@ -84,7 +84,7 @@ class StereoStart(Start):
             return self.points
         return max(sparse, min(self.most, round(pixels / (OVERLAP * self.spacing_px**2))))
 
-    def fused(self, known: Known) -> Thinned:
+    def fused(self, known: StartInput) -> Thinned:
         """The points of all depth maps, thinned."""
         wanted = self.most if self.points == "auto" else self.points
         unit = self.spacing_px if self.points == "auto" else 1.0
@@ -106,7 +106,7 @@ class StereoStart(Start):
         noise = rough.take(lonely(rough))
         return thinned_to(voxels.away_from(noise), wanted) if len(noise) else rough
 
-    def trusted(self, known: Known, at: int, prior: DepthPrior) -> Tensor:
+    def trusted(self, known: StartInput, at: int, prior: DepthPrior) -> Tensor:
         """(H, W) which pixels of a depth map are used."""
         mask = None if known.masks is None else known.masks[at]
         trusted = (prior.inverse > 0) & (prior.confidence >= self.min_confidence)
@@ -176,7 +176,7 @@ def _slope(values: Tensor, dim: int) -> Tensor:
     return slope
 
 
-def filled(stereo: Thinned, known: Known, start: StereoStart) -> Cloud:
+def filled(stereo: Thinned, known: StartInput, start: StereoStart) -> Cloud:
     """Points of depth maps, and sparse points where there are none of those."""
     from scipy.spatial import cKDTree
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from torch import Generator, Tensor
 
     from surfkit.densify.base import Policy, Step
-    from surfkit.losses.base import Loss, Sample
-    from surfkit.mesh.base import Mesher, Subject
-    from surfkit.partition.base import Partition, Sight
+    from surfkit.losses.base import Loss, Target
+    from surfkit.mesh.base import Mesher, MeshInput
+    from surfkit.partition.base import CoarseModel, Partition
     from surfkit.primitives.base import Primitive
     from surfkit.primitives.points import Columns, Points
     from surfkit.raster.api import Maps
@@ -94,18 +94,18 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
         weight = loss.weight_at(index, 1_000)
         assert math.isfinite(weight) and weight >= 0, f"{name}: the weight at step {index} of 1000 is {weight}"
     draw = torch.Generator().manual_seed(0)
-    sample = _sample(size, draw)
-    cases = [("", torch.rand(size, generator=draw), sample), (" of an empty render", torch.zeros(size), sample)]
+    target = _target(size, draw)
+    cases = [("", torch.rand(size, generator=draw), target), (" of an empty render", torch.zeros(size), target)]
     without = {
-        " without a depth prior": replace(sample, prior=None),
-        " without prior normals": replace(sample, prior=replace(sample.prior, normal=None)),
-        " without a neighbour": replace(sample, neighbour=None),
+        " without a depth prior": replace(target, prior=None),
+        " without prior normals": replace(target, prior=replace(target.prior, normal=None)),
+        " without a neighbour": replace(target, neighbour=None),
     }
     cases += [(what, torch.rand(size, generator=draw), less) for what, less in without.items()]
-    for what, alpha, sample in cases:
+    for what, alpha, target in cases:
         maps = _maps(alpha, loss.reads, draw)
         leaves = {key: value.requires_grad_() for key, value in maps.present().items()}
-        value, again = loss(maps, sample), loss(maps, sample)
+        value, again = loss(maps, target), loss(maps, target)
         assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
         assert torch.isfinite(value), f"{name}{what} is {value.item()}"
         assert torch.equal(value, again), f"{name} is not repeatable"
@@ -144,14 +144,14 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
     assert twins.keys() == params.keys(), f"{name}.split gives {sorted(twins)}, not {sorted(params)}"
     for key, value in twins.items():
         assert value.shape == (2 * (count // 2), *params[key].shape[1:]), f"{name}.split: {key!r} is not 2 M rows"
-    parents, children = primitive.shape(rows, 0).scales, primitive.shape(twins, 0).scales
+    parents, children = primitive.activate(rows, 0).scales, primitive.activate(twins, 0).scales
     assert (children <= torch.cat([parents, parents]) + 1e-6).all(), f"{name}.split: a child is larger than its parent"
 
 
-def _sample(size: tuple[int, int], draw: Generator) -> Sample:
+def _target(size: tuple[int, int], draw: Generator) -> Target:
     import torch
 
-    from surfkit.losses.base import Neighbour, Sample
+    from surfkit.losses.base import Neighbour, Target
     from surfkit.readers.depth_prior import DepthPrior
     from surfkit.scene.camera import Camera
     from surfkit.scene.scene import View
@@ -167,7 +167,7 @@ def _sample(size: tuple[int, int], draw: Generator) -> Sample:
     beside[0, 3] = 0.02  # less than a pixel of parallax, at any depth
     view_beside = View("beside.png", replace(camera, world_to_camera=beside), Path("beside.png"))
     maps = _maps(torch.ones(size), ("alpha", "depth", "median", "normal"), draw)
-    return Sample(view, photo, prior, neighbour=Neighbour(view_beside, torch.rand(3, *size, generator=draw), maps))
+    return Target(view, photo, prior, neighbour=Neighbour(view_beside, torch.rand(3, *size, generator=draw), maps))
 
 
 def _maps(alpha: Tensor, reads: Iterable[str], draw: Generator) -> Maps:
@@ -193,7 +193,7 @@ def _check_splats(primitive: Primitive, params: dict[str, Tensor], degree: int) 
     import torch
 
     name = f"{type(primitive).__name__}.shape"
-    splats = primitive.shape(params, degree)
+    splats = primitive.activate(params, degree)
     sizes = {"N": len(params["means"])}
     expect(f"{name}: means", splats.means, ("N", 3), sizes)
     expect(f"{name}: quats", splats.quats, ("N", 4), sizes)
@@ -223,7 +223,7 @@ def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) 
         assert torch.equal(value, second[key]), f"{what}: {key!r} differs for the same seed; draw from the generator"
 
 
-def check_partition(partition: Partition, sight: Sight) -> None:
+def check_partition(partition: Partition, sight: CoarseModel) -> None:
     """Its cells own every place exactly once, far away and on their sides too, and come out the same again."""
     import torch
 
@@ -261,14 +261,14 @@ def check_refine(refine: Refine, primitive: Primitive, params: Columns, views: S
     assert shapes == wanted, f"{name}: its points have the columns {shapes}, and what they are then has {wanted}"
     assert len({len(value) for value in begun.values()}) == 1, f"{name}: the columns differ in length"
     assert set(refine.stage.rates) == set(begun), f"{name}: stage.rates and the columns of the points differ"
-    assert after.shape(begun, after.sh_degree).sh.shape[1] == (after.sh_degree + 1) ** 2
+    assert after.activate(begun, after.sh_degree).sh.shape[1] == (after.sh_degree + 1) ** 2
     seen, again = ([view.camera.centre.tolist() for view in refine.views(views, 0)] for _ in range(2))
     assert seen and seen == again, f"{name}: its views are not the same again"
     there = [view.camera.centre.tolist() for view in views]
     assert refine.taught or seen == there, f"{name} has photographs of the training views only"
 
 
-def check_mesher(mesher: Mesher, subject: Subject) -> None:
+def check_mesher(mesher: Mesher, subject: MeshInput) -> None:
     """Its mesh is whole, faces the cameras, and has the same area when it is made again."""
     import numpy as np
     import torch

@@ -17,7 +17,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True)
-class Rate:
+class LearningRate:
     """A learning rate."""
 
     start: float
@@ -39,19 +39,19 @@ class Rate:
 def adam_step(points: Points, grads: Columns, rates: Mapping[str, float], index: int) -> None:
     """Take step `index` (from 1) of Adam on every column that has a gradient, in place."""
     for name, grad in grads.items():
-        update(points.params[name], grad, points.first[name], points.second[name], rates[name], index)
+        update(points.params[name], grad, points.exp_avg[name], points.exp_avg_sq[name], rates[name], index)
 
 
-def update(value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, index: int) -> None:
+def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int) -> None:
     """Take one step of Adam on a tensor and its moments, in place."""
     rate, correction = rate / (1 - BETA1**index), (1 - BETA2**index) ** -0.5
-    tensors = (value, grad, first, second)
+    tensors = (value, grad, exp_avg, exp_avg_sq)
     if native.module() is not None and all(_plain(t) for t in tensors):
         native.module().adam(*tensors, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads())
         return
-    first.lerp_(grad, 1 - BETA1)
-    second.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
-    value.addcdiv_(first, second.sqrt().mul_(correction).add_(EPSILON), value=-rate)
+    exp_avg.lerp_(grad, 1 - BETA1)
+    exp_avg_sq.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
+    value.addcdiv_(exp_avg, exp_avg_sq.sqrt().mul_(correction).add_(EPSILON), value=-rate)
 
 
 def _plain(tensor: Tensor) -> bool:

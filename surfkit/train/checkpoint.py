@@ -28,7 +28,8 @@ from surfkit.train.stage import StageState
 from surfkit.train.views import Order
 
 FORMAT = "surfkit-stage-3"
-GROUPS = ("params", "first", "second", "stats")
+GROUPS = {"params": "params", "first": "exp_avg", "second": "exp_avg_sq", "stats": "stats"}
+"""Of the columns of points, as a file has them and as `Points` does."""
 SCALARS = {
     "index": int,
     "seconds": float,
@@ -60,8 +61,8 @@ def save(path: Path, state: StageState) -> None:
     small, facts = beside_points(state)
     tensors = small | {
         f"{group}.{name}": value.contiguous()
-        for group in GROUPS
-        for name, value in getattr(state.points, group).items()
+        for group, attribute in GROUPS.items()
+        for name, value in getattr(state.points, attribute).items()
     }
     tensors |= {f"frozen.{name}": value.contiguous() for name, value in state.frozen.items()}
     with taking_the_place(path) as part:
@@ -148,7 +149,7 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         if group in groups:
             groups[group][name] = value
     looks, frozen = groups.pop("looks"), groups.pop("frozen")
-    points = Points(**groups)
+    points = Points(**{attribute: groups[group] for group, attribute in GROUPS.items()})
     _check(path, points, tensors["order"], facts)
     _check_frozen(path, points, frozen)
     generator = torch.Generator()
@@ -261,13 +262,13 @@ def digest(facts: str, tensors: Iterable[tuple[str, Tensor, Iterable[Tensor]]]) 
 def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> None:
     """Every column must have a row per point, every parameter its moments, and the order every view."""
     count = tuple(points.params["means"].shape[:1])
-    for group in GROUPS:
-        for name, value in getattr(points, group).items():
+    for group, attribute in GROUPS.items():
+        for name, value in getattr(points, attribute).items():
             if not count or value.shape[:1] != count:
                 raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {sum(count)} points")
     kinds = [
         {name: (value.shape, value.dtype) for name, value in group.items()}
-        for group in (points.params, points.first, points.second)
+        for group in (points.params, points.exp_avg, points.exp_avg_sq)
     ]
     if kinds[0] != kinds[1] or kinds[0] != kinds[2] or not all(kind.is_floating_point for _, kind in kinds[0].values()):
         raise _unusable(path, "the optimiser's moments do not fit the parameters")

@@ -24,7 +24,7 @@ LOWERED = 4
 
 
 @dataclass(frozen=True)
-class Store:
+class CacheSettings:
     """Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
 
     Attributes:
@@ -50,7 +50,7 @@ class Store:
 
 
 @dataclass(frozen=True)
-class Material:
+class TrainingData:
     """What training looks at, by position of the view.
 
     Attributes:
@@ -100,17 +100,17 @@ def needs_normals(losses: Mapping[str, Loss]) -> bool:
 
 
 def read_ahead(
-    data: Data, scene: Scene, losses: Mapping[str, Loss], store: Store, known: Alignment | None = None
-) -> Material:
+    data: Data, scene: Scene, losses: Mapping[str, Loss], caches: CacheSettings, known: Alignment | None = None
+) -> TrainingData:
     """The photographs, masks and depth priors of the training views, as far as losses need them.
 
     `known`: how the depth priors are aligned, where that is known; see `read_priors`.
     """
-    budget = store.bytes()
+    budget = caches.bytes()
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     needed, normals = needs_priors(losses), needs_normals(losses)
     wanted = [3 * pixels, sum(mask_sizes(scene.train)), prior_bytes(normals) * pixels if needed else 0]
     for_photos, for_masks, for_priors = share(budget, wanted)
     priors = read_priors(data, scene, for_priors, known, normals) if needed else None
-    copies = Copies(data.path) if store.copies and 3 * pixels > for_photos else None
-    return Material(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)
+    copies = Copies(data.path) if caches.copies and 3 * pixels > for_photos else None
+    return TrainingData(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from surfkit.core.memory import peak_memory_bytes, resident_bytes
-from surfkit.train.material import Material
+from surfkit.train.material import TrainingData
 from surfkit.train.stage import StageState
 
 
@@ -28,7 +28,7 @@ class Meter:
         """The scene has just been read."""
         self.parts["scene"] = max(0, resident_bytes() - self.parts["program"])
 
-    def step(self, state: StageState, material: Material) -> None:
+    def step(self, state: StageState, material: TrainingData) -> None:
         """See what is held after a step."""
         groups = (*vars(state.points).values(), state.frozen, state.looks)
         points = sum(value.nbytes for group in groups for value in group.values())

@@ -80,7 +80,7 @@ class Display:
         self.loss.add(sum(done.losses.values()))
         last = done.index == self.steps
         if done.index % PSNR_EVERY == 0 or last:
-            self.psnr.add(psnr(done.maps.color, done.sample.photo))
+            self.psnr.add(psnr(done.maps.color, done.target.photo))
         now = time.perf_counter()
         self.pace.add(now - self.last)
         self.last = now

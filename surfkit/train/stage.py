@@ -20,7 +20,7 @@ from surfkit.core.schedule import Interval
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Neighbour, Regularizer, Sample, ignoring
+from surfkit.losses.base import Loss, Neighbour, Regularizer, Target, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive, apply
 from surfkit.primitives.points import Columns, Edit, Points, merge, withheld
@@ -28,20 +28,20 @@ from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
-from surfkit.train.adam import Rate, adam_step
+from surfkit.train.adam import LearningRate, adam_step
 from surfkit.train.cotangents import added, gradient, pulled
 from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.rig import Rig
-from surfkit.train.views import Order, Survey
+from surfkit.train.views import Order, ViewContributions
 
 RATES = {
-    "means": Rate(1.6e-4, 1.6e-6),
-    "scales": Rate(5e-3),
-    "quats": Rate(1e-3),
-    "opacities": Rate(5e-2),
-    "sh0": Rate(2.5e-3),
-    "sh_rest": Rate(1.25e-4),
+    "means": LearningRate(1.6e-4, 1.6e-6),
+    "scales": LearningRate(5e-3),
+    "quats": LearningRate(1e-3),
+    "opacities": LearningRate(5e-2),
+    "sh0": LearningRate(2.5e-3),
+    "sh_rest": LearningRate(1.25e-4),
 }
 """Of 3DGS, for a scene extent of 1."""
 MOST_STEPS = 100_000_000
@@ -75,7 +75,7 @@ class Stage:
     prune: tuple[Annotated[Prune, choice(Prune)], ...] = ()
     """Further ways to remove points; prune.0:NAME adds the first, prune.1:NAME the next, prune.0:none drops one."""
 
-    rates: dict[str, Rate] = field(default_factory=lambda: dict(RATES))
+    rates: dict[str, LearningRate] = field(default_factory=lambda: dict(RATES))
     """Learning rates of the parameters; of positions as a share of the scene extent."""
 
     sh_every: Interval = 1_000
@@ -156,7 +156,7 @@ class Done:
     losses: dict[str, float]
     points: int
     maps: Maps
-    sample: Sample
+    target: Target
 
 
 class Pictures(Protocol):
@@ -225,39 +225,39 @@ class Trainer:
     def step(self, state: StageState) -> Done:
         """Show one photograph, and let points and policies learn from it."""
         stage, index = self.stage, state.index + 1
-        shown, sample = self.sample(state)
+        shown, target = self.target(state)
         active = stage.weights_at(index)
         reads = {name for loss in active for name in stage.losses[loss].reads}
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
-        shape = self.primitive.shape(leaves, state.sh_degree)
+        shape = self.primitive.activate(leaves, state.sh_degree)
         splats = self.drawn(state, shape)
 
         paired = stage.is_paired(index)
         geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
-        render = self.rasterizer.render(splats, sample.view.camera, stage.near, geometry, distortion)
+        render = self.rasterizer.render(splats, target.view.camera, stage.near, geometry, distortion)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
-        compared = replace(sample, neighbour=second)
+        compared = replace(target, neighbour=second)
         losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
         terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
         losses |= {name: float(term.detach()) for name, term in terms.items()}
-        require_finite_losses(index, sample.view.name, losses)
+        require_finite_losses(index, target.view.name, losses)
         gradients = render.backward(total, chosen, stage.signal.absolute, len(state.points))
-        facts = self.facts(state, splats, sample, render, gradients)
+        facts = self.facts(state, splats, target, render, gradients)
         edit = self.wanted(state.points, facts)
         adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
-        require_finite_values(index, sample.view.name, state.points.params)
+        require_finite_values(index, target.view.name, state.points.params)
         if edit is not None:
             state.points = self.edited(state, edit, index)
         state.index = index
-        return Done(index, losses, len(state.points), render.maps, sample)
+        return Done(index, losses, len(state.points), render.maps, target)
 
     def drawn(self, state: StageState, shape: Splats) -> Splats:
         """The splats of a state, detached, and then those that are frozen."""
         splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
-        return splats.and_then(self.primitive.shape(state.frozen, state.sh_degree)) if state.frozen else splats
+        return splats.and_then(self.primitive.activate(state.frozen, state.sh_degree)) if state.frozen else splats
 
-    def sample(self, state: StageState) -> tuple[int, Sample]:
+    def target(self, state: StageState) -> tuple[int, Target]:
         """Position and photograph of the view to show now; damaged ones are passed over, and named once."""
         while len(state.skipped) < len(self.views):
             if state.order.at == len(state.order.queue):
@@ -270,7 +270,7 @@ class Trainer:
             if photo is None:
                 continue
             prior, mask = (None if known is None else known[shown] for known in (self.priors, self.masks))
-            return shown, Sample(self.views[shown], photo, prior, mask, seed=state.seed)
+            return shown, Target(self.views[shown], photo, prior, mask, seed=state.seed)
         raise BadInput(f"none of the {len(self.views)} photographs can be read, {self.views[0].path} for one")
 
     def photo(self, state: StageState, at: int, aside: bool = False) -> Tensor | None:
@@ -310,15 +310,15 @@ class Trainer:
         return None
 
     def cotangents(
-        self, active: Mapping[str, float], maps: Maps, sample: Sample, look: Look | None
+        self, active: Mapping[str, float], maps: Maps, target: Target, look: Look | None
     ) -> tuple[dict[str, float], Maps, Maps | None]:
         """The weighted losses, their gradient by the maps, and that of the losses which the signal asks for apart."""
         losses, terms = self.stage.losses, self.stage.signal.terms
         leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
         leafy = Maps(**leaves)
         compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
-        compared, sample = ignoring(compared, sample)
-        values = {name: weight * losses[name](compared, sample) for name, weight in active.items()}
+        compared, target = ignoring(compared, target)
+        values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
         numbers = {name: float(value.detach()) for name, value in values.items()}
         if look is not None:
             look.learn(list(values.values()))
@@ -336,7 +336,7 @@ class Trainer:
         rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps) / 2**state.halvings
         return Look(self.stage.appearance, state.looks, shown, rate)
 
-    def facts(self, state: StageState, splats: Splats, sample: Sample, render: Render, gradients: Gradients) -> Step:
+    def facts(self, state: StageState, splats: Splats, target: Target, render: Render, gradients: Gradients) -> Step:
         """What the policies are told about a step, and nothing about frozen points."""
         index, count = state.index + 1, len(state.points)
         own = {name: value[:count] for name, value in splats.tensors().items()}
@@ -345,11 +345,11 @@ class Trainer:
             index=index,
             steps=self.stage.steps,
             seen=render.seen[:count],
-            shape=replace(splats, **own),
-            grad=self.stage.signal.combine(chosen, gradients.signal).norm(dim=-1),
+            splats=replace(splats, **own),
+            grad_norm=self.stage.signal.combine(chosen, gradients.signal).norm(dim=-1),
             radii=render.radii[:count],
-            image_px=max(sample.view.camera.width, sample.view.camera.height),
-            views=Survey(self.views, self.rasterizer, splats, self.stage.near, count),
+            image_px=max(target.view.camera.width, target.view.camera.height),
+            views=ViewContributions(self.views, self.rasterizer, splats, self.stage.near, count),
             since_reset=index - state.reset_at,
             rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.stage.rates.items()},
             seed=state.seed,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from surfkit.densify.base import Tally
+from surfkit.densify.base import Contribution
 from surfkit.raster.api import Rasterizer, Splats
 from surfkit.scene.scene import View
 
@@ -40,7 +40,7 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Survey:
+class ViewContributions:
     """Answers what policies ask about all training views of the present splats (`densify.base.Views`)."""
 
     views: Sequence[View]
@@ -49,7 +49,7 @@ class Survey:
     near: float
     rows: int | None = None
     """Of how many of the splats, the first ones, it tells; None for all."""
-    tallies: dict[tuple[float, float], Tally] = field(default_factory=dict)
+    tallies: dict[tuple[float, float], Contribution] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -60,8 +60,8 @@ class Survey:
             found = self.rasterizer.contribution(self.shape, view.camera, self.near, alpha_power, transmittance_power)
             yield found[0][: self.rows], found[1][: self.rows]
 
-    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
-        """See `Views.survey`."""
+    def contributions(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Contribution:
+        """See `Views.contributions`."""
         powers = (alpha_power, transmittance_power)
         if powers not in self.tallies:
             mean = torch.zeros_like(self.shape.opacities[: self.rows])
@@ -73,5 +73,5 @@ class Survey:
                 torch.maximum(peak, here, out=peak)
                 hits += count
                 views += count > 0
-            self.tallies[powers] = Tally(mean / len(self.views), peak, hits, views)
+            self.tallies[powers] = Contribution(mean / len(self.views), peak, hits, views)
         return self.tallies[powers]

@@ -33,7 +33,7 @@ def test_folded_points_have_the_colours_of_the_mean_photograph():
     pose = torch.eye(4, dtype=torch.float64)
     camera = Camera(pose, 30.0, 30.0, 8.0, 8.0, 16, 16)
     before, after = (
-        colors(primitive.shape(p, 2), camera) for p in (params, Exposure().folded(numbers, params))
+        colors(primitive.activate(p, 2), camera) for p in (params, Exposure().folded(numbers, params))
     )  # fmt: skip
     expected = Exposure()(numbers.mean(0), before.T[:, :, None])[:, :, 0].T
     assert before.min() > 0 and torch.allclose(after, expected, atol=1e-5)

@@ -9,7 +9,7 @@ from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, CountCap, Elongation, LossGradient
-from surfkit.densify.base import Densify, Filter, Policy, Signal, Step, Tally
+from surfkit.densify.base import Contribution, Densify, Filter, Policy, Signal, Step
 from surfkit.primitives import Flat3D, Gaussian3D
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
@@ -23,8 +23,10 @@ class Everything:
     def __len__(self) -> int:
         return 10
 
-    def survey(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Tally:
-        return Tally(torch.arange(N) / N, torch.arange(N) / N, torch.full((N,), 100), torch.ones(N, dtype=torch.int64))
+    def contributions(self, alpha_power: float = 0.5, transmittance_power: float = 0.5) -> Contribution:
+        return Contribution(
+            torch.arange(N) / N, torch.arange(N) / N, torch.full((N,), 100), torch.ones(N, dtype=torch.int64)
+        )
 
 
 N = 60
@@ -39,7 +41,8 @@ def scene() -> Points:
 def step(index: int, **other) -> Step:
     splats = Splats("surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, None)
     facts = dict(
-        index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), shape=splats, grad=torch.full((N,), 1e-3),
+        index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), splats=splats,
+        grad_norm=torch.full((N,), 1e-3),
         radii=torch.ones(N), image_px=100, views=Everything(), since_reset=1_000, rates={"means": 1e-4}, seed=index,
     )  # fmt: skip
     return Step(**(facts | other))
@@ -79,7 +82,7 @@ def test_the_gradient_is_averaged_over_the_views_that_saw_the_point():
         seen[0], seen[1] = index % 2 == 0, True  # both get 1e-3 in every second step; the other steps count for row 1
         grad = torch.zeros(N)
         grad[:2] = 1.01e-3 * (index % 2 == 0)
-        policy.watch(points, step(index, seen=seen, grad=grad))
+        policy.watch(points, step(index, seen=seen, grad_norm=grad))
     assert policy.edit(points, step(600)).clone.nonzero().flatten().tolist() == [0]
 
 
@@ -125,7 +128,7 @@ def test_faint_points_are_spared_while_they_recover_from_a_reset():
 
 
 def test_huge_points_go_after_the_first_reset_unless_splitting_makes_them_fit():
-    quiet = dict(grad=torch.zeros(N))
+    quiet = dict(grad_norm=torch.zeros(N))
     policy = ADC(cull_opacity=0)
     assert not watched(policy, scene(), [3000], **quiet).drop.any()
     assert torch.equal(watched(policy, scene(), [3100], **quiet).drop, SIZES > 0.1)
@@ -151,7 +154,7 @@ class SmallOnly(Filter):
     """Admits small points."""
 
     def admits(self, step, want):
-        return step.shape.scales.amax(-1) < 0.05
+        return step.splats.scales.amax(-1) < 0.05
 
 
 def test_filters_narrow_what_multiplies_but_not_what_is_dropped():
@@ -162,11 +165,11 @@ def test_filters_narrow_what_multiplies_but_not_what_is_dropped():
 
 def test_a_count_cap_takes_the_highest_gradients():
     grad = torch.linspace(1e-4, 1e-3, N)
-    edit = watched(ADC(filters=(CountCap(N + 5),)), scene(), [600], grad=grad)
+    edit = watched(ADC(filters=(CountCap(N + 5),)), scene(), [600], grad_norm=grad)
     assert (edit.clone | edit.split).nonzero().flatten().tolist() == list(range(N - 5, N))
-    full = watched(ADC(filters=(CountCap(N - 10),)), scene(), [600], grad=grad)
+    full = watched(ADC(filters=(CountCap(N - 10),)), scene(), [600], grad_norm=grad)
     assert not (full.clone | full.split).any()
-    both = watched(ADC(filters=(SmallOnly(), CountCap(N + 5))), scene(), [600], grad=grad)
+    both = watched(ADC(filters=(SmallOnly(), CountCap(N + 5))), scene(), [600], grad_norm=grad)
     small = (SIZES < 0.05).nonzero().flatten().tolist()
     assert (both.clone | both.split).nonzero().flatten().tolist() == small[-5:], "room goes to those admitted before"
 
@@ -175,14 +178,14 @@ def test_needles_do_not_multiply():
     scales = torch.full((N, 2), 0.05)
     scales[:, 1] = 0.05 * torch.linspace(0, 0.02, N)
     want = torch.ones(N)
-    kept = Elongation(0.01).admits(replace(step(600), shape=replace(step(600).shape, scales=scales)), want)
+    kept = Elongation(0.01).admits(replace(step(600), splats=replace(step(600).splats, scales=scales)), want)
     assert torch.equal(kept, scales[:, 1] / scales[:, 0] > 0.01) and kept.any() and not kept.all()
 
 
 def test_flat_points_multiply_and_needles_of_three_axes_do_not():
     flat, ball, needle, blade = [0.05, 0.04, 1e-6], [0.05, 0.05, 0.05], [0.05, 1e-4, 1e-4], [1e-4, 1e-6, 0.05]
-    shape = replace(step(600).shape, kind="gaussian", scales=torch.tensor([flat, ball, needle, blade]))
-    kept = Elongation(0.01).admits(replace(step(600), shape=shape), torch.ones(4))
+    shape = replace(step(600).splats, kind="gaussian", scales=torch.tensor([flat, ball, needle, blade]))
+    kept = Elongation(0.01).admits(replace(step(600), splats=shape), torch.ones(4))
     assert kept.tolist() == [True, True, False, False]
 
 
@@ -194,7 +197,7 @@ def test_every_primitive_multiplies_through_the_elongation_filter(primitive):
     points.params["scales"][:, :2] = torch.tensor([0.05, 0.03]).log()
     if points.params["scales"].shape[1] == 3:
         points.params["scales"][:, 2] = math.log(1e-6)
-    edit = watched(ADC(filters=(Elongation(),)), points, [600], shape=primitive.shape(points.params, 0))
+    edit = watched(ADC(filters=(Elongation(),)), points, [600], splats=primitive.activate(points.params, 0))
     assert edit.split.all()
 
 

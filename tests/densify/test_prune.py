@@ -10,13 +10,13 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, Faint, Importance, Trim
-from surfkit.densify.base import Tally
+from surfkit.densify.base import Contribution
 from surfkit.densify.trim import lowest, released_score, summed
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
-from surfkit.train.views import Survey
+from surfkit.train.views import ViewContributions
 
 DRAW = torch.Generator().manual_seed(2)
 AMOUNT = torch.rand(7, 200, generator=DRAW) * 30
@@ -34,9 +34,9 @@ class Seven:
         assert (alpha_power, transmittance_power) == (1.0, 1.0)
         yield from zip(AMOUNT * (COUNT > 0), COUNT, strict=True)
 
-    def survey(self, alpha_power=0.5, transmittance_power=0.5):
+    def contributions(self, alpha_power=0.5, transmittance_power=0.5):
         each = AMOUNT / COUNT.clamp_min(1) * (COUNT > 0)
-        return Tally(each.mean(0), each.amax(0), COUNT.sum(0), (COUNT > 0).sum(0))
+        return Contribution(each.mean(0), each.amax(0), COUNT.sum(0), (COUNT > 0).sum(0))
 
 
 def at(crowd, index, since_reset=1_000):
@@ -164,10 +164,12 @@ def test_the_sum_is_the_change_of_the_pictures_when_a_point_is_removed():
         keep = everything.clone()
         keep[removed] = False
         change.append(float((whole - pictures(keep)).abs().sum()) / 3)
-    views = Survey([View(str(i), camera, None) for i, camera in enumerate(cameras)], rasterizer, splats, 0.01)
+    views = ViewContributions(
+        [View(str(i), camera, None) for i, camera in enumerate(cameras)], rasterizer, splats, 0.01
+    )
     found = summed(views)[:12]
     assert found.tolist() == pytest.approx(change, rel=1e-4)
-    tally = views.survey()
+    tally = views.contributions()
     assert torch.equal(found.argsort(), torch.tensor(change).argsort())
     for other in (tally.mean, tally.peak):
         assert not torch.equal(other[:12].argsort(), found.argsort()), "no other score tells"
@@ -177,7 +179,7 @@ def test_the_sum_of_a_disc_is_the_integral_of_its_kernel():
     """2 pi sigma^2 (o - 1/255), with sigma in pixels: the tail below 1/255 is not drawn."""
     splats, cameras = discs()
     bare = replace(splats, **{name: value[:12] for name, value in splats.tensors().items()})
-    views = Survey([View("0", cameras[0], None)], select("cpu")[0], bare, 0.01)
+    views = ViewContributions([View("0", cameras[0], None)], select("cpu")[0], bare, 0.01)
     sigma = 150 / 2 * bare.scales[:, 0]
     wanted = 2 * math.pi * sigma**2 * (bare.opacities - 1 / 255)
     assert torch.allclose(summed(views), wanted, rtol=0.02)
@@ -191,7 +193,7 @@ def test_trim_by_the_sum(crowd):
 
 def test_importance_is_opacity_times_hits_times_a_power_of_the_area(crowd):
     points, step = at(crowd, 15_000)
-    opacities, scales = step.shape.opacities.double().numpy(), step.shape.scales.double().numpy()
+    opacities, scales = step.splats.opacities.double().numpy(), step.splats.scales.double().numpy()
     area = scales[:, 0] * scales[:, 1]
     score = COUNT.sum(0).numpy() * opacities * (area / np.sort(area)[::-1][180]) ** 0.1
     drop = Importance(ratio=0.3).edit(points, step).drop
@@ -203,10 +205,10 @@ def test_importance_is_opacity_times_hits_times_a_power_of_the_area(crowd):
 def test_faint_points_go_every_so_often(crowd):
     policy = Faint(below=0.5, start=100, until=400, every=100, recovery=50)
     points, step = crowd
-    faint = replace(step.shape, opacities=torch.linspace(0, 1, 200))
-    steps = [i for i in range(1, 600) if policy.edit(points, replace(step, index=i, shape=faint))]
+    faint = replace(step.splats, opacities=torch.linspace(0, 1, 200))
+    steps = [i for i in range(1, 600) if policy.edit(points, replace(step, index=i, splats=faint))]
     assert steps == [200, 300, 400]
-    drop = policy.edit(points, replace(step, index=200, shape=faint)).drop
+    drop = policy.edit(points, replace(step, index=200, splats=faint)).drop
     assert torch.equal(drop, faint.opacities < 0.5)
     assert policy.edit(points, replace(step, index=200, since_reset=49)) is None
 

@@ -9,7 +9,7 @@ from needs import needs
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.depth.base import Material
+from surfkit.depth.base import DepthInput
 from surfkit.depth.depth_anything import DepthAnythingV2
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations
@@ -40,12 +40,12 @@ def weights(tmp_path_factory):
     return folder
 
 
-def material(folder) -> Material:
+def material(folder) -> DepthInput:
     """One photograph of 120 x 80 pixels."""
     pixels = np.random.default_rng(0).integers(0, 255, (80, 120, 3), np.uint8)
     Image.fromarray(pixels).save(folder / "a.png")
     camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 60.0, 40.0, 120, 80)
-    return Material([View("a.png", camera, folder / "a.png")], NOTHING, torch.device("cpu"), folder)
+    return DepthInput([View("a.png", camera, folder / "a.png")], NOTHING, torch.device("cpu"), folder)
 
 
 def test_maps_have_the_shape_of_the_photograph_and_weights_come_from_the_folder(weights, tmp_path):

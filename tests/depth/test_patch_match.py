@@ -8,7 +8,7 @@ import torch
 from needs import needs_native
 
 from surfkit.core.check import BadInput
-from surfkit.depth.base import Material
+from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.readers.data import Data
@@ -37,7 +37,7 @@ def farm(tmp_path_factory):
 def estimates(farm, tmp_path_factory):
     """Of two views."""
     scene, tracks, _ = farm
-    given = Material(scene.train, tracks, CPU, tmp_path_factory.mktemp("work"))
+    given = DepthInput(scene.train, tracks, CPU, tmp_path_factory.mktemp("work"))
     return {estimate.at: estimate for estimate in PatchMatch(coarsest=60).estimate(given, [7, 12])}
 
 
@@ -170,7 +170,7 @@ def test_the_number_of_threads_changes_nothing(farm, tmp_path):
     found = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        given = Material(scene.train, tracks, CPU, tmp_path / str(threads))
+        given = DepthInput(scene.train, tracks, CPU, tmp_path / str(threads))
         (estimate,) = PatchMatch(coarsest=60, passes=1, neighbours=3).estimate(given, [3])
         found.append(estimate)
     for name in ("inverse", "confidence", "normal"):
@@ -203,7 +203,7 @@ def test_views_without_points_have_no_depth(farm, tmp_path):
     scene, tracks, _ = farm
     name = scene.train[2].name
     seen = {n: replace(s, points=s.points[:5], at=s.at[:5]) if n == name else s for n, s in tracks.seen.items()}
-    given = Material(scene.train, replace(tracks, seen=seen), CPU, tmp_path)
+    given = DepthInput(scene.train, replace(tracks, seen=seen), CPU, tmp_path)
     (estimate,) = PatchMatch(longest=40, coarsest=32, neighbours=2, best=1).estimate(given, [2])
     assert estimate.inverse is None and estimate.confidence is None
 
@@ -212,7 +212,7 @@ def test_photographs_from_one_place_have_no_depth(farm, tmp_path):
     scene, tracks, _ = farm
     views = [replace(view, camera=scene.train[7].camera) for view in scene.train]
     (estimate,) = PatchMatch(longest=40, coarsest=32, neighbours=2, best=1).estimate(
-        Material(views, tracks, CPU, tmp_path), [7]
+        DepthInput(views, tracks, CPU, tmp_path), [7]
     )
     assert estimate.inverse is None
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.depth.base import Material
+from surfkit.depth.base import DepthInput
 from surfkit.depth.consistency import Agreement, agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
@@ -35,7 +35,7 @@ def farm(tmp_path_factory):
 
 def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
     scene, observations, truth = farm
-    given = Material(scene.train, observations, CPU, tmp_path)
+    given = DepthInput(scene.train, observations, CPU, tmp_path)
     wanted = [7, 12]
     for estimate, at in zip(PlaneSweep().estimate(given, wanted), wanted, strict=True):
         depth = truth.exact[scene.train[at].name].depth.float()
@@ -49,7 +49,7 @@ def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
 
 def test_exposure_does_not_matter(farm, tmp_path):
     scene, observations, _ = farm
-    sweep, given = PlaneSweep(), Material(scene.train, observations, CPU, tmp_path)
+    sweep, given = PlaneSweep(), DepthInput(scene.train, observations, CPU, tmp_path)
     near = neighbours(scene.train, observations, 2, 8)[7]
     here, others = sweep.picture(given, 7), [sweep.picture(given, other) for other in near]
     planes = torch.linspace(*depth_range(scene.train[7], observations, 0.1), 8)
@@ -190,6 +190,6 @@ def test_views_without_points_have_no_depth(farm, tmp_path):
     scene, observations, _ = farm
     name = scene.train[2].name
     seen = {n: replace(s, points=s.points[:5], at=s.at[:5]) if n == name else s for n, s in observations.seen.items()}
-    given = Material(scene.train, replace(observations, seen=seen), CPU, tmp_path)
+    given = DepthInput(scene.train, replace(observations, seen=seen), CPU, tmp_path)
     (estimate,) = PlaneSweep(longest=40).estimate(given, [2])
     assert estimate.inverse is None and estimate.confidence is None

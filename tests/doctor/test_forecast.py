@@ -22,7 +22,7 @@ from surfkit.doctor.forecast import Plan, beyond, forecast, schedule, within
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, Started, Taken, Written, measure, probe, some, with_count
 from surfkit.losses import NormalPrior, Reprojection
-from surfkit.pipeline import Every, run, with_steps
+from surfkit.pipeline import Intervals, run, with_steps
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
@@ -277,7 +277,7 @@ def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path):
     assert {path for path in farm.rglob("*")} == before and not out.exists()
     assert findings == [] and heard[-1][0] == "probe" and heard[-1][1] == heard[-1][2]
     assert found.points == 300 and found.points_known and found.seconds > 0
-    run(recipe, data, out, every=Every(checkpoint=30, pictures=0))
+    run(recipe, data, out, intervals=Intervals(checkpoint=30, pictures=0))
     real = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     assert 0.75 * real < found.run_bytes < 1.25 * real
     undistorted = sum(path.stat().st_size for path in (farm / "undistorted").iterdir())

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.losses import DepthRegression
-from surfkit.losses.base import Sample
+from surfkit.losses.base import Target
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim_map
 from surfkit.readers.depth_prior import DepthPrior
@@ -20,7 +20,7 @@ SIZE = (19, 23)
 TYPICAL = 0.7
 
 
-def scene(seed: int = 0, unit: float = 1.0) -> tuple[torch.Tensor, Sample]:
+def scene(seed: int = 0, unit: float = 1.0) -> tuple[torch.Tensor, Target]:
     """A rendered median depth and a prior, both with holes, in any unit of length."""
     draw = torch.Generator().manual_seed(seed)
     median = unit * (1 + torch.rand(SIZE, generator=draw))
@@ -29,7 +29,7 @@ def scene(seed: int = 0, unit: float = 1.0) -> tuple[torch.Tensor, Sample]:
     inverse[torch.rand(SIZE, generator=draw) < 0.2] = 0
     prior = DepthPrior(inverse, torch.rand(SIZE, generator=draw) * (inverse > 0), TYPICAL / unit)
     camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 11.0, 9.0, SIZE[1], SIZE[0])
-    return median, Sample(View("a", camera, None), torch.zeros(3, *SIZE), prior)
+    return median, Target(View("a", camera, None), torch.zeros(3, *SIZE), prior)
 
 
 def masked(median: torch.Tensor, prior: DepthPrior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,19 +40,19 @@ def masked(median: torch.Tensor, prior: DepthPrior) -> tuple[np.ndarray, np.ndar
 
 
 def test_l1_is_the_mean_over_trusted_pixels():
-    median, sample = scene()
-    weight, rendered, estimated = masked(median, sample.prior)
+    median, target = scene()
+    weight, rendered, estimated = masked(median, target.prior)
     wanted = (weight * np.abs(rendered - estimated)).sum() / weight.sum()
-    assert DepthRegression()(Maps(median=median), sample).item() == pytest.approx(wanted, rel=1e-5)
+    assert DepthRegression()(Maps(median=median), target).item() == pytest.approx(wanted, rel=1e-5)
 
 
 def test_ssim_is_the_mean_over_trusted_pixels_too():
-    median, sample = scene()
-    weight, rendered, estimated = masked(median, sample.prior)
-    there = (median.numpy() > 0) & (sample.prior.inverse.numpy() > 0)
+    median, target = scene()
+    weight, rendered, estimated = masked(median, target.prior)
+    there = (median.numpy() > 0) & (target.prior.inverse.numpy() > 0)
     similar = ssim_map(*(torch.from_numpy(there * values)[None] for values in (rendered, estimated)))[0].numpy()
     wanted = (weight * (1 - similar)).sum() / weight.sum()
-    assert DepthRegression(error="ssim")(Maps(median=median), sample).item() == pytest.approx(wanted, rel=1e-4)
+    assert DepthRegression(error="ssim")(Maps(median=median), target).item() == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize("error", ["l1", "ssim"])
@@ -67,21 +67,21 @@ def test_pixels_without_an_estimate_do_not_dilute_the_error(error):
             known = torch.zeros(size)
             known[:, :columns] = 1.0
             prior = DepthPrior(known * shift / 2, known * confidence, 0.5)
-            values.append(DepthRegression(error=error)(Maps(median=median), Sample(view, photo, prior)).item())
+            values.append(DepthRegression(error=error)(Maps(median=median), Target(view, photo, prior)).item())
     assert values == pytest.approx(values[:1] * 4, rel=0.1 if error == "ssim" else 1e-5)  # rims have their say
 
 
 @pytest.mark.parametrize("error", ["l1", "ssim"])
 def test_the_expected_depth_is_compared_and_read_where_it_is_asked_for(error):
-    median, sample = scene()
+    median, target = scene()
     expected, _ = scene(seed=1)
     alpha = torch.where(expected > 0, 0.8, 0.0)
     loss = DepthRegression(error=error, depth="expected")
     assert set(loss.reads) == {"alpha", "depth"} and DepthRegression(error=error).reads == ("median",)
     maps = Maps(alpha=alpha, depth=alpha * expected)
-    found = loss(maps, sample).item()
-    assert found == pytest.approx(DepthRegression(error=error)(Maps(median=expected), sample).item(), rel=1e-5)
-    assert found != pytest.approx(DepthRegression(error=error)(Maps(median=median), sample).item(), rel=1e-2)
+    found = loss(maps, target).item()
+    assert found == pytest.approx(DepthRegression(error=error)(Maps(median=expected), target).item(), rel=1e-5)
+    assert found != pytest.approx(DepthRegression(error=error)(Maps(median=median), target).item(), rel=1e-2)
     check_loss(loss, SIZE)
 
 
@@ -95,24 +95,24 @@ def test_no_unit_of_length_matters(error):
 
 @pytest.mark.parametrize("error", ["l1", "ssim"])
 def test_the_gradient_is_that_of_finite_differences_and_zero_at_masked_pixels(error):
-    median, sample = scene()
+    median, target = scene()
     leaf = median.clone().requires_grad_()
-    DepthRegression(error=error)(Maps(median=leaf), sample).backward()
-    hidden = (median == 0) | (sample.prior.inverse == 0)
+    DepthRegression(error=error)(Maps(median=leaf), target).backward()
+    hidden = (median == 0) | (target.prior.inverse == 0)
     assert torch.isfinite(leaf.grad).all() and (leaf.grad[hidden] == 0).all() and (leaf.grad[~hidden] != 0).any()
-    weight, rendered, estimated = masked(median, sample.prior)
+    weight, rendered, estimated = masked(median, target.prior)
     if error == "l1":
         by_depth = weight * np.sign(rendered - estimated) * -(rendered**2) * TYPICAL / weight.sum()
         np.testing.assert_allclose(leaf.grad.numpy(), by_depth, rtol=1e-4, atol=1e-8)
 
 
 def test_nothing_to_compare_is_no_loss():
-    median, sample = scene()
+    median, target = scene()
     blank = DepthPrior(torch.zeros(SIZE), torch.zeros(SIZE), TYPICAL)
     for error in ("l1", "ssim"):
-        for depth, prior in ((torch.zeros(SIZE), sample.prior), (median, blank), (median, None)):
+        for depth, prior in ((torch.zeros(SIZE), target.prior), (median, blank), (median, None)):
             leaf = depth.clone().requires_grad_()
-            loss = DepthRegression(error=error)(Maps(median=leaf), Sample(sample.view, sample.photo, prior))
+            loss = DepthRegression(error=error)(Maps(median=leaf), Target(target.view, target.photo, prior))
             loss.backward()
             assert loss.item() == pytest.approx(0, abs=1e-6) and not leaf.grad.any()
 

@@ -8,7 +8,7 @@ from needs import needs_native
 from surfkit import native
 from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
-from surfkit.losses.base import Sample
+from surfkit.losses.base import Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement, disagreement_reference, normals_of
 from surfkit.scene.camera import Camera
@@ -17,8 +17,8 @@ from surfkit.scene.scene import View
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 60.0, 55.0, 17.0, 21.0, 41, 37)
 
 
-def sample(photo=None) -> Sample:
-    return Sample(View("a", CAMERA, None), photo)
+def target(photo=None) -> Target:
+    return Target(View("a", CAMERA, None), photo)
 
 
 def plane_depth(normal, offset: float) -> torch.Tensor:
@@ -104,16 +104,16 @@ def test_normal_consistency_is_zero_where_splats_lie_in_the_surface():
     flat = normal[:, None, None].expand(3, CAMERA.height, CAMERA.width)
     maps = Maps(alpha=torch.ones_like(depth), depth=depth, median=depth, normal=flat.contiguous())
     for which in ("median", "expected"):
-        assert NormalConsistency(depth=which)(maps, sample()).abs() < 1e-5
+        assert NormalConsistency(depth=which)(maps, target()).abs() < 1e-5
     turned = Maps(alpha=maps.alpha, depth=depth, median=depth, normal=-maps.normal)
-    assert NormalConsistency(depth="median")(turned, sample()).item() == pytest.approx(2.0, abs=1e-5)
+    assert NormalConsistency(depth="median")(turned, target()).item() == pytest.approx(2.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # the native pass, and plain torch
 def test_normal_consistency_does_not_pull_alpha(dtype):
     maps = random_maps()
     alpha, normal = (t.to(dtype, copy=True).requires_grad_() for t in (maps.alpha, maps.normal))
-    loss = NormalConsistency(depth="median")(Maps(alpha=alpha, median=maps.median.to(dtype), normal=normal), sample())
+    loss = NormalConsistency(depth="median")(Maps(alpha=alpha, median=maps.median.to(dtype), normal=normal), target())
     by_alpha, by_normal = torch.autograd.grad(loss, (alpha, normal), allow_unused=True)
     assert by_alpha is None and by_normal.abs().sum() > 0
 
@@ -122,14 +122,14 @@ def test_photometric_losses():
     maps, draw = random_maps(), torch.Generator().manual_seed(2)
     photo = torch.rand(3, CAMERA.height, CAMERA.width, generator=draw)
     expected = np.abs(maps.color.numpy() - photo.numpy()).mean()
-    assert L1()(maps, sample(photo)).item() == pytest.approx(expected, rel=1e-6)
-    assert SSIM()(maps, sample(maps.color)).item() == pytest.approx(0.0, abs=1e-6)
-    assert 0 < SSIM()(maps, sample(photo)).item() < 2
+    assert L1()(maps, target(photo)).item() == pytest.approx(expected, rel=1e-6)
+    assert SSIM()(maps, target(maps.color)).item() == pytest.approx(0.0, abs=1e-6)
+    assert 0 < SSIM()(maps, target(photo)).item() < 2
 
 
 def test_distortion_is_in_units_of_the_extent():
     maps = random_maps()
-    assert Distortion(unit=0.5)(maps, sample()).item() == pytest.approx(0.25 * maps.distortion.mean().item(), rel=1e-6)
+    assert Distortion(unit=0.5)(maps, target()).item() == pytest.approx(0.25 * maps.distortion.mean().item(), rel=1e-6)
 
 
 def test_weights_begin_after_their_start():

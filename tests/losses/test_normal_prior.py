@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.losses import NormalPrior
-from surfkit.losses.base import Sample, ignoring
+from surfkit.losses.base import Target, ignoring
 from surfkit.primitives import Surfel2D
 from surfkit.raster.api import Maps
 from surfkit.raster.select import select
@@ -21,7 +21,7 @@ SIZE = (11, 14)
 CAMERA = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 7.0, 5.5, SIZE[1], SIZE[0])
 
 
-def scene(dtype=torch.float64) -> tuple[Maps, Sample]:
+def scene(dtype=torch.float64) -> tuple[Maps, Target]:
     """Rendered and prior normals at random, both with holes."""
     draw = torch.Generator().manual_seed(0)
     prior, rendered = (torch.randn(3, *SIZE, generator=draw, dtype=dtype) for _ in range(2))
@@ -29,51 +29,51 @@ def scene(dtype=torch.float64) -> tuple[Maps, Sample]:
     rendered = rendered * (torch.rand(SIZE, generator=draw) > 0.2)
     alpha, confidence = (torch.rand(SIZE, generator=draw, dtype=dtype) for _ in range(2))
     known = DepthPrior(torch.ones(SIZE), confidence, 1.0, prior)
-    return Maps(alpha=alpha, normal=rendered), Sample(View("a", CAMERA, None), torch.zeros(3, *SIZE), known)
+    return Maps(alpha=alpha, normal=rendered), Target(View("a", CAMERA, None), torch.zeros(3, *SIZE), known)
 
 
 @pytest.mark.parametrize("error", ["cosine", "l1", "both"])
 def test_it_is_the_weighted_mean_over_pixels_that_have_both(error):
-    maps, sample = scene()
+    maps, target = scene()
     total = weights = 0.0
     for i, j in np.ndindex(*SIZE):
-        rendered, prior = maps.normal[:, i, j].numpy(), sample.prior.normal[:, i, j].numpy()
+        rendered, prior = maps.normal[:, i, j].numpy(), target.prior.normal[:, i, j].numpy()
         if rendered.any() and prior.any():
             rendered = rendered / np.linalg.norm(rendered)
             terms = {"cosine": 1 - rendered @ prior, "l1": np.abs(rendered - prior).sum()}
-            weight = float(maps.alpha[i, j] * sample.prior.confidence[i, j])
+            weight = float(maps.alpha[i, j] * target.prior.confidence[i, j])
             total += weight * (sum(terms.values()) if error == "both" else terms[error])
             weights += weight
     assert weights > 1
-    assert NormalPrior(error=error)(maps, sample).item() == pytest.approx(total / weights, rel=1e-9)
+    assert NormalPrior(error=error)(maps, target).item() == pytest.approx(total / weights, rel=1e-9)
 
 
 @pytest.mark.parametrize("error", ["cosine", "l1", "both"])
 def test_the_gradient_is_that_of_finite_differences_and_does_not_pull_alpha(error):
-    maps, sample = scene()
+    maps, target = scene()
     normal, alpha = maps.normal.clone().requires_grad_(), maps.alpha.clone().requires_grad_()
     loss = NormalPrior(error=error)
     by_normal, by_alpha = torch.autograd.grad(
-        loss(Maps(alpha=alpha, normal=normal), sample), (normal, alpha), allow_unused=True
+        loss(Maps(alpha=alpha, normal=normal), target), (normal, alpha), allow_unused=True
     )
     assert by_alpha is None and torch.isfinite(by_normal).all()
-    without = (maps.normal == 0).all(0) | (sample.prior.normal == 0).all(0)
+    without = (maps.normal == 0).all(0) | (target.prior.normal == 0).all(0)
     assert without.any() and not by_normal[:, without].any()
     draw = torch.Generator().manual_seed(1)
     way = torch.randn(3, *SIZE, generator=draw, dtype=torch.float64) * ~without
-    ends = [loss(replace(maps, normal=maps.normal + h * way), sample).item() for h in (-1e-6, 1e-6)]
+    ends = [loss(replace(maps, normal=maps.normal + h * way), target).item() for h in (-1e-6, 1e-6)]
     assert float((by_normal * way).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-5)
 
 
 def test_nothing_to_compare_is_no_loss():
-    maps, sample = scene()
-    blank = replace(sample.prior, normal=torch.zeros(3, *SIZE))
+    maps, target = scene()
+    blank = replace(target.prior, normal=torch.zeros(3, *SIZE))
     drawn = replace(maps, color=torch.zeros(3, *SIZE))
-    masked = ignoring(drawn, replace(sample, mask=torch.zeros(SIZE, dtype=torch.bool)))[1]
+    masked = ignoring(drawn, replace(target, mask=torch.zeros(SIZE, dtype=torch.bool)))[1]
     assert not masked.prior.normal.any(), "a mask hides normals too"
-    for prior in (None, replace(sample.prior, normal=None), blank, masked.prior):
+    for prior in (None, replace(target.prior, normal=None), blank, masked.prior):
         leaf = maps.normal.clone().requires_grad_()
-        loss = NormalPrior()(Maps(alpha=maps.alpha, normal=leaf), replace(sample, prior=prior))
+        loss = NormalPrior()(Maps(alpha=maps.alpha, normal=leaf), replace(target, prior=prior))
         (grad,) = torch.autograd.grad(loss, leaf)
         assert loss.item() == 0 and not grad.any()
 
@@ -94,12 +94,12 @@ def test_rendered_surfels_that_lie_in_the_surface_agree_with_exact_normals():
     params = primitive.init(Cloud(xyz, torch.zeros(len(xyz), 3, dtype=torch.uint8), normals), torch.Generator())
     params["opacities"].fill_(4.0)
     view, truth = views[2], exact[views[2].name]
-    maps = select("cpu")[0].render(primitive.shape(params, 0), view.camera, 0.005).maps
+    maps = select("cpu")[0].render(primitive.activate(params, 0), view.camera, 0.005).maps
     assert (maps.alpha > 0.9).float().mean() > 0.5
 
     def loss(normal):
         prior = DepthPrior(torch.ones(48, 64), torch.ones(48, 64), 1.0, normal.float())
-        return NormalPrior()(maps, Sample(view, torch.zeros(3, 48, 64), prior)).item()
+        return NormalPrior()(maps, Target(view, torch.zeros(3, 48, 64), prior)).item()
 
     turn = view.camera.world_to_camera[:3, :3].T
     assert loss(truth.normal) < 0.03

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.losses import Reprojection, WarpedPatches, warped_patches
-from surfkit.losses.base import Neighbour, Sample
+from surfkit.losses.base import Neighbour, Target
 from surfkit.losses.two_views import Opposite, agreement, round_trip, sampled, spread
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -53,11 +53,11 @@ def look(eye: Camera, normal=NORMAL, offset=OFFSET) -> tuple[torch.Tensor, Maps]
     return photo, Maps(alpha=alpha, depth=alpha * depth, median=depth, normal=alpha * flat)
 
 
-def scene(second=SECOND, normal=NORMAL, mask=None) -> tuple[Maps, Sample]:
+def scene(second=SECOND, normal=NORMAL, mask=None) -> tuple[Maps, Target]:
     """Exact maps of the first view, and a sample with the second as its neighbour."""
     (photo, maps), (other, theirs) = look(FIRST, normal), look(second, normal)
     neighbour = Neighbour(View("b", second, None), other, theirs, mask)
-    return maps, Sample(View("a", FIRST, None), photo, neighbour=neighbour, seed=5)
+    return maps, Target(View("a", FIRST, None), photo, neighbour=neighbour, seed=5)
 
 
 def moved(maps: Maps, factor: float) -> Maps:
@@ -71,53 +71,53 @@ def tilted(maps: Maps, by: float) -> Maps:
 
 @pytest.mark.parametrize("which", ["median", "expected"])
 def test_exact_depth_is_no_error(which):
-    maps, sample = scene()
-    assert Reprojection(depth=which, stride=1)(maps, sample).item() < 1e-9
-    exact = WarpedPatches(depth=which)(maps, sample).item()
+    maps, target = scene()
+    assert Reprojection(depth=which, stride=1)(maps, target).item() < 1e-9
+    exact = WarpedPatches(depth=which)(maps, target).item()
     assert exact < 0.01, "what is left is that pixels are interpolated"
     for factor in (0.95, 1.05):
-        assert Reprojection(depth=which, stride=1)(moved(maps, factor), sample).item() > 0.1
-        assert WarpedPatches(depth=which)(moved(maps, factor), sample).item() > 5 * exact
+        assert Reprojection(depth=which, stride=1)(moved(maps, factor), target).item() > 0.1
+        assert WarpedPatches(depth=which)(moved(maps, factor), target).item() > 5 * exact
     for by in (-0.5, 0.5):
-        assert WarpedPatches(depth=which)(tilted(maps, by), sample).item() > 2 * exact
+        assert WarpedPatches(depth=which)(tilted(maps, by), target).item() > 2 * exact
 
 
 @pytest.mark.parametrize("factor", [0.99, 0.995, 1.005, 1.01])
 def test_the_error_of_a_frontal_plane_is_the_difference_of_the_disparities(factor):
-    maps, sample = scene(BESIDE, FRONTAL)
+    maps, target = scene(BESIDE, FRONTAL)
     error = FOCAL * 0.1 / -OFFSET * abs(1 / factor - 1)
-    value = Reprojection(depth="median", stride=1)(moved(maps, factor), sample).item()
+    value = Reprojection(depth="median", stride=1)(moved(maps, factor), target).item()
     assert value == pytest.approx(math.exp(-error) * error, rel=1e-9)
-    limited = Reprojection(depth="median", stride=1, limit=0.9 * error)(moved(maps, factor), sample)
+    limited = Reprojection(depth="median", stride=1, limit=0.9 * error)(moved(maps, factor), target)
     assert limited.item() == 0, "all are taken for occluded"
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
 def test_the_gradient_leads_to_the_true_depth(loss):
-    maps, sample = scene()
+    maps, target = scene()
     for factor, sign in ((0.95, -1), (1.05, 1)):
         leaf = (maps.median * factor).requires_grad_()
-        loss(replace(maps, median=leaf), sample).backward()
+        loss(replace(maps, median=leaf), target).backward()
         pulled = leaf.grad != 0
         assert (leaf.grad * sign).sum() > 0 and pulled.sum() > 100
         assert (leaf.grad[pulled] * sign > 0).double().mean() > 0.75
 
 
 def test_the_gradient_leads_to_the_true_normal():
-    maps, sample = scene()
+    maps, target = scene()
     for by in (-0.5, 0.5):
         leaf = tilted(maps, by).normal.requires_grad_()
-        WarpedPatches(depth="median")(replace(maps, normal=leaf), sample).backward()
+        WarpedPatches(depth="median")(replace(maps, normal=leaf), target).backward()
         assert leaf.grad[0].sum() * by > 0
 
 
 def test_the_way_there_and_back_has_the_gradient_of_finite_differences():
-    maps, sample = scene()
+    maps, target = scene()
     at = torch.arange(200, HEIGHT * WIDTH, 7)
     rays = FIRST.rays(torch.float64).flatten(1)[:, at]
     draw = torch.Generator().manual_seed(0)
     wavy = 1 + 0.02 * torch.rand(HEIGHT, WIDTH, generator=draw, dtype=torch.float64)
-    opposite = Opposite.of(replace(sample.neighbour, maps=replace(maps, median=maps.median * wavy)), "median")
+    opposite = Opposite.of(replace(target.neighbour, maps=replace(maps, median=maps.median * wavy)), "median")
     depth = (maps.median.flatten()[at] * 1.01).requires_grad_()
     valid = round_trip(depth, rays, FIRST, opposite)[1]
     assert valid.sum() > 50
@@ -129,12 +129,12 @@ def test_the_way_there_and_back_has_the_gradient_of_finite_differences():
 
 
 def test_the_loss_is_that_of_constant_weights():
-    maps, sample = scene()
+    maps, target = scene()
     maps = moved(maps, 1.01)
-    rays, opposite = FIRST.rays(torch.float64).flatten(1), Opposite.of(sample.neighbour, "median")
+    rays, opposite = FIRST.rays(torch.float64).flatten(1), Opposite.of(target.neighbour, "median")
     weight, counts = agreement(*round_trip(maps.median.flatten(), rays, FIRST, opposite), 1.0)
     leaf = maps.median.clone().requires_grad_()
-    Reprojection(depth="median", stride=1)(replace(maps, median=leaf), sample).backward()
+    Reprojection(depth="median", stride=1)(replace(maps, median=leaf), target).backward()
     way = torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def frozen(step):
@@ -146,48 +146,48 @@ def test_the_loss_is_that_of_constant_weights():
 
 def test_the_gradient_of_patches_is_that_of_finite_differences(monkeypatch):
     monkeypatch.setattr(warped_patches, "agreement", lambda error, valid, limit: (valid.double(), valid))
-    maps, sample = scene()
+    maps, target = scene()
     maps = tilted(moved(maps, 1.01), 0.1)
     draw = torch.Generator().manual_seed(0)
     leaves = [value.clone().requires_grad_() for value in (maps.median, maps.normal)]
     loss = WarpedPatches(depth="median", pixels=60, radius=2)
-    loss(replace(maps, median=leaves[0], normal=leaves[1]), sample).backward()
+    loss(replace(maps, median=leaves[0], normal=leaves[1]), target).backward()
     for name, leaf in zip(("median", "normal"), leaves, strict=True):
         way = torch.rand(leaf.shape, generator=draw, dtype=torch.float64) - 0.3
-        ends = [loss(replace(maps, **{name: leaf.detach() + h * way}), sample).item() for h in (-1e-6, 1e-6)]
+        ends = [loss(replace(maps, **{name: leaf.detach() + h * way}), target).item() for h in (-1e-6, 1e-6)]
         assert float((leaf.grad * way).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-6, rel=1e-4), name
 
 
 def test_exposure_makes_no_difference_to_patches():
-    maps, sample = scene()
+    maps, target = scene()
     maps = moved(maps, 1.05)
-    darker = replace(sample.neighbour, photo=0.55 * sample.neighbour.photo + 0.1)
+    darker = replace(target.neighbour, photo=0.55 * target.neighbour.photo + 0.1)
     values = [
-        WarpedPatches(depth="median")(maps, given).item() for given in (sample, replace(sample, neighbour=darker))
+        WarpedPatches(depth="median")(maps, given).item() for given in (target, replace(target, neighbour=darker))
     ]
     assert values[0] > 0.01 and values[1] == pytest.approx(values[0], rel=1e-6)
 
 
-def occluded(sample: Sample) -> tuple[Sample, torch.Tensor]:
+def occluded(target: Target) -> tuple[Target, torch.Tensor]:
     """Something flat stands before the neighbour's right half, and which of its pixels it hides."""
     hidden = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hidden[:, WIDTH // 2 :] = True
-    given = sample.neighbour
+    given = target.neighbour
     maps = replace(given.maps, median=torch.where(hidden, 0.7, given.maps.median))
-    return replace(sample, neighbour=replace(given, maps=maps, photo=torch.where(hidden, 0.3, given.photo))), hidden
+    return replace(target, neighbour=replace(given, maps=maps, photo=torch.where(hidden, 0.3, given.photo))), hidden
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
 def test_what_the_neighbour_does_not_see_does_not_count(loss):
-    maps, sample = scene()
+    maps, target = scene()
     for way in ("occluded", "masked", "hole", "out of sight"):
-        given, hidden = occluded(sample)
+        given, hidden = occluded(target)
         if way == "masked":
-            near = sample.neighbour.maps.median
+            near = target.neighbour.maps.median
             wrong = replace(given.neighbour.maps, median=torch.where(hidden, 1.01 * near, near))
             given = replace(given, neighbour=replace(given.neighbour, maps=wrong, mask=~hidden))
         elif way == "hole":
-            holes = replace(given.neighbour.maps, median=torch.where(hidden, 0.0, sample.neighbour.maps.median))
+            holes = replace(given.neighbour.maps, median=torch.where(hidden, 0.0, target.neighbour.maps.median))
             given = replace(given, neighbour=replace(given.neighbour, maps=holes))
         elif way == "out of sight":
             half = replace(SECOND, width=WIDTH // 2)
@@ -210,20 +210,20 @@ def test_what_the_neighbour_does_not_see_does_not_count(loss):
 
 
 def test_patches_that_reach_under_the_mask_of_the_view_do_not_count():
-    maps, sample = scene()
+    maps, target = scene()
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[8:20, 10:24] = False
-    right, wrong = (torch.where(mask, sample.photo, value) for value in (sample.photo, torch.zeros(())))
+    right, wrong = (torch.where(mask, target.photo, value) for value in (target.photo, torch.zeros(())))
     loss = WarpedPatches(depth="median")
-    values = [loss(maps, replace(sample, photo=photo, mask=mask)).item() for photo in (right, wrong)]
-    assert values[0] == values[1] and loss(maps, replace(sample, photo=wrong)).item() > values[0] + 0.01
+    values = [loss(maps, replace(target, photo=photo, mask=mask)).item() for photo in (right, wrong)]
+    assert values[0] == values[1] and loss(maps, replace(target, photo=wrong)).item() > values[0] + 0.01
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: type(loss).__name__)
 def test_a_neighbour_that_looks_away_teaches_nothing(loss):
     away = camera(pose(180.0, 0.1))
-    maps, sample = scene()
-    given = replace(sample, neighbour=replace(sample.neighbour, view=View("b", away, None)))
+    maps, target = scene()
+    given = replace(target, neighbour=replace(target.neighbour, view=View("b", away, None)))
     leaf = maps.median.clone().requires_grad_()
     value = loss(replace(maps, median=leaf), given)
     value.backward()
@@ -231,10 +231,10 @@ def test_a_neighbour_that_looks_away_teaches_nothing(loss):
 
 
 def test_patches_without_texture_or_room_do_not_count():
-    maps, sample = scene()
-    plain = replace(sample, photo=torch.full_like(sample.photo, 0.4))
+    maps, target = scene()
+    plain = replace(target, photo=torch.full_like(target.photo, 0.4))
     assert WarpedPatches(depth="median")(moved(maps, 1.01), plain).item() == 0
-    assert WarpedPatches(depth="median", radius=20)(moved(maps, 1.01), sample).item() == 0, "larger than the picture"
+    assert WarpedPatches(depth="median", radius=20)(moved(maps, 1.01), target).item() == 0, "larger than the picture"
 
 
 def test_pixels_are_spread_evenly_and_never_twice():
@@ -250,9 +250,9 @@ def test_pixels_are_spread_evenly_and_never_twice():
 
 @pytest.mark.parametrize("pixels", [1, 7, 100, 5_000])
 def test_no_more_patches_than_asked_for(pixels):
-    _, sample = scene()
+    _, target = scene()
     loss = WarpedPatches(pixels=pixels)
-    counts = [len(loss.centres(replace(sample, seed=seed))) for seed in range(20)]
+    counts = [len(loss.centres(replace(target, seed=seed))) for seed in range(20)]
     room = (HEIGHT - 6) * (WIDTH - 6)
     assert max(counts) <= pixels and sum(counts) / 20 > 0.4 * min(pixels, room)
 

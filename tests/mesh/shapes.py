@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import torch
 
-from surfkit.mesh.base import Subject
+from surfkit.mesh.base import MeshInput
 from surfkit.raster.api import Maps, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
@@ -104,4 +104,4 @@ def subject(cameras, shape, **changes):
         "frame": Frame(np.array([500_000.0, 5_700_000.0, 100.0]), 0.1, metres=1.0),
         "budget_bytes": 2**30,
     }
-    return Subject(**(given | changes))
+    return MeshInput(**(given | changes))

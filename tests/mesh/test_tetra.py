@@ -9,7 +9,7 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
-from surfkit.mesh.base import Mesher, Subject
+from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.mesh.delaunay import crossing, split
 from surfkit.mesh.tetra import Tetra, triangles, used
 from surfkit.raster.api import Splats
@@ -48,7 +48,7 @@ def facing(normals: torch.Tensor) -> torch.Tensor:
     return torch.stack([w, -normals[:, 1], normals[:, 0], torch.zeros_like(w)], 1)
 
 
-def ball(kind: str = "surfel", count: int = 900, views: int = 14, **changes) -> Subject:
+def ball(kind: str = "surfel", count: int = 900, views: int = 14, **changes) -> MeshInput:
     """Splats on a ball, opaque and red, and cameras all around it."""
     normals = spread(count)
     scales = torch.full((count, 2 if kind == "surfel" else 3), 0.03)
@@ -62,7 +62,7 @@ def ball(kind: str = "surfel", count: int = 900, views: int = 14, **changes) -> 
     def draw(view):
         return rasterizer.render(splats, view.camera, 0.01, True, False).maps
 
-    given = Subject(splats, seen, draw, rasterizer, 0.01, Frame(np.zeros(3), 1.0), 1 << 30)
+    given = MeshInput(splats, seen, draw, rasterizer, 0.01, Frame(np.zeros(3), 1.0), 1 << 30)
     return replace(given, **changes)
 
 
@@ -189,7 +189,7 @@ def test_every_mesher_keeps_the_contract(name):
     check_mesher(mesher, with_priors(ball()) if mesher.needs_prior else ball())
 
 
-def with_priors(given: Subject) -> Subject:
+def with_priors(given: MeshInput) -> MeshInput:
     """Priors that say what the splats do."""
     maps = [given.draw(view) for view in given.views]
     inverses = [torch.where(m.median > 0, 1 / m.median.clamp_min(1e-9), 0.0) for m in maps]

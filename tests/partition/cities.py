@@ -2,7 +2,7 @@
 
 import torch
 
-from surfkit.partition import Sight
+from surfkit.partition import CoarseModel
 from surfkit.partition.base import Ground
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
@@ -20,7 +20,7 @@ def below(x: float, y: float, height: float = 0.5) -> Camera:
     return Camera(pose, 50.0, 50.0, 24.0, 20.0, 48, 40)
 
 
-def city(count: int = 1_500, seed: int = 0) -> Sight:
+def city(count: int = 1_500, seed: int = 0) -> CoarseModel:
     """Discs on the ground, denser to the left, and 6 x 5 cameras above them."""
     draws = torch.Generator().manual_seed(seed)
     xy = torch.rand(count, 2, generator=draws) * 2 - 1
@@ -31,4 +31,4 @@ def city(count: int = 1_500, seed: int = 0) -> Sight:
     splats = Splats("surfel", means, quats, torch.full((count, 2), 0.025), torch.full((count,), 0.9), color)
     at = [(-0.8 + 1.6 * i / 5, -0.8 + 1.6 * j / 4) for j in range(5) for i in range(6)]
     views = tuple(View(f"{i:02}.png", below(*xy), path=None) for i, xy in enumerate(at))
-    return Sight(splats, views, select("cpu")[0], 0.01)
+    return CoarseModel(splats, views, select("cpu")[0], 0.01)

@@ -14,7 +14,7 @@ import pytest
 
 from surfkit.execute.base import LOG, Job
 from surfkit.execute.remote import Outcome, attend
-from surfkit.execute.shared import MARK, errand, marked
+from surfkit.execute.shared import MARK, marked, remote_job
 
 HOST = socket.gethostname()
 
@@ -28,8 +28,8 @@ def test_an_errand_is_run(tmp_path, monkeypatch):
     seen = "import json, os\nnames = 'OMP_NUM_THREADS', 'CUDA_VISIBLE_DEVICES'\n"
     seen += "print(json.dumps([os.environ[name] for name in names]))"
     with marked([job(tmp_path, "")]) as mark:
-        assert errand(job(tmp_path, seen), mark, 2, gpu=False)() == Outcome(0, HOST)
-        assert errand(job(tmp_path, f"{seen}\nraise SystemExit(3)"), mark, 1, gpu=True)() == Outcome(3, HOST)
+        assert remote_job(job(tmp_path, seen), mark, 2, gpu=False)() == Outcome(0, HOST)
+        assert remote_job(job(tmp_path, f"{seen}\nraise SystemExit(3)"), mark, 1, gpu=True)() == Outcome(3, HOST)
     lines = (tmp_path / "000" / LOG).read_text().splitlines()
     assert list(map(json.loads, lines)) == [["2", ""], ["1", "3"]]
 
@@ -39,7 +39,7 @@ def test_another_disk(tmp_path):
     (tmp_path / f"{MARK}of-a-driver-that-was-killed").touch()
     with marked([job(tmp_path, "")]) as mark:
         assert [path.name for path in tmp_path.iterdir()] == [mark.name]
-        made = errand(job(tmp_path, ""), mark, 1, gpu=False)
+        made = remote_job(job(tmp_path, ""), mark, 1, gpu=False)
     found = made()
     assert found.status == 2
     assert found.why.startswith(f"machine {HOST}: {mark} is not there; run folder and data set must lie")
@@ -48,14 +48,14 @@ def test_another_disk(tmp_path):
 
 def test_another_version(tmp_path):
     with marked([job(tmp_path, "")]) as mark:
-        found = replace(errand(job(tmp_path, ""), mark, 1, gpu=False), version="0.0.7")()
+        found = replace(remote_job(job(tmp_path, ""), mark, 1, gpu=False), version="0.0.7")()
     assert found.status == 2 and "and the run is of 0.0.7; install the same on all machines" in found.why
 
 
 def test_told_to_end_by_someone_else(tmp_path):
     """A cluster tells every process of a job; the one that minds it then waits for its own end."""
     with marked([job(tmp_path, "")]) as mark:
-        made = errand(job(tmp_path, "raise SystemExit(130)"), mark, 1, gpu=False)
+        made = remote_job(job(tmp_path, "raise SystemExit(130)"), mark, 1, gpu=False)
         began = time.monotonic()
         assert replace(made, hold_s=0.7)().status == 130 and time.monotonic() - began > 0.7
 

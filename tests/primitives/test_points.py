@@ -8,7 +8,7 @@ from surfkit.primitives.points import Edit, Points, merge, withheld
 def points(count: int = 6) -> Points:
     params = {"means": torch.arange(3.0 * count).view(count, 3), "opacities": torch.arange(1.0 * count)}
     made = Points.fresh(params)
-    for group, size in ((made.first, 10.0), (made.second, 100.0)):
+    for group, size in ((made.exp_avg, 10.0), (made.exp_avg_sq, 100.0)):
         for name, value in params.items():
             group[name] = value + size
     made.stat("a/count").copy_(torch.arange(1.0 * count))
@@ -22,15 +22,15 @@ def mask(*rows: int, count: int = 6) -> torch.Tensor:
 def test_take_moves_every_column_with_its_row():
     taken = points().take(torch.tensor([4, 1]))
     assert taken.params["opacities"].tolist() == [4, 1]
-    assert taken.first["opacities"].tolist() == [14, 11]
-    assert taken.second["means"][:, 0].tolist() == [112, 103]
+    assert taken.exp_avg["opacities"].tolist() == [14, 11]
+    assert taken.exp_avg_sq["means"][:, 0].tolist() == [112, 103]
     assert taken.stat("a/count").tolist() == [4, 1]
 
 
 def test_new_rows_start_without_a_past():
     grown = points().append({"means": torch.ones(2, 3), "opacities": torch.full((2,), 9.0)})
     assert len(grown) == 8 and grown.params["opacities"][-2:].tolist() == [9, 9]
-    for group in (grown.first, grown.second):
+    for group in (grown.exp_avg, grown.exp_avg_sq):
         assert group["means"].shape == (8, 3) and not group["means"][-2:].any() and group["means"][:6].any()
     assert grown.stat("a/count").tolist() == [0, 1, 2, 3, 4, 5, 0, 0]
 
@@ -76,7 +76,7 @@ def test_merge_adds_nudges_and_makes_the_most_copies():
 
 def test_copies_inherit_the_nudge_and_only_the_named_forget():
     points = Points.fresh({"means": torch.arange(9.0).view(3, 3), "opacities": torch.zeros(3)})
-    points.first["means"] += 1
+    points.exp_avg["means"] += 1
     edit = Edit(
         clone=torch.tensor([0, 2, 0]), nudge={"opacities": torch.tensor([0.0, 5, 0])},
         drop=mask(0, count=3), forget=mask(2, count=3),
@@ -84,7 +84,7 @@ def test_copies_inherit_the_nudge_and_only_the_named_forget():
     after = apply(Surfel2D(), points, edit, torch.Generator())
     assert after.params["opacities"].tolist() == [5, 0, 5, 5]
     assert after.params["means"][:, 0].tolist() == [3, 6, 3, 3]
-    assert after.first["means"][:, 0].tolist() == [1, 0, 0, 0], "a copy has no past"
+    assert after.exp_avg["means"][:, 0].tolist() == [1, 0, 0, 0], "a copy has no past"
     assert points.params["opacities"].tolist() == [0, 0, 0], "the points before the edit are as they were"
 
 

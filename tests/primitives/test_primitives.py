@@ -46,7 +46,7 @@ def test_init_gives_the_columns_and_the_splats_the_rasterizer_expects(primitive)
         "means": (3,), "scales": (axes,), "quats": (4,), "opacities": (), "sh0": (1, 3), "sh_rest": (15, 3),
     }  # fmt: skip
     assert all(len(v) == 50 and v.dtype == torch.float32 and v.isfinite().all() for v in params.values())
-    splats = primitive.shape(params, 0)
+    splats = primitive.activate(params, 0)
     assert splats.scales.shape == (50, 2 if splats.kind == "surfel" else 3) and (splats.scales > 0).all()
     assert torch.allclose(splats.opacities, torch.tensor(0.1))
     rgb = splats.sh[:, 0] / (2 * math.sqrt(math.pi)) + 0.5  # the constant harmonic, from its definition
@@ -59,7 +59,7 @@ def test_shape_uses_the_harmonics_in_use_and_carries_their_gradient(primitive, d
     params = {k: v.requires_grad_() for k, v in primitive.init(cloud(5), generator()).items()}
     with torch.no_grad():
         params["sh_rest"].copy_(torch.arange(5 * 45.0).view(5, 15, 3))
-    splats = primitive.shape(params, degree)
+    splats = primitive.activate(params, degree)
     assert splats.sh.shape == (5, (degree + 1) ** 2, 3)
     assert torch.equal(splats.sh[:, 1:], params["sh_rest"][:, : (degree + 1) ** 2 - 1])
     sum(value.sum() for value in splats.tensors().values()).backward()
@@ -77,13 +77,13 @@ def test_degrees_that_do_not_exist_are_refused(degree):
 
 def test_degree_zero_trains():
     params = Gaussian3D(sh_degree=0).init(cloud(4), generator())
-    assert params["sh_rest"].shape == (4, 0, 3) and Gaussian3D(sh_degree=0).shape(params, 0).sh.shape == (4, 1, 3)
+    assert params["sh_rest"].shape == (4, 0, 3) and Gaussian3D(sh_degree=0).activate(params, 0).sh.shape == (4, 1, 3)
 
 
 def test_flat_gaussians_stay_flat():
     params = Flat3D(thickness=0.01).init(cloud(), generator())
     params["scales"][:, 0] += 2
-    scales = Flat3D(thickness=0.01).shape(params, 0).scales
+    scales = Flat3D(thickness=0.01).activate(params, 0).scales
     assert torch.allclose(scales[:, 2], 0.01 * scales[:, 1]) and (scales.argmin(-1) == 2).all()
     with pytest.raises(BadInput, match="thickness is 1.5"):
         Flat3D(thickness=1.5)
@@ -149,7 +149,7 @@ def test_children_are_drawn_from_their_parent(primitive):
     assert len(twins["means"]) == 40000
     offset = (twins["means"] - parents["means"][0]).double()
     axes = torch.from_numpy(matrix(parents["quats"][0].double().numpy()))
-    scales = primitive.shape(parents, 0).scales[0].double()
+    scales = primitive.activate(parents, 0).scales[0].double()
     scales = torch.cat([scales, scales.new_zeros(3 - len(scales))])
     wanted = axes @ (scales**2).diag() @ axes.T
     assert torch.allclose(offset.T @ offset / 40000, wanted, atol=0.03 * float(wanted.max()))
@@ -171,7 +171,7 @@ def row(primitive: Primitive) -> dict[str, torch.Tensor]:
 def edited(seed: int = 0) -> tuple[Points, Points]:
     primitive = Surfel2D(sh_degree=1)
     points = Points.fresh(primitive.init(cloud(8), generator()))
-    for size, group in enumerate((points.first, points.second)):
+    for size, group in enumerate((points.exp_avg, points.exp_avg_sq)):
         for name in group:
             group[name] += torch.arange(1.0, 9).view(-1, *[1] * (group[name].dim() - 1)) * (size + 1)
     points.stat("x").copy_(torch.arange(8.0))
@@ -187,7 +187,7 @@ def test_apply_moves_moments_and_statistics_with_their_rows():
     for name, value in before.params.items():
         assert torch.equal(after.params[name][:6], value[kept])
         assert torch.equal(after.params[name][6:8], value[[3, 5]]), "clones are exact copies"
-        for old, new in ((before.first, after.first), (before.second, after.second)):
+        for old, new in ((before.exp_avg, after.exp_avg), (before.exp_avg_sq, after.exp_avg_sq)):
             assert torch.equal(new[name][:6], old[name][kept]) and not new[name][6:].any()
     assert after.stat("x").tolist() == [1, 2, 3, 4, 5, 7, 0, 0, 0, 0]
 
@@ -209,5 +209,5 @@ def test_max_opacity_caps_and_forgets():
     before.params["opacities"].copy_(torch.linspace(-9, 9, 8))
     after = apply(Surfel2D(sh_degree=1), before, Edit(max_opacity=0.01), generator())
     assert torch.allclose(after.params["opacities"].sigmoid(), before.params["opacities"].sigmoid().clamp_max(0.01))
-    assert not after.first["opacities"].any() and not after.second["opacities"].any()
-    assert after.first["means"].any() and before.params["opacities"].max() == 9
+    assert not after.exp_avg["opacities"].any() and not after.exp_avg_sq["opacities"].any()
+    assert after.exp_avg["means"].any() and before.params["opacities"].max() == 9

@@ -9,7 +9,7 @@ import torch
 
 from surfkit import pipeline
 from surfkit.appearance import Exposure
-from surfkit.blocks.schedule import Hands
+from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.core.registry import components
@@ -25,19 +25,19 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.recipes.city import FIRST
-from surfkit.refine import Distil, Recover, Refine
+from surfkit.refine import DistilSH, PruneAndRecover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
 from surfkit.run import stage as optimise
 from surfkit.run.folder import Run
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.testing import check_refine
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.faults import Diverged, NotFinite
 from surfkit.train.stage import Stage
 
-EVERY = Every(checkpoint=2, pictures=0)
+EVERY = Intervals(checkpoint=2, pictures=0)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def data(tmp_path_factory) -> Data:
 @pytest.fixture(scope="module")
 def recipe() -> Recipe:
     """One block, then half of the points for 4 steps, then colours of degree 1 for 6."""
-    stage, recover, distil = Stage(steps=6, sh_every=1), Recover(), Distil(sh_degree=1, copies=2)
+    stage, recover, distil = Stage(steps=6, sh_every=1), PruneAndRecover(), DistilSH(sh_degree=1, copies=2)
     return Recipe(
         primitive=Gaussian3D(sh_degree=2),
         pretrain=stage,
@@ -67,7 +67,7 @@ def recipe() -> Recipe:
 @pytest.fixture(scope="module")
 def finished(data, recipe, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "run"
-    run(recipe, data, out, Hands("cpu"), EVERY)
+    run(recipe, data, out, Compute("cpu"), EVERY)
     return out
 
 
@@ -79,8 +79,8 @@ def test_what_is_left(finished):
     assert [len(state_of(finished, part).points) for part in ("tune", "refine0", "refine1")] == [200, 100, 100]
     splats = read_splats(finished / "point_cloud.ply")
     assert splats.means.shape == (100, 3) and splats.sh_rest.shape == (100, 3, 3)
-    this, state, _ = load_run(finished)
-    assert this.part == "refine1" and this.primitive.sh_degree == 1 and state.index == 6
+    loaded, state, _ = load_run(finished)
+    assert loaded.part == "refine1" and loaded.primitive.sh_degree == 1 and state.index == 6
     for folder, steps in ((finished, 6), (finished / "refine0", 4), (finished / "refine1", 6)):
         lines = map(json.loads, (folder / "events.jsonl").read_text().splitlines())
         assert [line["index"] for line in lines if line["event"] == "StepDone"] == [*range(1, steps + 1)]
@@ -94,7 +94,7 @@ def test_what_is_left(finished):
 
 def test_refinement_begins_with_the_harmonics_of_the_model(finished):
     """Its own steps are too few for any, and distillation leaves one degree."""
-    assert Recover().stage.sh_every == Distil().stage.sh_every == 1_000
+    assert PruneAndRecover().stage.sh_every == DistilSH().stage.sh_every == 1_000
     assert [state_of(finished, part).sh_degree for part in ("tune", "refine0", "refine1")] == [2, 2, 1]
 
 
@@ -108,16 +108,16 @@ def test_recovery_goes_on_from_the_merged_model(finished):
 
 def test_distillation_learns_what_the_model_drew_before(finished, data):
     """Beside the photographs too, the student is nearer to the teacher than the teacher without those harmonics is."""
-    this, student, scene = load_run(finished)
+    loaded, student, scene = load_run(finished)
     teacher = state_of(finished, "refine0")
     assert torch.equal(teacher.points.params["opacities"], student.points.params["opacities"]), "they are frozen"
-    cut = replace(teacher.points, params=this.recipe.refine[1].params(teacher.points.params))
-    before, rasterizer = replace(this, part="refine0"), select("cpu")[0]
+    cut = replace(teacher.points, params=loaded.recipe.refine[1].params(teacher.points.params))
+    before, rasterizer = replace(loaded, part="refine0"), select("cpu")[0]
     drawn = [
         optimise.drawing(run, state, rasterizer, geometry=False)
-        for run, state in ((before, teacher), (this, student), (this, replace(teacher, points=cut, sh_degree=1)))
+        for run, state in ((before, teacher), (loaded, student), (loaded, replace(teacher, points=cut, sh_degree=1)))
     ]
-    views = this.recipe.refine[1].views(scene.train, 0)
+    views = loaded.recipe.refine[1].views(scene.train, 0)
     taught, learnt, plain = (torch.stack([draw(view).color for view in views]) for draw in drawn)
     assert float((learnt - taught).abs().mean()) < 0.9 * float((plain - taught).abs().mean())
 
@@ -135,12 +135,12 @@ def test_interrupted_and_continued(finished, data, recipe, tmp_path, monkeypatch
     monkeypatch.setattr(optimise.checkpoint, "save", stop)
     for part in ("refine0", "refine1"):
         with pytest.raises(KeyboardInterrupt):
-            run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+            run(recipe, data, tmp_path, Compute("cpu"), EVERY)
         assert state_of(tmp_path, part).index == 2
         with pytest.raises(BadInput, match="stopped after step 2"):
             load_run(tmp_path)
     monkeypatch.undo()
-    run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+    run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert (tmp_path / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
 
 
@@ -154,9 +154,9 @@ def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path, monkeypatch
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=8))
     with pytest.raises(KeyboardInterrupt), monkeypatch.context() as patch:
         patch.setattr(pipeline, "tuned", interrupt)
-        run(longer, data, out, Hands("cpu"), EVERY)
+        run(longer, data, out, Compute("cpu"), EVERY)
     assert status(out).stage == "pretrain"
-    run(longer, data, out, Hands("cpu"), EVERY)
+    run(longer, data, out, Compute("cpu"), EVERY)
     assert not torch.equal(
         state_of(out, "refine0").points.params["sh0"], state_of(finished, "refine0").points.params["sh0"]
     )
@@ -182,26 +182,26 @@ def test_numbers_that_stay_infinite_name_the_rates_of_the_refinement(data, recip
 def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):
     (tmp_path / "refine0").touch()
     with pytest.raises(BadInput, match="refine0: a file, where the run keeps a folder"):
-        run(recipe, data, tmp_path, Hands("cpu"), EVERY)
+        run(recipe, data, tmp_path, Compute("cpu"), EVERY)
 
 
 def test_a_refinement_less_or_another_is_named(finished, data, recipe):
     other = replace(recipe.refine[1], copies=3)
     for refine, told in (
         (recipe.refine[:1], r"refine.1 \{.*, and this one has null"),
-        ((recipe.refine[0], other, Recover()), r"refine.1.copies 2, and this one has 3"),
+        ((recipe.refine[0], other, PruneAndRecover()), r"refine.1.copies 2, and this one has 3"),
     ):
         with pytest.raises(BadInput, match=told):
-            run(replace(recipe, refine=refine), data, finished, Hands("cpu"), EVERY)
+            run(replace(recipe, refine=refine), data, finished, Compute("cpu"), EVERY)
 
 
 def test_a_finished_run_is_refined_further(finished, data, recipe, tmp_path):
     """To the same bits as in one go, without a step of what is there made again."""
     out = tmp_path / "run"
-    run(replace(recipe, refine=recipe.refine[:1]), data, out, Hands("cpu"), EVERY)
+    run(replace(recipe, refine=recipe.refine[:1]), data, out, Compute("cpu"), EVERY)
     journals = [out / "events.jsonl", out / "blocks" / "000" / "events.jsonl", out / "refine0" / "events.jsonl"]
     before = [path.read_text().count("StepDone") for path in journals]
-    metrics = run(recipe, data, out, Hands("cpu"), EVERY)
+    metrics = run(recipe, data, out, Compute("cpu"), EVERY)
     assert [path.read_text().count("StepDone") for path in journals] == before
     assert (out / "point_cloud.ply").read_bytes() == (finished / "point_cloud.ply").read_bytes()
     assert metrics["steps"] == 6 + 6 + 4 + 6
@@ -210,15 +210,15 @@ def test_a_finished_run_is_refined_further(finished, data, recipe, tmp_path):
 def test_longer_and_refined_at_once_is_refused(data, tmp_path):
     """Of the two, the message names the refinement: it is what the folder lacks."""
     plain = Recipe(pretrain=Stage(steps=2, sh_every=1))
-    run(plain, data, tmp_path, Hands("cpu"), EVERY)
+    run(plain, data, tmp_path, Compute("cpu"), EVERY)
     with pytest.raises(BadInput, match=r"refine\.0 null"):
-        run(with_steps(replace(plain, refine=(Recover(),)), 4), data, tmp_path, Hands("cpu"), EVERY)
+        run(with_steps(replace(plain, refine=(PruneAndRecover(),)), 4), data, tmp_path, Compute("cpu"), EVERY)
 
 
 def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
     depth = replace(recipe.refine[0].stage, losses=Stage().losses | {"depth": DepthRegression()})
-    short = replace(recipe, partition=None, refine=(Recover(stage=depth),))
-    run(evolve(short, "pretrain.losses", depth.losses), data, tmp_path, Hands("cpu"), EVERY)
+    short = replace(recipe, partition=None, refine=(PruneAndRecover(stage=depth),))
+    run(evolve(short, "pretrain.losses", depth.losses), data, tmp_path, Compute("cpu"), EVERY)
     assert capsys.readouterr().err.count("has no depth priors") == 1
 
 
@@ -230,27 +230,27 @@ def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkey
         pipeline, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
     )
     stage = Stage(steps=2, sh_every=1)
-    refine = (Distil if taught else Recover)(stage=stage)
-    run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Hands("cpu"), EVERY)
+    refine = (DistilSH if taught else PruneAndRecover)(stage=stage)
+    run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Compute("cpu"), EVERY)
     assert found == [corrected]
 
 
 def test_depth_priors_teach_nothing_where_the_model_does():
     losses = Stage().losses | {"depth": DepthRegression()}
     with pytest.raises(BadInput, match="refine.1: learns from what the model draws, where depth finds no depth priors"):
-        Recipe(refine=(Recover(stage=Stage(losses=losses)), Distil(stage=Stage(losses=losses))))
+        Recipe(refine=(PruneAndRecover(stage=Stage(losses=losses)), DistilSH(stage=Stage(losses=losses))))
 
 
 def test_cameras_beside_those_of_the_photographs(data):
     scene = read(data)
-    views = Distil(jitter=0.01, copies=40).views(scene.train, 0)
+    views = DistilSH(jitter=0.01, copies=40).views(scene.train, 0)
     there = torch.stack([view.camera.centre for view in scene.train]).repeat(40, 1)
     shift = torch.stack([view.camera.centre for view in views]) - there
     assert len(views) == 40 * len(scene.train)
     assert float(shift.std()) == pytest.approx(0.01, rel=0.1) and abs(float(shift.mean())) < 0.002
     turned = [view.camera.world_to_camera[:3, :3] for view in views[: len(scene.train)]]
     assert all(torch.equal(a, b.camera.world_to_camera[:3, :3]) for a, b in zip(turned, scene.train, strict=True))
-    first, again, other = (Distil().views(scene.train, seed)[0].camera.centre for seed in (0, 0, 1))
+    first, again, other = (DistilSH().views(scene.train, seed)[0].camera.centre for seed in (0, 0, 1))
     assert torch.equal(first, again) and not torch.equal(first, other)
 
 
@@ -265,18 +265,18 @@ def test_citygaussian():
     assert DISTILLATION["opacities"].at(5, 10) == 0
 
 
-class Keeps(Distil):
+class Keeps(DistilSH):
     """Says that colours are simpler than they are."""
 
     def params(self, params):
         return params
 
 
-class Wanders(Recover):
+class Wanders(PruneAndRecover):
     """Looks from where there is no photograph."""
 
     def views(self, views, seed):
-        return Distil().views(views, seed)
+        return DistilSH().views(views, seed)
 
 
 @pytest.mark.parametrize("refine", [*(cls() for cls in components(Refine).values()), Keeps(), Wanders()])
@@ -293,4 +293,4 @@ def test_conformance(refine, data):
 @pytest.mark.parametrize("wrong", [{"sh_degree": 4}, {"jitter": -1.0}, {"copies": 0}])
 def test_settings_that_cannot_be(wrong):
     with pytest.raises(BadInput, match="distil"):
-        Distil(**wrong)
+        DistilSH(**wrong)

@@ -18,7 +18,7 @@ from surfkit.recipes.surface import SURFACE as BEST
 from surfkit.report.ablation import Row, Table, build, built_on, capped, pick, scaled
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
-LADDER = Table(
+FALLBACKS = Table(
     "ladder",
     "A kept row, one given up, and one more.",
     COARSE_BASELINE,
@@ -79,12 +79,12 @@ def test_every_row_has_its_published_figures(name):
 
 
 def test_rows_build_on_the_last_kept_one():
-    recipes = build(LADDER)
+    recipes = build(FALLBACKS)
     assert list(recipes) == ["start", "given up", "end"]
     assert [recipe.seed for recipe in recipes.values()] == [1, 2, 1]
     assert [recipe.pretrain.sh_every for recipe in recipes.values()] == [1_000, 7, 1_000]
     assert [recipe.primitive.sh_degree for recipe in recipes.values()] == [3, 3, 0]
-    assert built_on(LADDER) == {"start": None, "given up": "start", "end": "start"}
+    assert built_on(FALLBACKS) == {"start": None, "given up": "start", "end": "start"}
 
 
 def test_the_model_table_adds_up():
@@ -132,8 +132,8 @@ def test_a_row_with_a_shorter_run_stays_shorter():
 
 
 def test_rows_are_picked_by_number_or_label():
-    assert pick(LADDER, []) == ["start", "given up", "end"]
-    assert pick(LADDER, ["3", "start"]) == ["start", "end"]
+    assert pick(FALLBACKS, []) == ["start", "given up", "end"]
+    assert pick(FALLBACKS, ["3", "start"]) == ["start", "end"]
     for wrong in ("0", "4", "strt"):
         with pytest.raises(BadInput, match=f"no row named '{wrong}'.*known: start, given up, end; .* 1 to 3"):
-            pick(LADDER, [wrong])
+            pick(FALLBACKS, [wrong])

@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import components
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
-from surfkit.start.base import Known, Start
+from surfkit.start.base import Start, StartInput
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.stereo import StereoStart, normals_of, pixel_size
 from surfkit.start.voxels import Collected, Samples, apart, thinned, thinned_to
@@ -34,7 +34,7 @@ def known(farm, normals=True, spoilt=None, **changes):
         prior = DepthPrior(inverse, (inverse > 0).float(), 0.7, exact.normal.float() if normals else None)
         priors.append(spoilt(at, prior) if spoilt else prior)
     photos = [(farm.exact[view.name].color * 255).round().to(torch.uint8) for view in farm.scene.train]
-    return replace(Known(farm.scene, photos, None, priors, torch.Generator().manual_seed(0)), **changes)
+    return replace(StartInput(farm.scene, photos, None, priors, torch.Generator().manual_seed(0)), **changes)
 
 
 def surface(farm, xyz):
@@ -251,7 +251,7 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
     cloud = Cloud(torch.rand(9, 3), torch.zeros(9, 3, dtype=torch.uint8), normals, torch.linspace(0.1, 0.9, 9))
     cloud = replace(cloud, size=torch.linspace(1, 9, 9))
     for primitive in (Surfel2D(), Gaussian3D()):
-        splats = primitive.shape(primitive.init(cloud, draw), 0)
+        splats = primitive.activate(primitive.init(cloud, draw), 0)
         assert torch.allclose(splats.opacities, torch.linspace(0.1, 0.9, 9), atol=1e-6)
         assert torch.allclose(splats.scales, torch.linspace(1, 9, 9)[:, None])
     surfels = Surfel2D().shape(Surfel2D().init(cloud, draw), 0)

@@ -5,7 +5,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.primitives.points import Points
-from surfkit.train.adam import Rate, adam_step
+from surfkit.train.adam import LearningRate, adam_step
 
 
 def gradients(count: int, seed: int) -> dict[str, torch.Tensor]:
@@ -53,12 +53,12 @@ def test_columns_without_a_gradient_stay():
 
 
 def test_rates_run_along_a_line_in_the_logarithm():
-    rate = Rate(1e-2, 1e-6)
+    rate = LearningRate(1e-2, 1e-6)
     assert math.isclose(rate.at(500, 1000), 1e-4) and math.isclose(rate.at(1000, 1000), 1e-6)
-    assert Rate(0.5).at(1, 10) == Rate(0.5).at(10, 10) == 0.5 and Rate(0.0).at(3, 10) == 0
+    assert LearningRate(0.5).at(1, 10) == LearningRate(0.5).at(10, 10) == 0.5 and LearningRate(0.0).at(3, 10) == 0
 
 
 @pytest.mark.parametrize("ends", [(-1.0, None), (0.0, 1.0), (1.0, 0.0)])
 def test_rates_that_make_no_sense_are_refused(ends):
     with pytest.raises(BadInput):
-        Rate(*ends)
+        LearningRate(*ends)

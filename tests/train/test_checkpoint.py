@@ -171,7 +171,7 @@ def test_all_of_a_state_comes_back(begin, tmp_path):
 
 def test_columns_that_do_not_fit_are_named(begin, tmp_path):
     _, state = begin(STAGE)
-    state.points.first["sh0"] = state.points.first["sh0"][:-1].clone()
+    state.points.exp_avg["sh0"] = state.points.exp_avg["sh0"][:-1].clone()
     save(tmp_path / "c.safetensors", state)
     with pytest.raises(BadInput, match=r"first.sh0 has shape \(39, 1, 3\) for 40 points"):
         load(tmp_path / "c.safetensors")

@@ -37,8 +37,8 @@ class Everything(Prune):
     shown: list = field(default_factory=list)
 
     def edit(self, points, step):
-        tally = step.views.survey()
-        sizes = {len(points), len(step.shape), len(step.seen), len(step.radii), len(step.grad), len(tally.mean)}
+        tally = step.views.contributions()
+        sizes = {len(points), len(step.splats), len(step.seen), len(step.radii), len(step.grad_norm), len(tally.mean)}
         self.shown.append((sizes, int(tally.views.sum()), len(next(step.views.each(1.0, 1.0))[0])))
         half = torch.arange(len(points)) % 2 == 0
         return Edit(drop=half if step.index == 2 else None, max_opacity=0.01, forget=half)
@@ -106,7 +106,7 @@ def test_frozen_points_teach_the_others_the_same(begin):
     trainer.step(part)
     for name, value in part.points.params.items():
         assert torch.equal(value, whole.points.params[name][~rows]), name
-        assert torch.equal(part.points.second[name], whole.points.second[name][~rows]), name
+        assert torch.equal(part.points.exp_avg_sq[name], whole.points.exp_avg_sq[name][~rows]), name
     _, alone = begin(QUIET)
     alone = cut(alone, rows)
     alone.frozen = {}

@@ -9,7 +9,7 @@ from surfkit.densify import ADC, Elongation
 from surfkit.losses.photometric import SSIM
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
-from surfkit.train.adam import Rate
+from surfkit.train.adam import LearningRate
 from surfkit.train.stage import RATES, Stage
 
 NEEDLES = 8
@@ -22,7 +22,7 @@ def grown(begin, truth, filters) -> list[tuple[int, int]]:
     their place can change: however many there are, each keeps its gradient.
     """
     densify = ADC(threshold=0.02, start=5, until=1_000, every=10, cull_opacity=0.0, reset_every=1_000, filters=filters)
-    rates = {name: Rate(1e-5 if name == "means" else 0.0) for name in RATES}
+    rates = {name: LearningRate(1e-5 if name == "means" else 0.0) for name in RATES}
     losses = {"ssim": SSIM(weight=1.0)}  # its gradient, unlike that of L1, is small where little is wrong
     stage = Stage(steps=120, losses=losses, densify=densify, rates=rates, sh_every=1_000)
     trainer, state = begin(stage, Surfel2D(sh_degree=0))

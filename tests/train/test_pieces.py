@@ -48,7 +48,9 @@ def test_what_is_written_in_pieces_is_read_as_any_other(path):
     pieces.save(there, stored.state, (piece.points.params for piece in stored.pieces()))
     found = checkpoint.load(there)
     assert all(torch.equal(found.points.params[name], value) for name, value in true.points.params.items())
-    assert all((value == 0).all() for group in (found.points.first, found.points.second) for value in group.values())
+    assert all(
+        (value == 0).all() for group in (found.points.exp_avg, found.points.exp_avg_sq) for value in group.values()
+    )
     checkpoint.save(path, found)
     with checkpoint.reading(path) as (_, one), checkpoint.reading(there) as (_, other):
         assert one == other, "digest and facts"

@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Reprojection, WarpedPatches
-from surfkit.losses.base import Sample
+from surfkit.losses.base import Target
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
@@ -16,7 +16,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
-from surfkit.train.adam import Rate
+from surfkit.train.adam import LearningRate
 from surfkit.train.rig import CHOICE, Rig
 from surfkit.train.stage import RATES, Stage, Trainer
 
@@ -80,11 +80,11 @@ class Counting:
 class Watched(Reprojection):
     """Keeps the samples it is given."""
 
-    given: list[Sample] = []
+    given: list[Target] = []
 
-    def __call__(self, maps, sample):
-        self.given.append(sample)
-        return Reprojection.__call__(self, maps, sample)
+    def __call__(self, maps, target):
+        self.given.append(target)
+        return Reprojection.__call__(self, maps, target)
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +123,8 @@ def test_one_more_view_is_rendered_in_steps_that_count_and_in_no_other(world):
         done = trainer.step(state)
         drawn = trainer.rasterizer.cameras[before:]
         assert len(drawn) == (2 if index > 2 and index % 2 == 0 else 1), index
-        assert ("patches" in done.losses) == (index % 4 == 0) and drawn[0] is done.sample.view.camera
-        assert done.sample.neighbour is None, "nothing holds the second view after the step"
+        assert ("patches" in done.losses) == (index % 4 == 0) and drawn[0] is done.target.view.camera
+        assert done.target.neighbour is None, "nothing holds the second view after the step"
     trainer, state = started(world, {"l1": L1()})
     list(trainer.run(state))
     assert len(trainer.rasterizer.cameras) == 12
@@ -135,23 +135,23 @@ def test_a_second_view_is_another_one_and_constant(world):
     trainer, state = started(world, {"l1": L1(), "watched": Watched(start=0, every=1)})
     masks = [torch.full((36, 48), at % 2 == 0) for at in range(20)]
     list(replace(trainer, masks=masks).run(state))
-    seconds = [sample.neighbour for sample in Watched.given]
+    seconds = [target.neighbour for target in Watched.given]
     assert len(seconds) == 12 and all(seconds)
     names = [view.name for view in trainer.views]
-    for sample, second in zip(Watched.given, seconds, strict=True):
-        assert second.view.name != sample.view.name
+    for target, second in zip(Watched.given, seconds, strict=True):
+        assert second.view.name != target.view.name
         assert set(second.maps.present()) == {"alpha", "depth", "median", "normal"}
         assert not any(value.requires_grad for value in second.maps.present().values())
         at = names.index(second.view.name)
         assert torch.equal((second.photo * 255).round().to(torch.uint8), trainer.photos[at])
         assert second.mask is masks[at]
-    assert len({sample.seed for sample in Watched.given}) == 12
+    assert len({target.seed for target in Watched.given}) == 12
 
 
 @pytest.mark.parametrize("every", [1, 2, 4])
 def test_all_good_neighbours_take_turns(world, every):
     trainer, state = started(world, PAIRED)
-    splats = trainer.primitive.shape(state.points.params, 0)
+    splats = trainer.primitive.activate(state.points.params, 0)
     maps = trainer.rasterizer.render(splats, trainer.views[7].camera, 0.005).maps
     good = {trainer.views[at].name for at in trainer.rig.neighbours(7, maps.median)}
     turns = [
@@ -176,7 +176,7 @@ def test_damaged_neighbours_are_passed_over(world):
     trainer, state = started(world, {"l1": L1(), "watched": Watched(start=0, every=1)})
     done = list(replace(trainer, photos=Damaged(trainer.photos)).run(state))
     good = {view.name for view in trainer.views[::2]}
-    shown = [one.sample.view.name for one in done]
+    shown = [one.target.view.name for one in done]
     assert set(shown) <= good and {s.neighbour.view.name for s in Watched.given if s.neighbour} <= good
     assert len(state.skipped) == len(set(state.skipped)) > 0
 
@@ -199,13 +199,13 @@ def test_a_run_that_goes_on_has_the_same_bits(world, tmp_path):
 
 def mean_error(trainer, state, loss) -> float:
     """Of all views and their best neighbours, with all pixels."""
-    splats = trainer.primitive.shape(state.points.params, 0)
+    splats = trainer.primitive.activate(state.points.params, 0)
     values = []
     for at, view in enumerate(trainer.views):
         maps = trainer.rasterizer.render(splats, view.camera, 0.005).maps
         second = trainer.neighbour(replace(state, index=at), splats, at, maps)
-        sample = Sample(view, trainer.photos[at] / 255, neighbour=second)
-        values.append(float(loss(maps, sample)))
+        target = Target(view, trainer.photos[at] / 255, neighbour=second)
+        values.append(float(loss(maps, target)))
     return sum(values) / len(values)
 
 
@@ -214,7 +214,7 @@ def test_training_lowers_the_loss(world, loss, share):
     settings = {"start": 0, "every": 1, "weight": 1.0, "depth": "expected"}
     settings |= {"stride": 1} if loss is Reprojection else {"radius": 2}
     trainer, state = started(
-        world, {"pair": loss(**settings)}, noise=0.015, steps=40, rates=RATES | {"means": Rate(1e-3)}
+        world, {"pair": loss(**settings)}, noise=0.015, steps=40, rates=RATES | {"means": LearningRate(1e-3)}
     )
     before = mean_error(trainer, state, loss(**settings))
     list(trainer.run(state))

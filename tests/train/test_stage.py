@@ -13,7 +13,7 @@ from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.surface import NormalConsistency
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Edit
-from surfkit.train.adam import Rate
+from surfkit.train.adam import LearningRate
 from surfkit.train.faults import Diverged
 from surfkit.train.progress import psnr
 from surfkit.train.stage import RATES, Stage
@@ -23,7 +23,7 @@ QUIET = Stage(steps=40, densify=None, sh_every=10)
 
 def scored(trainer, state) -> float:
     """Mean PSNR over all views."""
-    splats = trainer.primitive.shape(state.points.params, 0)
+    splats = trainer.primitive.activate(state.points.params, 0)
     return sum(
         psnr(trainer.rasterizer.render(splats, view.camera, 0.005, geometry=False).maps.color, photo.float() / 255)
         for view, photo in zip(trainer.views, trainer.photos, strict=True)
@@ -42,18 +42,18 @@ def test_training_raises_psnr(begin, primitive):
 
 def test_one_step_moves_parameters_against_a_numerical_gradient(begin):
     stage = replace(
-        QUIET, losses={"l1": L1(weight=0.8), "ssim": SSIM(weight=0.2)}, rates={k: Rate(1e-3) for k in RATES}
+        QUIET, losses={"l1": L1(weight=0.8), "ssim": SSIM(weight=0.2)}, rates={k: LearningRate(1e-3) for k in RATES}
     )
     trainer, state = begin(stage)
     before = {name: value.clone() for name, value in state.points.params.items()}
     done = trainer.step(state)
     # colours, because the blend has no jumps in them
-    slopes = state.points.first["sh0"] * 10  # the first step leaves a tenth of the gradient there
+    slopes = state.points.exp_avg["sh0"] * 10  # the first step leaves a tenth of the gradient there
 
     def loss(way: float) -> float:
         params = before | {"sh0": before["sh0"] + way * slopes.sign()}
-        maps = trainer.rasterizer.render(trainer.primitive.shape(params, 0), done.sample.view.camera, 0.005).maps
-        return float(0.8 * L1()(maps, done.sample) + 0.2 * SSIM()(maps, done.sample))
+        maps = trainer.rasterizer.render(trainer.primitive.activate(params, 0), done.target.view.camera, 0.005).maps
+        return float(0.8 * L1()(maps, done.target) + 0.2 * SSIM()(maps, done.target))
 
     assert float(slopes.abs().sum()) == pytest.approx((loss(0.01) - loss(-0.01)) / 0.02, rel=0.02)
     moved = state.points.params["sh0"] - before["sh0"]
@@ -151,7 +151,7 @@ def test_regularizers_add_their_gradient_to_that_of_the_losses(begin):
     opacity, scales = before["opacities"].sigmoid(), before["scales"].exp()
     assert done.losses["opacity"] == pytest.approx(0.3 * float(opacity.mean()))
     assert done.losses["size"] == pytest.approx(0.2 * float(scales.mean()))
-    found = {name: state.points.first[name] * 10 for name in ("opacities", "scales")}
+    found = {name: state.points.exp_avg[name] * 10 for name in ("opacities", "scales")}
     assert torch.allclose(found["opacities"], 0.3 * opacity * (1 - opacity) / len(opacity), rtol=1e-3, atol=1e-7)
     assert torch.allclose(found["scales"], 0.2 * scales / scales.numel(), rtol=1e-3, atol=1e-7)
 
@@ -245,7 +245,7 @@ def test_damaged_photographs_are_passed_over_and_named_once(begin, monkeypatch):
     said = []
     monkeypatch.setattr("surfkit.train.stage.emit", said.append)
     trainer = replace(trainer, photos=Damaged(trainer.photos))
-    shown = [done.sample.view.name for done in trainer.run(state)]
+    shown = [done.target.view.name for done in trainer.run(state)]
     assert sorted(state.skipped) == [1, 4] and len(shown) == 12
     assert {shown.count(name) for name in ("0.png", "2.png", "3.png", "5.png")} == {3}, "all others, evenly"
     assert [event.name for event in said if isinstance(event, PhotoSkipped)] in (["1.png", "4.png"], ["4.png", "1.png"])
@@ -270,7 +270,7 @@ def test_stages_that_make_no_sense_are_refused(begin):
     with pytest.raises(BadInput, match="sh_every is 0"):
         Stage(sh_every=0)
     with pytest.raises(BadInput, match="the points have means"):
-        begin(Stage(rates={"means": Rate(1.0)}))
+        begin(Stage(rates={"means": LearningRate(1.0)}))
 
 
 def test_a_view_that_sees_nothing_changes_no_colour_and_gives_no_signal(begin):

@@ -1,6 +1,6 @@
 import torch
 
-from surfkit.train.views import Order, Survey
+from surfkit.train.views import Order, ViewContributions
 
 
 def test_every_view_is_shown_once_in_each_round_in_an_order_of_the_generator():
@@ -39,9 +39,11 @@ def test_contribution_is_the_mean_over_views_of_means_over_pixels():
     from surfkit.scene.scene import View
 
     splats = Splats("surfel", *[None] * 3, torch.ones(3), None)
-    survey = Survey([View("a", 4.0, None), View("b", 8.0, None)], Fixed(), splats, 0.005)
-    tally = survey.survey(0.25, 0.75)
-    assert tally.mean.tolist() == [2, 0, 3] and tally.peak.tolist() == [2, 0, 4] and len(survey) == 2
+    contributions = ViewContributions([View("a", 4.0, None), View("b", 8.0, None)], Fixed(), splats, 0.005)
+    tally = contributions.contributions(0.25, 0.75)
+    assert tally.mean.tolist() == [2, 0, 3] and tally.peak.tolist() == [2, 0, 4] and len(contributions) == 2
     assert tally.hits.tolist() == [6, 0, 4] and tally.views.tolist() == [2, 0, 2]
-    assert survey.survey(0.25, 0.75) is tally and survey.rasterizer.calls == 2, "one pass for all who ask"
-    assert [amount.tolist() for amount, _ in survey.each(0.25, 0.75)] == [[6, 0, 4], [6, 0, 8]]
+    assert contributions.contributions(0.25, 0.75) is tally and contributions.rasterizer.calls == 2, (
+        "one pass for all who ask"
+    )
+    assert [amount.tolist() for amount, _ in contributions.each(0.25, 0.75)] == [[6, 0, 4], [6, 0, 8]]

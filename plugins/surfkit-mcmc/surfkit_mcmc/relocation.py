@@ -70,14 +70,14 @@ class Relocation(Densify):
 
     def _noise(self, step: Step, draw: torch.Generator) -> Tensor:
         """(N, 3) drawn with the covariance squared, so within the disc of a surfel; faint points move the most."""
-        shape = step.shape
+        shape = step.splats
         spread = torch.nn.functional.pad(shape.scales, (0, 3 - shape.scales.shape[1])) ** 2
         normal = torch.randn(len(shape), 3, generator=draw).to(spread)
         faint = torch.sigmoid(100 * (1 - shape.opacities - 0.995))
         return self.noise * step.rates["means"] * faint[:, None] * rotated(spread * normal, shape.quats)
 
     def _move(self, points: Points, step: Step, nudge: dict[str, Tensor], draw: torch.Generator) -> Edit:
-        opacities, scales = step.shape.opacities, step.shape.scales
+        opacities, scales = step.splats.opacities, step.splats.scales
         dead = opacities <= self.dead
         alive = admitted(self.filters, step, opacities * ~dead) * opacities
         count = len(opacities)

@@ -20,7 +20,7 @@ from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
 from surfkit.testing import check_component, check_policy
-from surfkit.train.adam import Rate
+from surfkit.train.adam import LearningRate
 from surfkit.train.stage import RATES, Trainer
 
 N = 400
@@ -45,8 +45,8 @@ def crowd(primitive=None, dead: int = 60) -> tuple[Points, Step]:
     params["opacities"] = torch.linspace(-2, 3, N)
     params["opacities"][:dead] = -8
     step = Step(
-        index=1_000, steps=30_000, seen=torch.ones(N, dtype=torch.bool), shape=primitive.shape(params, 1),
-        grad=torch.zeros(N), radii=torch.ones(N), image_px=100, views=None, rates={"means": 1e-4}, seed=7,
+        index=1_000, steps=30_000, seen=torch.ones(N, dtype=torch.bool), splats=primitive.activate(params, 1),
+        grad_norm=torch.zeros(N), radii=torch.ones(N), image_px=100, views=None, rates={"means": 1e-4}, seed=7,
     )  # fmt: skip
     return Points.fresh(params), step
 
@@ -93,7 +93,7 @@ def test_the_dead_move_and_a_few_more_come_up_to_the_cap():
     assert Relocation(cap=N - 100).edit(points, step).clone.sum() == 60, "no point is taken away"
     opacity = (points.params["opacities"] + edit.nudge["opacities"]).sigmoid()
     moved, number = edit.clone > 0, edit.clone + 1
-    assert torch.allclose(1 - (1 - opacity[moved]) ** number[moved], step.shape.opacities[moved], atol=1e-4)
+    assert torch.allclose(1 - (1 - opacity[moved]) ** number[moved], step.splats.opacities[moved], atol=1e-4)
     assert (edit.nudge["scales"][moved] < 0).all() and not edit.nudge["scales"][~moved].any()
 
 
@@ -109,10 +109,10 @@ def test_a_move_is_carried_out_as_asked():
 def test_points_nearly_dead_and_wholly_opaque_move_too(logit):
     primitive, (points, step) = Gaussian3D(sh_degree=1), crowd()
     points.params["opacities"][60:] = logit  # 0.0055, less than twice that of the dead; 1 in float32
-    step = replace(step, shape=primitive.shape(points.params, 1))
+    step = replace(step, splats=primitive.activate(points.params, 1))
     edit = Relocation(noise=0).edit(points, step)
     after = (points.params["opacities"] + edit.nudge["opacities"]).sigmoid()[edit.clone > 0]
-    wanted, _ = shared(step.shape.opacities, edit.clone + 1, 0.00505)
+    wanted, _ = shared(step.splats.opacities, edit.clone + 1, 0.00505)
     assert torch.allclose(after, wanted[edit.clone > 0], rtol=1e-4) and (after > 0.005).all()
 
 
@@ -132,9 +132,9 @@ def test_steps_between_moves_only_add_noise():
 
 def test_needles_are_not_moved_onto():
     points, step = crowd()
-    scales = step.shape.scales.clone()
+    scales = step.splats.scales.clone()
     scales[100:, 1:] *= 1e-3
-    edit = Relocation(filters=(Elongation(),)).edit(points, replace(step, shape=replace(step.shape, scales=scales)))
+    edit = Relocation(filters=(Elongation(),)).edit(points, replace(step, splats=replace(step.splats, scales=scales)))
     assert edit.clone[60:100].any() and not edit.clone[100:].any()
 
 
@@ -153,17 +153,17 @@ def test_without_a_live_point_nothing_moves():
 
 def test_noise_has_the_covariance_squared_and_stays_within_a_disc():
     points, step = crowd(Surfel2D(sh_degree=1))
-    shape = step.shape
+    shape = step.splats
     turn = torch.tensor([0.5, 0.5, 0.5, 0.5]).expand(N, 4)  # x to y, y to z, z to x
     shape = replace(shape, quats=turn, scales=torch.tensor([0.1, 0.2]).expand(N, 2), opacities=torch.full((N,), 0.005))
-    step = replace(step, shape=shape, index=1)
+    step = replace(step, splats=shape, index=1)
     noise = torch.cat(
         [Relocation(noise=1e4).edit(points, replace(step, seed=seed)).nudge["means"] for seed in range(100)]
     )
     assert not noise[:, 0].abs().max() > 1e-6, "none along the normal"
     deviation = 1e4 * 1e-4 * 0.5 * torch.tensor([0.01, 0.04])
     assert torch.allclose(noise[:, 1:].std(0), deviation, rtol=0.03)
-    opaque = replace(step, shape=replace(shape, opacities=torch.full((N,), 0.5)))
+    opaque = replace(step, splats=replace(shape, opacities=torch.full((N,), 0.5)))
     assert Relocation(noise=1e4).edit(points, opaque).nudge["means"].abs().max() < 1e-6
 
 
@@ -184,7 +184,7 @@ def test_a_short_training_with_the_recipe():
     photo = (127 + 120 * torch.stack([torch.sin(x / 3), torch.sin(y / 4), torch.cos((x + y) / 5)])).to(torch.uint8)
     cloud = Cloud(0.6 * (torch.rand(50, 3, generator=draw) - 0.5), torch.full((50, 3), 127, dtype=torch.uint8))
     moves = Relocation(cap=120, start=10, until=150, every=10, growth=0.2)
-    rates = RATES | {"means": Rate(1.6e-4)}
+    rates = RATES | {"means": LearningRate(1.6e-4)}
     stage = replace(recipe.pretrain, steps=160, densify=moves, rates=rates, sh_every=1_000)
     trainer = Trainer(stage, recipe.primitive, views, [photo, photo], rasterizer)
     state = trainer.begin(Points.fresh(recipe.primitive.init(cloud, draw)), draw)

@@ -11,7 +11,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
 from surfkit.evaluate.images.measure import Draw, psnr, similarity
-from surfkit.evaluate.images.seen import Sight
+from surfkit.evaluate.images.seen import Counted
 
 Masks = dict[str, Tensor]
 """(H, W) bool of each part, by its name."""
@@ -20,11 +20,11 @@ FEWEST = 64
 
 
 def measure_parts(
-    found: Iterable[Sight],
-    parts: Callable[[Sight], Masks],
+    found: Iterable[Counted],
+    parts: Callable[[Counted], Masks],
     draw: Draw,
-    photo_of: Callable[[Sight], Tensor],
-    mask_of: Callable[[Sight], Tensor | None],
+    photo_of: Callable[[Counted], Tensor],
+    mask_of: Callable[[Counted], Tensor | None],
 ) -> dict[str, dict[str, Any]]:
     """PSNR and SSIM of each part, as means over photographs that count by their pixels in it, and its share of all.
 
@@ -66,10 +66,10 @@ def _means(sums: dict[str, float], total: int) -> dict[str, float | None]:
     return {**figures, "share": sums["pixels"] / max(1, total)}
 
 
-def by_views(least: tuple[int, ...]) -> Callable[[Sight], Masks]:
+def by_views(least: tuple[int, ...]) -> Callable[[Counted], Masks]:
     """Parts seen by so many training views or more, and by fewer, for each of some numbers."""
 
-    def parts(sight: Sight) -> Masks:
+    def parts(sight: Counted) -> Masks:
         found = {}
         for number in least:
             enough = sight.full(sight.counts >= number)
@@ -79,14 +79,14 @@ def by_views(least: tuple[int, ...]) -> Callable[[Sight], Masks]:
     return parts
 
 
-def by_seams(near: Callable[[Sight], Tensor]) -> Callable[[Sight], Masks]:
+def by_seams(near: Callable[[Counted], Tensor]) -> Callable[[Counted], Masks]:
     """Parts near the borders of blocks and elsewhere; pixels that show no place are in neither.
 
     Args:
         near: (h, w) bool of a photograph's places.
     """
 
-    def parts(sight: Sight) -> Masks:
+    def parts(sight: Counted) -> Masks:
         known, close = torch.isfinite(sight.places[..., 0]), near(sight)
         return {"near": sight.full(known & close), "elsewhere": sight.full(known & ~close)}
 

@@ -44,7 +44,7 @@ class Depths:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Counted:
     """What a held-out photograph shows.
 
     Attributes:
@@ -63,7 +63,7 @@ class Sight:
         return torch.nn.functional.interpolate(mask[None, None].float(), size=size, mode="nearest")[0, 0] > 0.5
 
 
-def sights(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> Iterator[Sight]:
+def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> Iterator[Counted]:
     """What each held-out photograph shows, and how many training views see it.
 
     A place counts as seen if it lies in a training view's picture, and the depth there, of the nearest pixel or between
@@ -82,7 +82,7 @@ def sights(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> I
         batches[at].append(view)
     batches = [batch for batch in batches if batch]
     for number, batch in enumerate(batches):
-        found = [Sight(view, *_begun(view, depths.of)) for view in batch]
+        found = [Counted(view, *_begun(view, depths.of)) for view in batch]
         for done, view in enumerate(train, 1):
             small = reduced(view)
             depth = depths.of(small)
