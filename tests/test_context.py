@@ -11,7 +11,7 @@ from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F4
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.forecast import InitialModel, begun, memory_of, need
+from surfkit.blocks.forecast import BlockPoints, begun, memory_of, need
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -228,9 +228,9 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         found[context] = Found(memory_of(ctx, block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.points, block.begins
         wanted = {
-            "densified": InitialModel(both, 0, False),
-            "tuned": InitialModel(own, both - own, False),
-            "frozen": InitialModel(own, both - own, True),
+            "densified": BlockPoints(both, 0, False),
+            "tuned": BlockPoints(own, both - own, False),
+            "frozen": BlockPoints(own, both - own, True),
         }
         assert begun(ctx, block) == wanted[context]
         write_state(ctx.place(0), begun_points=own + 7 if context == "frozen" else both + 7)

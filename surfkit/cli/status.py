@@ -83,7 +83,7 @@ def _where(block: Block) -> str:
     parts += [f"{clock(seconds)} left" for seconds in [left] if seconds is not None]
     parts.append(f"{block.views} views")
     parts += [f"attempt {block.attempts}"] * (block.attempts > 1)
-    parts += [f"for want of memory {'; then '.join(block.eased)}"] * bool(block.eased)
+    parts += [f"for want of memory {'; then '.join(block.reduced)}"] * bool(block.reduced)
     return ", ".join(parts)
 
 

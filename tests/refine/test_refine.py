@@ -153,7 +153,7 @@ def test_a_longer_run_refines_anew(finished, data, recipe, tmp_path, monkeypatch
     shutil.copytree(finished, out)
     longer = replace(recipe, pretrain=replace(recipe.pretrain, steps=8))
     with pytest.raises(KeyboardInterrupt), monkeypatch.context() as patch:
-        patch.setattr(pipeline, "tuned", interrupt)
+        patch.setattr(pipeline, "tune_blocks", interrupt)
         run(longer, data, out, Compute("cpu"), EVERY)
     assert status(out).stage == "pretrain"
     run(longer, data, out, Compute("cpu"), EVERY)

@@ -254,7 +254,7 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
         splats = primitive.activate(primitive.init(cloud, draw), 0)
         assert torch.allclose(splats.opacities, torch.linspace(0.1, 0.9, 9), atol=1e-6)
         assert torch.allclose(splats.scales, torch.linspace(1, 9, 9)[:, None])
-    surfels = Surfel2D().shape(Surfel2D().init(cloud, draw), 0)
+    surfels = Surfel2D().activate(Surfel2D().init(cloud, draw), 0)
     z = torch.tensor([0.0, 0.0, 1.0]).expand(9, 3)
     assert torch.allclose(rotated(z, surfels.quats), normals, atol=1e-5)
 
