@@ -23,7 +23,6 @@ from surfkit.evaluate.metrics import read_metrics
 from surfkit.execute.base import Inline
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
-from surfkit.primitives.base import to_table
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
@@ -166,7 +165,7 @@ def export(run: Run, state: StageState, scene: Scene) -> None:
     params = run.stage.finished(state)
     write_cameras(run.cameras, scene)
     emit(FileWritten(run.cameras, "cameras"))
-    write_splats(run.cloud, to_table(run.primitive, params).in_input_frame(scene.frame), frame=scene.frame)
+    write_splats(run.cloud, run.primitive.table(params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(run.cloud, "points"))
 
 

@@ -8,7 +8,7 @@ import torch
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.densify.base import Prune
 from surfkit.losses.base import Loss
-from surfkit.primitives.points import Edit
+from surfkit.primitives.edit import Edit
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.testing import check_component, check_loss, check_policy, check_primitive
 

@@ -7,11 +7,15 @@ from abc import abstractmethod
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 
 
 class Appearance(Component):
     """Turns the colours of the scene into those of one photograph, with a few numbers learned per photograph."""
+
+    def refuse_unfit(self, primitive: Primitive) -> None:  # noqa: B027 (some fit all)
+        """BadInput if the colours of this primitive cannot be changed by it; asked before anything is trained."""
 
     @abstractmethod
     def begin(self, count: int) -> Tensor:

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
+from surfkit.core.registry import name_of
 from surfkit.core.schedule import log_linear
+from surfkit.primitives.base import Primitive
 from surfkit.primitives.points import Columns
 
 SH0 = 0.28209479177387814
@@ -29,6 +31,14 @@ class Exposure(Appearance):
     def __post_init__(self) -> None:
         if not (self.start > 0 and self.end > 0):
             raise BadInput(f"appearance: the rate goes from {self.start} to {self.end}; both must be above 0")
+
+    def refuse_unfit(self, primitive: Primitive) -> None:
+        """See `Appearance.refuse_unfit`."""
+        if lacking := {"sh0", "sh_rest"} - set(primitive.columns()):
+            raise BadInput(
+                f"appearance exposure changes the columns sh0 and sh_rest, and primitive {name_of(primitive)} has no "
+                f"{' and '.join(sorted(lacking))}; choose appearance:none or another primitive"
+            )
 
     def begin(self, count: int) -> Tensor:
         """(V, 3, 4): a matrix and an offset each, which change nothing."""

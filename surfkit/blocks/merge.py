@@ -14,7 +14,7 @@ from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.execute.state import read_state, write_state
 from surfkit.partition.merge import Merge, Pieces, Share
 from surfkit.partition.plan import Plan
-from surfkit.primitives.points import Points
+from surfkit.primitives.points import Columns, Points
 from surfkit.run.context import RunContext
 from surfkit.train import checkpoint
 from surfkit.train import streaming as pieces
@@ -39,27 +39,31 @@ def put_together(ctx: RunContext, blocks: Plan, coarse: Stored) -> bool:
     merge = Merge(blocks.cells, finished(recipe.pretrain, coarse), tuned_pieces, skipped)
     shares = merge.shares()
     note(ctx, shares)
-    points = sum(share.kept for share in shares)
     parts = [result.state for result in (coarse, *found.values())]
-    pieces.save(final.checkpoint, together(ctx, parts, points), merge.pieces())
+    pieces.save(final.checkpoint, together(ctx, parts, shares), merge.pieces())
     emit(FileWritten(final.checkpoint, "merged blocks"))
     return True
 
 
 def finished(stage: Stage, stored: Stored) -> Pieces:
     """The points of a state as they leave its stage."""
-    return lambda: (stage.finished(piece) for piece in stored.pieces())
+    return lambda: (
+        {name: value for name, value in stage.finished(piece).items() if name in piece.points.params}
+        for piece in stored.pieces()
+    )
 
 
-def together(ctx: RunContext, parts: Sequence[StageState], points: int) -> StageState:
+def together(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Share]) -> StageState:
     """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
-    recipe = ctx.run.recipe
+    recipe, points = ctx.run.recipe, sum(share.kept for share in shares)
     like = parts[0].points.params
     params = {
         name: torch.empty(points, *value.shape[1:], dtype=value.dtype, device="meta") for name, value in like.items()
     }
     order, generator = Order(len(ctx.scene.train)), torch.Generator().manual_seed(recipe.seed)
-    state = StageState(Points(params, {}, {}), order, generator, index=recipe.tune.steps)
+    state = StageState(
+        Points(params, {}, {}, shared=shared_mean(parts, shares)), order, generator, index=recipe.tune.steps
+    )
     state.seconds = sum(part.seconds for part in parts)
     state.cpu_seconds = sum(part.cpu_seconds for part in parts)
     state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
@@ -67,6 +71,24 @@ def together(ctx: RunContext, parts: Sequence[StageState], points: int) -> Stage
     if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
         state.looks = fresh_looks(recipe.tune.appearance, len(ctx.scene.train))
     return state
+
+
+def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns:
+    """What belongs to no point: the mean over the blocks that were tuned, each weighted by the points that it gives.
+
+    `parts` are the coarse model and the tuned blocks, in the order of those shares that the coarse model did not fill.
+    """
+    tuned = [share.kept for share in shares if not share.filled]
+    weights, total = (tuned, sum(tuned)) if sum(tuned) else ([1] * len(tuned), len(tuned))
+    coarse, *blocks = [part.points.shared for part in parts]
+    if not blocks:
+        return coarse
+    return {
+        name: sum(block[name].double() * weight for block, weight in zip(blocks, weights, strict=True))
+        .div(total)
+        .to(value)
+        for name, value in coarse.items()
+    }
 
 
 def sound(ctx: RunContext, index: int) -> Stored | None:

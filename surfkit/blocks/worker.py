@@ -27,6 +27,7 @@ from surfkit.execute.remote import CRASHED, DRIVER, INTERRUPTED, POLL_S
 from surfkit.execute.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
 from surfkit.partition.base import CoarseModel
 from surfkit.partition.plan import Plan
+from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns
 from surfkit.readers import extract
 from surfkit.run.context import RunContext
@@ -144,9 +145,8 @@ class Start:
         """Their raw parameters, and the degree of harmonics that the coarse model has come to."""
         coarse = coarse_model(self.ctx.run)
         kept = [self.wanted(piece) for piece in coarse.pieces()]
-        return InitialModel(
-            {name: torch.cat([part[name] for part in kept]) for name in kept[0]}, coarse.state.sh_degree
-        )
+        params = {name: torch.cat([part[name] for part in kept]) for name in kept[0]}
+        return InitialModel(params | coarse.state.points.shared, coarse.state.sh_degree)
 
     def wanted(self, piece: StageState) -> Columns:
         """Those among some points of the coarse model."""
@@ -155,9 +155,9 @@ class Start:
         own = self.owns(params["means"])
         rows = own.clone()
         for view in self.views if self.part != "own" else ():
-            rows |= ctx.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
+            rows |= sight.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False).seen
         rows &= ~own if self.part == "around" else True
-        return {name: value[rows] for name, value in params.items()}
+        return {name: params[name][rows] for name in piece.points.params}
 
     def owns(self, means: Tensor) -> Tensor:
         """(N,) bool, which of (N, 3) positions are the block's own."""
@@ -176,8 +176,8 @@ def coarse_model_of(ctx: RunContext, coarse: StageState) -> CoarseModel:
     """The coarse model, or some points of it, to be looked at."""
     stage = ctx.run.recipe.pretrain
     splats = ctx.run.recipe.primitive.activate(stage.finished(coarse), coarse.sh_degree)
-    splats = replace(splats, **{name: value.detach() for name, value in splats.tensors().items()})
-    return CoarseModel(splats, ctx.scene.train, ctx.rasterizer, stage.near)
+    draws = drawn_by(ctx.run.recipe.primitive, ctx.rasterizer)
+    return CoarseModel(splats.detached(), ctx.scene.train, draws, stage.near)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.export.ply import write_splats
 from surfkit.pipeline import load_run
-from surfkit.primitives.base import to_table
 from surfkit.run.folder import refuse_no_run
 from surfkit.train.faults import full_disk_in_one_line
 
@@ -44,7 +43,7 @@ class Export:
             raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
         if path.exists() and self.out is not None and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        table = to_table(run.primitive, run.stage.finished(state)).in_input_frame(scene.frame)
+        table = run.primitive.table(run.stage.finished(state)).in_input_frame(scene.frame)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
         print(f"wrote {len(state.points):,} points to {path}")

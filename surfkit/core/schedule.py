@@ -134,3 +134,22 @@ def _element_hints(hint: Any, value: Any) -> list[Any]:
         if get_origin(bare) is tuple and isinstance(value, tuple):
             return [args[0]] * count if args[1:] == (...,) else list(args)
     return [Any] * count
+
+
+@dataclass(frozen=True)
+class LearningRate:
+    """A learning rate."""
+
+    start: float
+    """At the first step."""
+
+    end: float | None = None
+    """At the last step, reached along a straight line in the logarithm; constant if unset."""
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or (self.end is not None and (self.end <= 0 or self.start == 0)):
+            raise BadInput(f"a rate goes from {self.start} to {self.end}; rates must be positive (a constant may be 0)")
+
+    def at(self, index: int, steps: int) -> float:
+        """The rate of step `index` of 1..`steps`."""
+        return self.start if self.end is None else log_linear(self.start, self.end, index / steps)

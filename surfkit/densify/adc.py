@@ -13,7 +13,8 @@ from surfkit.core.registry import choice
 from surfkit.core.schedule import StepCount, Steps
 from surfkit.densify.base import Densify, Filter, Step, admitted
 from surfkit.primitives.base import SHRINK
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 
 GRAD, SEEN, SIZE = "adc/grad", "adc/seen", "adc/size"
 START_STRETCH, EVERY_STRETCH = 15.0, 30.0

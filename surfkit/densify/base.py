@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
 
 

@@ -11,7 +11,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.schedule import StepCount, Steps
 from surfkit.densify.base import Prune, Step
 from surfkit.densify.trim import lowest
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import StepCount, Steps
 from surfkit.densify.base import Prune, Step, Views
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 
 RELEASED_TOP = 5
 

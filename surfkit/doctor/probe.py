@@ -25,8 +25,9 @@ from surfkit.core.memory import peak_memory_bytes
 from surfkit.densify.base import Prune, Step
 from surfkit.evaluate.images.pictures import panel, write_picture
 from surfkit.export.ply import write_splats
-from surfkit.primitives.base import Primitive, apply, to_table
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.edit import Edit, apply
+from surfkit.primitives.points import Points
 from surfkit.raster.select import Device, select
 from surfkit.readers.capture import library
 from surfkit.readers.depth_prior import DepthPrior
@@ -229,7 +230,7 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     held = sum(photo.numel() for photo in photos) + sum(mask.numel() for mask in masks if mask is not None)
     held += sum((20 if normals else 8) * prior.inverse.numel() for prior in priors or ())
     generator, start = torch.Generator().manual_seed(recipe.seed), time.perf_counter()
-    points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator))
+    points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator), recipe.primitive.shared())
     yield Started(photo_seconds, time.perf_counter() - start, held)
     churn = EditStress(tuple(part.index + 1 for part in job.parts))
     stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
@@ -300,11 +301,11 @@ def _written(trainer: Trainer, state: StageState) -> Written:
         folder, start = Path(name), time.perf_counter()
         checkpoint.save(folder / "checkpoint.safetensors", state)
         save_seconds, start = time.perf_counter() - start, time.perf_counter()
-        splats = trainer.primitive.activate(state.points.params, state.sh_degree)
+        splats = trainer.primitive.activate(state.points.all_params(), state.sh_degree)
         maps = trainer.rasterizer.render(splats, view.camera, trainer.stage.near, True).maps
         write_picture(folder / "picture.png", panel(trainer.photos[0], maps))
         draw_seconds = time.perf_counter() - start
-        write_splats(folder / "cloud.ply", to_table(trainer.primitive, state.points.params))
+        write_splats(folder / "cloud.ply", trainer.primitive.table(state.points.all_params()))
         sizes = {path.stem: path.stat().st_size for path in folder.iterdir()}
     per_point = sizes["checkpoint"] / count, sizes["cloud"] / count
     return Written(*per_point, sizes["picture"], draw_seconds, save_seconds, peak_memory_bytes())

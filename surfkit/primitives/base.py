@@ -1,19 +1,21 @@
-"""What a kind of primitive decides: how points begin, what splats they are, and how one becomes two."""
+"""What a primitive decides: its trainable columns, the splats they stand for, how they split and how they are drawn."""
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import Component
+from surfkit.core.registry import Component, kebab
 from surfkit.export.ply import SplatTable
-from surfkit.primitives.points import Columns, Edit, Points
-from surfkit.raster.api import Splats
+from surfkit.primitives.columns import SIGMOID, Activation, Column
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import KINDS, Rasterizer, Render, Splats
+from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
 
 SHRINK = 1.6
@@ -22,10 +24,10 @@ SHRINK = 1.6
 
 @dataclass(frozen=True)
 class Primitive(Component):
-    """A kind of splat. Its raw parameters are columns of `Points`.
+    """A kind of splat. Its raw parameters are columns of `Points`: one is "means", (N, 3) positions in local units.
 
-    Columns: means (N, 3) local units; scales (N, 2 or 3) natural log; quats (N, 4) wxyz of any length; opacities (N,)
-    logit; sh0 (N, 1, 3); sh_rest (N, K - 1, 3) with K = (sh_degree + 1)^2.
+    The methods that are not abstract suit splats whose columns "scales" and "opacities", where they have such, hold one
+    number for each scale and opacity of `activate`; others replace them.
     """
 
     sh_degree: int = 3
@@ -36,16 +38,109 @@ class Primitive(Component):
             raise BadInput(f"primitive.sh_degree is {self.sh_degree}; it must be 0, 1, 2 or 3")
 
     @abstractmethod
+    def columns(self) -> Mapping[str, Column]:
+        """The trainable parameters by name; `standard_columns` gives those of 3DGS."""
+
+    @abstractmethod
     def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
-        """Raw parameters of one point per cloud point."""
+        """Raw parameters of a point for each of a cloud, and the shared ones; `init.seeds` gives the standard ones."""
 
     @abstractmethod
     def activate(self, params: Columns, degree: int) -> Splats:
-        """Activated splats, with the autograd graph to `params`, using harmonics up to `degree`."""
+        """The splats that raw parameters stand for, with the autograd graph to `params`.
 
-    @abstractmethod
+        Args:
+            params: Raw columns of N points, and the shared ones.
+            degree: Use spherical harmonics up to this degree.
+        """
+
     def split(self, params: Columns, generator: torch.Generator) -> Columns:
-        """Raw parameters of the children of M points: 2 M rows, the first children of all, then the second."""
+        """Raw parameters of the children of M points: 2 M rows, the first children of all, then the second.
+
+        By default two children for each point, at places drawn from the point's own Gaussian, smaller by SHRINK. The
+        draws come from `generator` on the CPU, so that the device does not change them.
+        """
+        splats = self.activate(params, 0)
+        scales = torch.nn.functional.pad(splats.scales, (0, 3 - splats.scales.shape[1]))
+        twin = {name: torch.cat([value, value]) for name, value in self.per_point(params).items()}
+        draw = torch.randn(2 * len(scales), 3, generator=generator).to(scales)
+        shift = rotated(draw * torch.cat([scales, scales]), torch.cat([splats.quats, splats.quats]))
+        return self.scaled(self.moved(twin, shift), 1 / SHRINK)
+
+    def moved(self, params: Columns, shift: Tensor) -> Columns:
+        """Raw parameters of the points moved by (N, 3) local units."""
+        return params | {"means": params["means"] + shift}
+
+    def scaled(self, params: Columns, factor: Tensor | float) -> Columns:
+        """Raw parameters of the points with all scales `factor` times as large; one for all, or (N,)."""
+        raw = params["scales"]
+        each = factor.view(-1, *[1] * (raw.dim() - 1)).to(raw) if isinstance(factor, Tensor) else factor
+        return params | {"scales": self._activation("scales").times(raw, each)}
+
+    def with_opacities(self, params: Columns, opacities: Tensor) -> Columns:
+        """Raw parameters of the points with (N,) opacities between 0 and 1; NaN leaves a point's as it is."""
+        raw = params["opacities"]
+        wanted = self._activation("opacities").inverse(opacities.double()).to(raw)
+        return params | {"opacities": torch.where(opacities.isnan(), raw, wanted.view_as(raw))}
+
+    def render(
+        self,
+        splats: Splats,
+        camera: Camera,
+        rasterizer: Rasterizer,
+        near: float,
+        geometry: bool = True,
+        distortion: bool = True,
+    ) -> Render:
+        """Draw splats that `activate` gave, as `Rasterizer.render` does; by default `rasterizer` does it.
+
+        A primitive that no rasterizer knows draws itself here (`raster.autograd` has what helps), and so does one that
+        needs the camera, such as levels of detail.
+        """
+        return rasterizer.render(splats, camera, near, geometry, distortion)
+
+    def table(self, params: Columns) -> SplatTable:
+        """The points as PLY files of splats hold them, local frame.
+
+        Raises:
+            BadInput: Such files have no place for these splats.
+        """
+        with torch.no_grad():
+            splats = self.activate(params, self.sh_degree)
+            if splats.kind not in KINDS:
+                raise BadInput(
+                    f"splats of kind {splats.kind!r} have no place in a PLY file of splats, which holds "
+                    f"{' and '.join(KINDS)}s; primitive {kebab(type(self).__name__)} needs a `table` of its own"
+                )
+            exact = "opacities" in params and self._activation("opacities") is SIGMOID
+            return SplatTable(
+                kind=splats.kind,
+                means=splats.means,
+                quats=splats.quats,
+                log_scales=splats.scales.log(),
+                opacity_logits=params["opacities"] if exact else logits(splats.opacities),
+                sh0=splats.sh[:, 0],
+                sh_rest=splats.sh[:, 1:],
+                antialias=splats.antialias,
+            )
+
+    def per_point(self, params: Columns) -> Columns:
+        """The parameters that belong to points."""
+        shared = self.shared()
+        return {name: value for name, value in params.items() if name not in shared}
+
+    def shared(self) -> frozenset[str]:
+        """Names of the parameters that belong to no point."""
+        return frozenset(name for name, column in self.columns().items() if column.shared)
+
+    def _activation(self, name: str) -> Activation:
+        found = self.columns().get(name)
+        if found is None:
+            raise BadInput(
+                f"primitive {kebab(type(self).__name__)} has no column {name!r}: it needs `scaled`, `with_opacities`, "
+                "`split` and `table` of its own"
+            )
+        return found.activation
 
 
 def harmonics(params: Columns, degree: int) -> Tensor:
@@ -56,81 +151,14 @@ def harmonics(params: Columns, degree: int) -> Tensor:
     return torch.cat([params["sh0"], rest if rest.shape[1] == used else rest[:, :used]], dim=1)
 
 
+def logits(opacities: Tensor) -> Tensor:
+    """(N,) finite logits of opacities from 0 to 1, in their own type."""
+    return torch.logit(opacities.double().clamp(1e-9, 1 - 1e-9)).to(opacities)
+
+
 def rotated(vectors: Tensor, quats: Tensor) -> Tensor:
     """(N, 3) vectors turned by (N, 4) quaternions wxyz of any length."""
     quats = torch.nn.functional.normalize(quats, dim=-1)
     w, axis = quats[:, :1], quats[:, 1:]
     twice = 2 * torch.linalg.cross(axis, vectors)
     return vectors + w * twice + torch.linalg.cross(axis, twice)
-
-
-def children(params: Columns, scales: Tensor, generator: torch.Generator) -> Columns:
-    """Two children per point, drawn from the point's own Gaussian and smaller by SHRINK.
-
-    Args:
-        params: Raw columns of M points.
-        scales: (M, 3) standard deviations along the point's axes, local units; 0 where the point has no extent.
-        generator: Where the draws come from; on the CPU, so that the device does not change them.
-    """
-    twin = {name: torch.cat([value, value]) for name, value in params.items()}
-    draw = torch.randn(2 * len(scales), 3, generator=generator).to(scales)
-    twin["means"] = twin["means"] + rotated(draw * torch.cat([scales, scales]), twin["quats"])
-    twin["scales"] = twin["scales"] - math.log(SHRINK)
-    return twin
-
-
-def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Generator) -> Points:
-    """Points after an edit: the kept in their order, then clones, then children. Moments and statistics follow rows."""
-    points, added, keep = _nudged(points, edit), [], None
-    if edit.clone is not None and edit.clone.any():
-        rows = torch.arange(len(points)).to(edit.clone.device).repeat_interleave(edit.clone.to(torch.int64))
-        added.append({name: value[rows] for name, value in points.params.items()})
-    if edit.split is not None and edit.split.any():
-        rows = {name: value[edit.split] for name, value in points.params.items()}
-        added.append(primitive.split(rows, generator))
-        keep = ~edit.split
-    if edit.drop is not None and edit.drop.any():
-        keep = ~edit.drop if keep is None else keep & ~edit.drop
-    if keep is not None:
-        points = points.take(keep)
-    if added:
-        points = points.append({name: torch.cat([rows[name] for rows in added]) for name in points.params})
-    return points if edit.max_opacity is None else _dimmed(points, edit.max_opacity)
-
-
-def to_table(primitive: Primitive, params: Columns) -> SplatTable:
-    """The points as files hold them, local frame."""
-    splats = primitive.activate({name: value.detach() for name, value in params.items()}, 0)
-    return SplatTable(
-        kind=splats.kind,
-        means=splats.means,
-        quats=splats.quats,
-        log_scales=splats.scales.log(),
-        opacity_logits=params["opacities"].detach(),
-        sh0=params["sh0"].detach()[:, 0],
-        sh_rest=params["sh_rest"].detach(),
-        antialias=splats.antialias,
-    )
-
-
-def _nudged(points: Points, edit: Edit) -> Points:
-    """Points whose parameters have been moved and whose moments have been forgotten, where the edit asks for it."""
-    params, moments = points.params, [points.exp_avg, points.exp_avg_sq]
-    if edit.nudge is not None:
-        params = params | {name: params[name] + shift for name, shift in edit.nudge.items()}
-    if edit.forget is not None and edit.forget.any():
-        kept = ~edit.forget
-        moments = [{k: v * kept.view(-1, *[1] * (v.dim() - 1)) for k, v in group.items()} for group in moments]
-    return Points(params, *moments, points.stats)
-
-
-def _dimmed(points: Points, most: float) -> Points:
-    """Points with opacities of at most `most`, whose optimiser starts anew for the opacities."""
-    logit = math.log(most / (1 - most))
-    zero = torch.zeros_like(points.params["opacities"])
-    return Points(
-        points.params | {"opacities": points.params["opacities"].clamp_max(logit)},
-        points.exp_avg | {"opacities": zero},
-        points.exp_avg_sq | {"opacities": zero.clone()},
-        points.stats,
-    )

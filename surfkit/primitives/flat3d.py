@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.base import Primitive, harmonics
+from surfkit.primitives.columns import Column, standard_columns
 from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
@@ -34,9 +35,13 @@ class Flat3D(Primitive):
         if not 0 < self.thickness < 1:
             raise BadInput(f"primitive.thickness is {self.thickness}; it must lie between 0 and 1")
 
+    def columns(self) -> dict[str, Column]:
+        """The standard ones."""
+        return standard_columns(2, self.sh_degree)
+
     def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
         """Thin discs facing along the cloud's normals, or any way when it has none."""
-        params = seeds(cloud, axes=2, sh_degree=self.sh_degree)
+        params = seeds(self.columns(), cloud)
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)
         return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
 
@@ -51,10 +56,6 @@ class Flat3D(Primitive):
             sh=harmonics(params, degree),
             antialias=self.antialias,
         )
-
-    def split(self, params: Columns, generator: torch.Generator) -> Columns:
-        """Children inside the parent."""
-        return children(params, self._three(params["scales"]), generator)
 
     def _three(self, raw: Tensor) -> Tensor:
         """(N, 3) scales from two raw ones."""

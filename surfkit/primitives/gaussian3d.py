@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.base import Primitive, harmonics
+from surfkit.primitives.columns import Column, standard_columns
 from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
@@ -20,10 +21,14 @@ class Gaussian3D(Primitive):
     antialias: bool = False
     """Dim splats smaller than a pixel by what the 0.3 px blur adds to them."""
 
+    def columns(self) -> dict[str, Column]:
+        """The standard ones."""
+        return standard_columns(3, self.sh_degree)
+
     def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
         """Balls."""
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
-        return seeds(cloud, axes=3, sh_degree=self.sh_degree) | {"quats": quats}
+        return seeds(self.columns(), cloud) | {"quats": quats}
 
     def activate(self, params: Columns, degree: int) -> Splats:
         """Gaussians."""
@@ -36,7 +41,3 @@ class Gaussian3D(Primitive):
             sh=harmonics(params, degree),
             antialias=self.antialias,
         )
-
-    def split(self, params: Columns, generator: torch.Generator) -> Columns:
-        """Children inside the parent."""
-        return children(params, params["scales"].exp(), generator)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.primitives.columns import Column
 from surfkit.primitives.points import Columns
 from surfkit.scene.scene import Cloud
 
@@ -22,26 +23,37 @@ ALONE = 0.01
 """Size of a new point without neighbours, local units."""
 
 
-def seeds(cloud: Cloud, axes: int, sh_degree: int) -> Columns:
-    """Every raw column but the rotations: one point per cloud point, round, of its colour and opacity."""
+def seeds(columns: Mapping[str, Column], cloud: Cloud) -> Columns:
+    """The standard raw columns but the rotations: one point per cloud point, round, of its colour and opacity.
+
+    Args:
+        columns: What the primitive declares. Of "means", "scales", "opacities", "sh0" and "sh_rest" those are made that
+            it has, by its activations.
+        cloud: N points.
+    """
     count = len(cloud.xyz)
     if count == 0:
         raise BadInput("the scene has no sparse points to start from; triangulate some (COLMAP point_triangulator)")
     sizes = gaps(cloud.xyz) if cloud.size is None else cloud.size.float().clamp_min(SMALLEST)
-    return {
+    opacities = torch.full((count,), OPACITY, dtype=torch.float64) if cloud.opacity is None else cloud.opacity.float()
+    activated = {
         "means": cloud.xyz.float().clone(),
-        "scales": sizes.log()[:, None].repeat(1, axes),
-        "opacities": opacity_logits(cloud),
-        "sh0": ((cloud.rgb.float() / 255 - 0.5) / SH_C0)[:, None],
-        "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        "scales": sizes,
+        "opacities": opacities,
+        "sh0": (cloud.rgb.float() / 255 - 0.5) / SH_C0,
+        "sh_rest": torch.zeros(count, 1, 3),
+    }
+    return {
+        name: _spread(column.activation.inverse(activated[name]).float(), column.shape)
+        for name, column in columns.items()
+        if name in activated
     }
 
 
-def opacity_logits(cloud: Cloud) -> Tensor:
-    """(N,) logits of the cloud's opacities; of OPACITY where it has none."""
-    if cloud.opacity is None:
-        return torch.full((len(cloud.xyz),), math.log(OPACITY / (1 - OPACITY)))
-    return torch.logit(cloud.opacity.float())
+def _spread(values: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """(N, *shape), the same values for all that has none of its own."""
+    missing = len(shape) + 1 - values.dim()
+    return values.reshape(len(values), *[1] * missing, *values.shape[1:]).expand(-1, *shape).contiguous().clone()
 
 
 def gaps(xyz: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from surfkit.primitives.base import Primitive, children, harmonics
+from surfkit.primitives.base import Primitive, harmonics
+from surfkit.primitives.columns import Column, standard_columns
 from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
@@ -17,9 +18,13 @@ from surfkit.scene.scene import Cloud
 class Surfel2D(Primitive):
     """Flat discs with exact ray intersection: clean surfaces (2DGS, Huang et al. 2024)."""
 
+    def columns(self) -> dict[str, Column]:
+        """The standard ones."""
+        return standard_columns(2, self.sh_degree)
+
     def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
         """Discs facing along the cloud's normals, or any way when it has none."""
-        params = seeds(cloud, axes=2, sh_degree=self.sh_degree)
+        params = seeds(self.columns(), cloud)
         anyhow = torch.randn(len(cloud.xyz), 4, generator=generator)  # uniform over all rotations
         return params | {"quats": anyhow if cloud.normals is None else facing(cloud.normals)}
 
@@ -33,8 +38,3 @@ class Surfel2D(Primitive):
             opacities=params["opacities"].sigmoid(),
             sh=harmonics(params, degree),
         )
-
-    def split(self, params: Columns, generator: torch.Generator) -> Columns:
-        """Children in the parent's plane."""
-        scales = params["scales"].exp()
-        return children(params, torch.cat([scales, torch.zeros_like(scales[:, :1])], dim=1), generator)

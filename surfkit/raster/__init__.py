@@ -1,0 +1,14 @@
+"""Pictures of splats, and the way back to their gradients."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """Rasterizers, by name."""
+    from surfkit.raster.native import NativeRasterizer
+    from surfkit.raster.reference import Reference
+
+    return {"native": NativeRasterizer, "reference": Reference}

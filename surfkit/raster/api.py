@@ -14,13 +14,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.core.registry import Component
 from surfkit.scene.camera import Camera
 
 ALPHA_MAX = float(np.float32(0.99))
@@ -29,10 +31,14 @@ T_MIN = float(np.float32(1e-4))
 CUTOFF = math.sqrt(2 * math.log(255))
 """Sigmas at which a splat of opacity 1 falls to ALPHA_MIN."""
 
+STANDARD = ("means", "quats", "scales", "opacities", "sh")
+"""Tensors that all splats have."""
+
 EDGE_ON = 2e-3
 """Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
 
-Kind = Literal["surfel", "gaussian"]
+KINDS = ("surfel", "gaussian")
+"""What the rasterizers of surfkit draw: flat discs (2DGS) and ellipsoids (3DGS)."""
 
 
 @dataclass(frozen=True)
@@ -40,34 +46,64 @@ class Splats:
     """N splats in activated values.
 
     Attributes:
-        kind: "surfel" is a flat disc (2DGS), "gaussian" an ellipsoid (3DGS).
+        kind: "surfel" is a flat disc (2DGS), "gaussian" an ellipsoid (3DGS); primitives that draw themselves have more.
         means: (N, 3) world.
         quats: (N, 4) wxyz.
         scales: (N, 2) for surfels, (N, 3) for gaussians; local units, positive.
         opacities: (N,) in [0, 1].
         sh: (N, K, 3) spherical harmonics with K in {1, 4, 9, 16}.
         antialias: Gaussians only: lower the opacity by what the 0.3 px dilation adds to the footprint.
+        extra: Further tensors (N, ...) by name, for primitives that draw themselves.
+        shared: Further tensors that belong to no splat.
     """
 
-    kind: Kind
+    kind: str
     means: Tensor
     quats: Tensor
     scales: Tensor
     opacities: Tensor
     sh: Tensor
     antialias: bool = False
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
+    shared: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.means)
 
     def and_then(self, others: Splats) -> Splats:
         """These and others of the same kind, in this order."""
-        rest = others.tensors()
-        return replace(self, **{name: torch.cat([value, rest[name]]) for name, value in self.tensors().items()})
+        return self._with(lambda value, other: torch.cat([value, other]), others)
+
+    def detached(self) -> Splats:
+        """The same values without an autograd graph."""
+        shared = {name: value.detach() for name, value in self.shared.items()}
+        return replace(self._with(lambda value, _: value.detach(), self), shared=shared)
+
+    def first(self, count: int) -> Splats:
+        """The first so many of them."""
+        return self._with(lambda value, _: value[:count], self)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five tensors by name, in the order of the fields."""
-        return {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+        """The five standard tensors by name, in the order of the fields."""
+        return {name: getattr(self, name) for name in STANDARD}
+
+    def named(self) -> dict[str, Tensor]:
+        """All tensors by name: the standard ones, then those of `extra` and `shared`."""
+        return self.tensors() | dict(self.extra) | dict(self.shared)
+
+    def with_named(self, tensors: Mapping[str, Tensor]) -> Splats:
+        """The same kind of splats with other tensors, as `named` gives them."""
+        standard = {name: tensors[name] for name in STANDARD}
+        extra, shared = ({name: tensors[name] for name in group} for group in (self.extra, self.shared))
+        return replace(self, **standard, extra=extra, shared=shared)
+
+    def _with(self, change: Callable[[Tensor, Tensor], Tensor], others: Splats) -> Splats:
+        """The same with each tensor of (N, ...) changed."""
+        rest = others.tensors()
+        standard = {name: change(value, rest[name]) for name, value in self.tensors().items()}
+        return replace(
+            self, **standard, extra={name: change(value, others.extra[name]) for name, value in self.extra.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -113,6 +149,7 @@ class Gradients:
         signal: (N, 2) of the total loss.
         chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels; None if no second
             cotangent was given.
+        extra: By the `extra` and `shared` tensors of the splats that have an influence, by name.
     """
 
     means: Tensor
@@ -122,10 +159,15 @@ class Gradients:
     sh: Tensor
     signal: Tensor
     chosen: Tensor | None = None
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The five gradients by name, in the order of `Splats.tensors`."""
-        return {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+        """The five standard gradients by name, in the order of `Splats.tensors`."""
+        return {name: getattr(self, name) for name in STANDARD}
+
+    def named(self) -> dict[str, Tensor]:
+        """All gradients by name."""
+        return self.tensors() | dict(self.extra)
 
 
 class Render(ABC):
@@ -156,8 +198,22 @@ class Render(ABC):
         """
 
 
-class Rasterizer(ABC):
-    """Draws splats."""
+@dataclass(frozen=True)
+class Rasterizer(Component):
+    """Draws splats on one kind of device. The device chooses among those that are registered; a recipe does not."""
+
+    device: ClassVar[str] = "cpu"
+    """Where it draws: "cpu" or "cuda"."""
+    rank: ClassVar[int] = 0
+    """Of those for one device, the one of the highest rank that can run is taken."""
+
+    def missing(self) -> str | None:
+        """Why it cannot run on this machine, and what to do, in one sentence; None if it can."""
+        return None
+
+    @abstractmethod
+    def title(self) -> str:
+        """What run.json calls it, such as "cpu avx512"."""
 
     @abstractmethod
     def render(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.native import module
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
@@ -18,8 +19,24 @@ MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
 """In the order of `api.Maps`; the kernels make the first 2, the first 5 or all of them."""
 
 
+@dataclass(frozen=True)
 class NativeRasterizer(Rasterizer):
     """Draws on the CPU with SIMD on `torch.get_num_threads()` threads; their number does not change a bit."""
+
+    rank: ClassVar[int] = 10
+
+    def missing(self) -> str | None:
+        """See `Rasterizer.missing`."""
+        if native.module() is not None:
+            return None
+        return (
+            "surfkit was installed without its compiled rasterizer (no C++ compiler was found); install GCC or Clang, "
+            "then surfkit again"
+        )
+
+    def title(self) -> str:
+        """See `Rasterizer.title`."""
+        return f"cpu {native.module().kernels_in_use()}"
 
     def render(
         self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
@@ -47,11 +64,11 @@ class _Pass:
     """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn."""
 
     def __init__(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> None:
-        self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         validate(splats, values=False)
+        self.arrays = [t.detach().to("cpu", torch.float32).contiguous() for t in splats.tensors().values()]
         self.seen = torch.empty(len(splats), dtype=torch.bool)
         self.radii = torch.empty(len(splats), dtype=torch.float32)
-        self.native = module().Pass(
+        self.native = native.module().Pass(
             splats.kind == "surfel",
             self.arrays,
             camera.world_to_camera.double().flatten().tolist(),

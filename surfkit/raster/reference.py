@@ -127,8 +127,13 @@ def _blend(
     return block, risky, touched
 
 
+@dataclass(frozen=True)
 class Reference(Rasterizer):
     """Draws with `draw`, in the precision of the splats; slow, and right."""
+
+    def title(self) -> str:
+        """See `Rasterizer.title`."""
+        return f"cpu reference ({torch.__version__})"
 
     def render(
         self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True

@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
 
-import torch
-
-from surfkit import native
 from surfkit.core.check import BadInput
+from surfkit.core.registry import components, unknown
 from surfkit.raster.api import Rasterizer
-from surfkit.raster.native import NativeRasterizer
 
-Device = Literal["auto", "cpu", "cuda"]
+Device = str
+"""auto, cpu, cuda, or the name of a registered rasterizer."""
+DEVICES = ("auto", "cpu", "cuda")
 
 
 def select(device: Device = "auto") -> tuple[Rasterizer, str]:
-    """A rasterizer for the device, and its name for run.json, such as "cpu avx512"."""
-    if device == "cuda":
-        raise BadInput("--device cuda: the CUDA rasterizer is not part of this version; use --device cpu")
-    if native.module() is not None:
-        return NativeRasterizer(), f"cpu {native.module().kernels_in_use()}"
-    from surfkit.raster.reference import Reference
+    """A rasterizer for a device or of a name, and its title for run.json, such as "cpu avx512".
 
-    warnings.warn(
-        "surfkit was installed without its compiled rasterizer (no C++ compiler was found): the reference in torch "
-        "draws instead, about a hundred times slower; install GCC or Clang, then surfkit again",
-        stacklevel=2,
-    )
-    return Reference(), f"cpu reference ({torch.__version__})"
+    Raises:
+        BadInput: None draws there, or the one of that name cannot run here.
+    """
+    known = {name: kind() for name, kind in components(Rasterizer).items()}
+    if device in known:
+        if why := known[device].missing():
+            raise BadInput(f"--device {device}: {why}")
+        return known[device], known[device].title()
+    if device not in DEVICES:
+        raise BadInput(unknown("--device", device, (*DEVICES, *known)))
+    there = [each for each in known.values() if device in ("auto", each.device)]
+    there.sort(key=lambda each: (each.device == "cuda", each.rank), reverse=True)
+    if not there:
+        raise BadInput(f"--device {device}: no rasterizer for it is part of this version; use --device cpu")
+    lacking = []
+    for each in there:
+        why = each.missing()
+        if why is None:
+            for text in lacking:
+                warnings.warn(f"{text}: {each.title()} draws instead, about a hundred times slower", stacklevel=2)
+            return each, each.title()
+        lacking.append(why)
+    raise BadInput(f"--device {device}: {lacking[0]}")

@@ -7,7 +7,7 @@ import math
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import Splats
+from surfkit.raster.api import KINDS, Splats
 
 
 def validate(splats: Splats, values: bool = True) -> None:
@@ -16,6 +16,12 @@ def validate(splats: Splats, values: bool = True) -> None:
     Raises:
         BadInput: Naming the tensor, the first wrong row and what is allowed.
     """
+    if splats.kind not in KINDS:
+        raise BadInput(
+            f"splats of kind {splats.kind!r}: the rasterizers draw {' and '.join(KINDS)}s; the primitive needs a "
+            "`render` of its own, and what asks for contributions (trim, importance) or opacity fields (mesh:tetra) "
+            "does not fit it"
+        )
     count = len(splats)
     columns = 2 if splats.kind == "surfel" else 3
     wanted = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": (), "sh": None}

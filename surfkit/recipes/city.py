@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
 from surfkit.densify.signal import LossGradient
@@ -14,12 +15,12 @@ from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.assign import SSIMDifference
 from surfkit.partition.grid import ContractedGrid
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.refine.light import DistilSH, PruneAndRecover
-from surfkit.train.adam import LearningRate
-from surfkit.train.stage import RATES, Stage
+from surfkit.train.stage import Stage
 
 FILTERS = (Elongation(min_ratio=0.01),)
 LOSSES = {
@@ -60,7 +61,7 @@ CITY = replace(
         COARSE.pretrain,
         losses=TUNED_LOSSES,
         prune=(Trim(ratio=0.025),),
-        rates=RATES | {"means": LearningRate(6.4e-5, 6.4e-7), "scales": LearningRate(4e-3)},
+        rates={"means": LearningRate(6.4e-5, 6.4e-7), "scales": LearningRate(4e-3)},
     ),
     # The paper does not say what becomes of points around a block. On shibuya-synth at an eighth of the size, two
     # blocks, 300 steps each stage, two seeds: densified 17.75 and 17.57 dB, tuned 18.13 and 18.22, frozen 17.94 and
@@ -72,7 +73,7 @@ CITY = replace(
 SHORT = replace(
     CITY,
     about="CityGaussianV2 for runs of a few thousand steps: blocks keep the rates of pretraining and are not trimmed",
-    tune=replace(CITY.tune, prune=(), rates=RATES),
+    tune=replace(CITY.tune, prune=(), rates={}),
 )
 
 SMALL = replace(
@@ -102,7 +103,7 @@ STREET = replace(
         COARSE.pretrain,
         losses=LOSSES | {"depth": DepthRegression(start=1.0, end=0.1)},
         densify=ADC(threshold=5e-5, start=4_000, every=1_000, reset_every=20_000, filters=FILTERS),
-        rates=RATES | {"means": LearningRate(1.6e-5, 1.6e-6), "scales": LearningRate(1e-3)},
+        rates={"means": LearningRate(1.6e-5, 1.6e-6), "scales": LearningRate(1e-3)},
     ),
     partition=ContractedGrid(blocks=(5, 4)),
     assign=SSIMDifference(threshold=0.01),
@@ -112,7 +113,7 @@ STREET = replace(
         losses=TUNED_LOSSES | {"depth": DepthRegression(start=0.5, end=0.025)},
         densify=ADC(threshold=7.5e-5, until=30_000, every=1_000, reset_every=30_000, filters=FILTERS),
         prune=(),
-        rates=RATES | {"means": LearningRate(8e-6, 8e-7), "scales": LearningRate(2.5e-3)},
+        rates={"means": LearningRate(8e-6, 8e-7), "scales": LearningRate(2.5e-3)},
     ),
 )
 

@@ -23,6 +23,9 @@ class Refine(Component):
     stage: Stage = field(default_factory=Stage)
     """The optimisation."""
 
+    def refuse_unfit(self, primitive: Primitive) -> None:  # noqa: B027 (most fit all)
+        """BadInput if a model of this primitive cannot go through it; asked before anything is trained."""
+
     def primitive(self, primitive: Primitive) -> Primitive:
         """What the points are from then on, given what they were."""
         return primitive

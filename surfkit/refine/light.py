@@ -9,13 +9,15 @@ from typing import ClassVar
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.registry import name_of
+from surfkit.core.schedule import LearningRate
 from surfkit.densify.prune import Importance
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.points import Columns
 from surfkit.refine.base import Refine
 from surfkit.scene.scene import View
-from surfkit.train.adam import LearningRate
-from surfkit.train.stage import RATES, Stage
+from surfkit.train.stage import Stage
 
 
 def slowing(rates: dict[str, float], to: float) -> dict[str, LearningRate]:
@@ -74,6 +76,14 @@ class DistilSH(Refine):
     def primitive(self, primitive: Primitive) -> Primitive:
         """The same with fewer harmonics."""
         return replace(primitive, sh_degree=min(self.sh_degree, primitive.sh_degree))
+
+    def refuse_unfit(self, primitive: Primitive) -> None:
+        """See `Refine.refuse_unfit`."""
+        if "sh_rest" not in primitive.columns():
+            raise BadInput(
+                f"distil cuts the column sh_rest, which primitive {name_of(primitive)} does not have; leave it out "
+                "(refine.N:none), or choose another primitive"
+            )
 
     def params(self, params: Columns) -> Columns:
         """Without the higher harmonics."""

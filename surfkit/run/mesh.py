@@ -21,6 +21,7 @@ from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require, simplified
+from surfkit.primitives.drawing import drawn_by
 from surfkit.raster.api import Rasterizer
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
@@ -94,14 +95,15 @@ def subject(
     """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
     stage = run.stage
     splats = run.primitive.activate(stage.finished(state), state.sh_degree)
+    draws = drawn_by(run.primitive, rasterizer)
     masks = mask_cache(scene.train, budget_bytes // 4)
     wanted = mesher is not None and mesher.needs_prior
     priors = read_priors(run.data, scene, budget_bytes // 4) if wanted else None
     return MeshInput(
         splats=splats,
         views=scene.train,
-        draw=lambda view: rasterizer.render(splats, view.camera, stage.near, distortion=False).maps,
-        rasterizer=rasterizer,
+        draw=lambda view: draws.render(splats, view.camera, stage.near, distortion=False).maps,
+        rasterizer=draws,
         near=stage.near,
         frame=scene.frame,
         budget_bytes=budget_bytes,

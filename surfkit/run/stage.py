@@ -15,6 +15,7 @@ from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.evaluate.images.along import Along
 from surfkit.evaluate.images.measure import Draw
+from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select
@@ -131,7 +132,9 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         began = time.perf_counter(), time.process_time()
         cloud = job.cloud() if job.cloud else job.scene.cloud
         begun = job.start() if job.start else InitialModel(primitive.init(cloud, generator), 0)
-        fresh = trainer.begin(Points.fresh(begun.params), generator, job.frozen().params if job.frozen else None)
+        fresh = trainer.begin(
+            Points.fresh(begun.params, primitive.shared()), generator, job.frozen().params if job.frozen else None
+        )
         fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         if job.cloud:
             fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
@@ -232,7 +235,8 @@ def drawing(run: Run, state: StageState, rasterizer: Rasterizer, geometry: bool 
     """What draws the points of a state, as they are to be looked at."""
     stage = run.stage
     splats = run.primitive.activate(stage.finished(state), state.sh_degree)
-    return lambda view: rasterizer.render(splats, view.camera, stage.near, geometry).maps
+    draws = drawn_by(run.primitive, rasterizer)
+    return lambda view: draws.render(splats, view.camera, stage.near, geometry).maps
 
 
 def drawer(device: Device) -> tuple[Rasterizer, str]:

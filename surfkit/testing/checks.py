@@ -72,10 +72,17 @@ def check_policy(policy: Policy, points: Points, step: Step) -> None:
     for key in ("drop", "clone", "split", "forget"):
         counts = key == "clone"
         _check_mask(f"{name}: {key}", getattr(first, key), getattr(second, key), len(points), counts)
-    for key, value in (first.nudge or {}).items():
-        assert key in points.params, f"{name} nudges {key!r}, which is none of {', '.join(points.params)}"
-        assert value.shape == points.params[key].shape, f"{name}: the nudge of {key!r} has shape {tuple(value.shape)}"
-        assert torch.equal(value, second.nudge[key]), f"{name}.edit is not repeatable; draw from `step.seed`"
+    for key, shape in (("move", (len(points), 3)), ("opacities", (len(points),)), ("scale_by", (len(points),))):
+        value, again = getattr(first, key), getattr(second, key)
+        if value is None:
+            assert again is None, f"{name}.edit is not repeatable"
+            continue
+        assert value.shape == shape, f"{name}: {key} has shape {tuple(value.shape)}, not {shape}"
+        assert torch.equal(value.nan_to_num(-1), again.nan_to_num(-1)), f"{name}.edit is not repeatable: `step.seed`"
+    if first.opacities is not None:
+        wanted = first.opacities[~first.opacities.isnan()]
+        assert bool(((wanted > 0) & (wanted < 1)).all()), f"{name}: opacities must lie between 0 and 1, or be NaN"
+    assert first.scale_by is None or bool((first.scale_by > 0).all()), f"{name}: factors of scales must be above 0"
 
 
 def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:

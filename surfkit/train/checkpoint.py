@@ -72,6 +72,7 @@ def save(path: Path, state: StageState) -> None:
 def beside_points(state: StageState) -> tuple[dict[str, Tensor], str]:
     """What a file holds of a state beside its points: tensors, and facts as text."""
     tensors = {f"looks.{name}": value.contiguous() for name, value in state.looks.items()}
+    tensors |= {f"shared.{name}": value.contiguous() for name, value in state.points.shared.items()}
     tensors |= {"order": state.order.queue, "generator": state.generator.get_state()}
     facts = {"views": state.order.count, "shown": state.order.at} | {name: getattr(state, name) for name in SCALARS}
     return tensors, json.dumps(facts)
@@ -143,13 +144,14 @@ def state_of(path: Path, tensors: Mapping[str, Tensor], text: str) -> StageState
         BadInput: They make none.
     """
     facts = _facts(path, tensors, text)
-    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks", "frozen")}
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in (*GROUPS, "looks", "frozen", "shared")}
     for key, value in tensors.items():
         group, _, name = key.partition(".")
         if group in groups:
             groups[group][name] = value
     looks, frozen = groups.pop("looks"), groups.pop("frozen")
-    points = Points(**{attribute: groups[group] for group, attribute in GROUPS.items()})
+    columns = {attribute: groups[group] for group, attribute in GROUPS.items()}
+    points = Points(**columns, shared=groups["shared"])
     _check(path, points, tensors["order"], facts)
     _check_frozen(path, points, frozen)
     generator = torch.Generator()
@@ -264,11 +266,11 @@ def _check(path: Path, points: Points, order: Tensor, facts: dict[str, Any]) -> 
     count = tuple(points.params["means"].shape[:1])
     for group, attribute in GROUPS.items():
         for name, value in getattr(points, attribute).items():
-            if not count or value.shape[:1] != count:
+            if name not in points.shared and (not count or value.shape[:1] != count):
                 raise _unusable(path, f"{group}.{name} has shape {tuple(value.shape)} for {sum(count)} points")
     kinds = [
         {name: (value.shape, value.dtype) for name, value in group.items()}
-        for group in (points.params, points.exp_avg, points.exp_avg_sq)
+        for group in (points.all_params(), points.exp_avg, points.exp_avg_sq)
     ]
     if kinds[0] != kinds[1] or kinds[0] != kinds[2] or not all(kind.is_floating_point for _, kind in kinds[0].values()):
         raise _unusable(path, "the optimiser's moments do not fit the parameters")

@@ -36,8 +36,8 @@ def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Ten
 
     A parameter without influence is left out.
     """
-    splats, grads = shape.tensors(), gradients.tensors()
-    names = [name for name, value in splats.items() if value.requires_grad]
+    splats, grads = shape.named(), gradients.named()
+    names = [name for name, value in splats.items() if value.requires_grad and name in grads]
     raw = torch.autograd.grad(
         [*(splats[name] for name in names), *terms],
         list(leaves.values()),

@@ -15,35 +15,28 @@ from surfkit.appearance.base import Appearance
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, PointsEdited, StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
-from surfkit.core.registry import choice
-from surfkit.core.schedule import Interval
+from surfkit.core.registry import choice, name_of
+from surfkit.core.schedule import Interval, LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.base import Loss, Neighbour, Regularizer, Target, ignoring
 from surfkit.losses.photometric import L1, SSIM
-from surfkit.primitives.base import Primitive, apply
-from surfkit.primitives.points import Columns, Edit, Points, merge, withheld
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.edit import Edit, apply, merge, withheld
+from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
-from surfkit.train.adam import LearningRate, adam_step
+from surfkit.train.adam import adam_step
 from surfkit.train.cotangents import added, gradient, pulled
 from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.rig import Rig
 from surfkit.train.views import Order, ViewContributions
 
-RATES = {
-    "means": LearningRate(1.6e-4, 1.6e-6),
-    "scales": LearningRate(5e-3),
-    "quats": LearningRate(1e-3),
-    "opacities": LearningRate(5e-2),
-    "sh0": LearningRate(2.5e-3),
-    "sh_rest": LearningRate(1.25e-4),
-}
-"""Of 3DGS, for a scene extent of 1."""
 MOST_STEPS = 100_000_000
 """Of a stage: days and days of the fastest machine."""
 GEOMETRY = {"depth", "median", "normal", "distortion"}
@@ -75,8 +68,8 @@ class Stage:
     prune: tuple[Annotated[Prune, choice(Prune)], ...] = ()
     """Further ways to remove points; prune.0:NAME adds the first, prune.1:NAME the next, prune.0:none drops one."""
 
-    rates: dict[str, LearningRate] = field(default_factory=lambda: dict(RATES))
-    """Learning rates of the parameters; of positions as a share of the scene extent."""
+    rates: dict[str, LearningRate] = field(default_factory=dict)
+    """Learning rates of the parameters that differ from those of the primitive; of positions in scene extents."""
 
     sh_every: Interval = 1_000
     """Steps between degrees of the spherical harmonics, from 0 up to the primitive's; a stage that goes on from a model
@@ -109,9 +102,8 @@ class Stage:
 
     def finished(self, state: StageState) -> Columns:
         """Raw parameters of the points as they leave the stage, in the colours of the mean photograph."""
-        if self.appearance is None:
-            return state.points.params
-        return self.appearance.folded(state.looks["value"], state.points.params)
+        params = state.points.all_params()
+        return params if self.appearance is None else self.appearance.folded(state.looks["value"], params)
 
 
 @dataclass
@@ -197,9 +189,12 @@ class Trainer:
 
     def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
         """The state before the first step; `frozen` as in `StageState`."""
-        missing = set(points.params) ^ set(self.stage.rates)
-        if missing:
-            raise BadInput(f"rates has {', '.join(self.stage.rates)}; the points have {', '.join(points.params)}")
+        declared = set(self.primitive.columns())
+        if set(points.all_params()) != declared:
+            raise BadInput(
+                f"primitive {name_of(self.primitive)} declares the columns {', '.join(sorted(declared))}, and its "
+                f"points have {', '.join(sorted(points.all_params()))}"
+            )
         state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.looks = fresh_looks(self.stage.appearance, len(self.views))
@@ -228,14 +223,14 @@ class Trainer:
         shown, target = self.target(state)
         active = stage.weights_at(index)
         reads = {name for loss in active for name in stage.losses[loss].reads}
-        leaves = {name: value.detach().requires_grad_() for name, value in state.points.params.items()}
+        leaves = {name: value.detach().requires_grad_() for name, value in state.points.all_params().items()}
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
         shape = self.primitive.activate(leaves, state.sh_degree)
         splats = self.drawn(state, shape)
 
         paired = stage.is_paired(index)
         geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
-        render = self.rasterizer.render(splats, target.view.camera, stage.near, geometry, distortion)
+        render = self.draws.render(splats, target.view.camera, stage.near, geometry, distortion)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
         losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
@@ -246,7 +241,7 @@ class Trainer:
         facts = self.facts(state, splats, target, render, gradients)
         edit = self.wanted(state.points, facts)
         adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
-        require_finite_values(index, target.view.name, state.points.params)
+        require_finite_values(index, target.view.name, state.points.all_params())
         if edit is not None:
             state.points = self.edited(state, edit, index)
         state.index = index
@@ -254,8 +249,21 @@ class Trainer:
 
     def drawn(self, state: StageState, shape: Splats) -> Splats:
         """The splats of a state, detached, and then those that are frozen."""
-        splats = replace(shape, **{name: value.detach() for name, value in shape.tensors().items()})
-        return splats.and_then(self.primitive.activate(state.frozen, state.sh_degree)) if state.frozen else splats
+        splats = shape.detached()
+        if not state.frozen:
+            return splats
+        shared = {name: value.detach() for name, value in state.points.shared.items()}
+        return splats.and_then(self.primitive.activate(state.frozen | shared, state.sh_degree))
+
+    @cached_property
+    def draws(self) -> Rasterizer:
+        """What draws the splats of the primitive."""
+        return drawn_by(self.primitive, self.rasterizer)
+
+    @cached_property
+    def rates(self) -> dict[str, LearningRate]:
+        """The learning rate of each parameter."""
+        return rates_of(self.stage, self.primitive)
 
     def target(self, state: StageState) -> tuple[int, Target]:
         """Position and photograph of the view to show now; damaged ones are passed over, and named once."""
@@ -304,7 +312,7 @@ class Trainer:
             photo = None if at in state.skipped else self.photo(state, at, aside=True)
             if photo is None:
                 continue
-            drawn = self.rasterizer.render(splats, self.views[at].camera, self.stage.near, True, False).maps
+            drawn = self.draws.render(splats, self.views[at].camera, self.stage.near, True, False).maps
             mask = None if self.masks is None else out_of_turn(self.masks, at)
             return Neighbour(self.views[at], photo, replace(drawn, color=None, distortion=None), mask)
         return None
@@ -339,19 +347,18 @@ class Trainer:
     def facts(self, state: StageState, splats: Splats, target: Target, render: Render, gradients: Gradients) -> Step:
         """What the policies are told about a step, and nothing about frozen points."""
         index, count = state.index + 1, len(state.points)
-        own = {name: value[:count] for name, value in splats.tensors().items()}
         chosen = gradients.signal if gradients.chosen is None else gradients.chosen
         return Step(
             index=index,
             steps=self.stage.steps,
             seen=render.seen[:count],
-            splats=replace(splats, **own),
+            splats=splats.first(count),
             grad_norm=self.stage.signal.combine(chosen, gradients.signal).norm(dim=-1),
             radii=render.radii[:count],
             image_px=max(target.view.camera.width, target.view.camera.height),
-            views=ViewContributions(self.views, self.rasterizer, splats, self.stage.near, count),
+            views=ViewContributions(self.views, self.draws, splats, self.stage.near, count),
             since_reset=index - state.reset_at,
-            rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.stage.rates.items()},
+            rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.rates.items()},
             seed=state.seed,
             owns=self.owns,
         )
@@ -374,6 +381,11 @@ class Trainer:
         if any(counts):
             emit(PointsEdited(index, *counts, points=len(points)))
         return points
+
+
+def rates_of(stage: Stage, primitive: Primitive) -> dict[str, LearningRate]:
+    """The learning rate of each parameter: the primitive's own, unless the stage has another."""
+    return {name: stage.rates.get(name, column.rate) for name, column in primitive.columns().items()}
 
 
 def out_of_turn(known: Pictures | Sequence, at: int) -> Any:

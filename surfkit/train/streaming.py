@@ -52,7 +52,7 @@ class Stored:
                     name: file.get_slice(f"params.{name}")[start : start + ROWS].clone()
                     for name in self.state.points.params
                 }
-            yield replace(self.state, points=Points(params, {}, {}))
+            yield replace(self.state, points=Points(params, {}, {}, shared=self.state.points.shared))
 
 
 def open_last(path: Path) -> tuple[Stored, str | None] | None:
@@ -88,8 +88,9 @@ def save(path: Path, state: StageState, pieces: Iterable[Columns]) -> None:
     """
     small, facts = checkpoint.beside_points(state)
     params = state.points.params
-    groups = {f"{group}.{name}": value for group in ("params", "first", "second") for name, value in params.items()}
-    tensors = small | groups
+    groups = {f"params.{name}": value for name, value in params.items()}
+    moments = {f"{g}.{name}": value for g in ("first", "second") for name, value in state.points.all_params().items()}
+    tensors = small | groups | moments
     with checkpoint.taking_the_place(path) as part:
         with open(part, "wb") as file:
             starts = _begin(file, tensors, facts, "0" * 64)

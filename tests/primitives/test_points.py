@@ -1,8 +1,9 @@
+import pytest
 import torch
 
 from surfkit.primitives import Surfel2D
-from surfkit.primitives.base import apply
-from surfkit.primitives.points import Edit, Points, merge, withheld
+from surfkit.primitives.edit import Edit, apply, merge, withheld
+from surfkit.primitives.points import Points
 
 
 def points(count: int = 6) -> Points:
@@ -64,43 +65,63 @@ def test_merge_of_nothing_is_nothing():
     assert merge([None, None]) is None and merge([]) is None
 
 
-def test_merge_adds_nudges_and_makes_the_most_copies():
-    a = Edit(clone=torch.tensor([2, 0, 1, 3]), nudge={"means": torch.ones(4, 3)}, forget=mask(0, count=4))
-    b = Edit(
-        clone=mask(1, 2, count=4), drop=mask(3, count=4), nudge={"means": torch.ones(4, 3), "scales": torch.ones(4, 2)}
+def test_merge_adds_moves_multiplies_factors_and_makes_the_most_copies():
+    half, nan = torch.full((4,), 0.5), torch.full((4,), torch.nan)
+    a = Edit(
+        clone=torch.tensor([2, 0, 1, 3]), move=torch.ones(4, 3), forget=mask(0, count=4), scale_by=half, opacities=nan
     )
+    b = Edit(clone=mask(1, 2, count=4), drop=mask(3, count=4), move=torch.ones(4, 3), scale_by=half, opacities=half)
     both = merge([a, b])
     assert both.clone.tolist() == [2, 1, 1, 0] and both.forget.tolist() == [True, False, False, False]
-    assert both.nudge["means"].tolist() == [[2.0] * 3] * 4 and both.nudge["scales"].tolist() == [[1.0] * 2] * 4
+    assert both.move.tolist() == [[2.0] * 3] * 4 and both.scale_by.tolist() == [0.25] * 4
+    assert both.opacities.tolist() == [0.5] * 4 and merge([a, a]).opacities.isnan().all()
+    assert merge([b, Edit(opacities=torch.tensor([0.2, 0.7, torch.nan, 0.5]))]).opacities.tolist() == pytest.approx(
+        [0.2, 0.5, 0.5, 0.5]
+    )
 
 
-def test_copies_inherit_the_nudge_and_only_the_named_forget():
+def test_copies_inherit_the_change_and_only_the_named_forget():
     points = Points.fresh({"means": torch.arange(9.0).view(3, 3), "opacities": torch.zeros(3)})
     points.exp_avg["means"] += 1
     edit = Edit(
-        clone=torch.tensor([0, 2, 0]), nudge={"opacities": torch.tensor([0.0, 5, 0])},
+        clone=torch.tensor([0, 2, 0]), opacities=torch.tensor([torch.nan, 0.75, torch.nan]),
         drop=mask(0, count=3), forget=mask(2, count=3),
     )  # fmt: skip
     after = apply(Surfel2D(), points, edit, torch.Generator())
-    assert after.params["opacities"].tolist() == [5, 0, 5, 5]
+    assert after.params["opacities"].sigmoid().tolist() == pytest.approx([0.75, 0.5, 0.75, 0.75])
     assert after.params["means"][:, 0].tolist() == [3, 6, 3, 3]
     assert after.exp_avg["means"][:, 0].tolist() == [1, 0, 0, 0], "a copy has no past"
     assert points.params["opacities"].tolist() == [0, 0, 0], "the points before the edit are as they were"
 
 
-def test_copies_that_are_withheld_take_their_nudge_with_them():
+def test_copies_that_are_withheld_take_their_changes_with_them():
     edit = Edit(
         drop=mask(0, 1),
         clone=torch.tensor([0, 2, 3, 0, 0, 0]),
         split=mask(3),
         max_opacity=0.5,
-        nudge={"means": torch.ones(6, 3), "opacities": torch.ones(6)},
+        move=torch.ones(6, 3),
+        opacities=torch.full((6,), 0.5),
+        scale_by=torch.full((6,), 0.5),
         forget=mask(1, 2, 5),
     )
     left = withheld(edit, mask(2, 5))
     assert left.clone.tolist() == [0, 0, 3, 0, 0, 0] and not left.split.any()
     assert torch.equal(left.drop, edit.drop) and left.max_opacity == 0.5 and torch.equal(left.forget, mask(2, 5))
-    assert left.nudge["opacities"].tolist() == [1, 0, 1, 0, 1, 1]
-    assert left.nudge["means"][:, 2].tolist() == [1, 0, 1, 0, 1, 1]
-    quiet = Edit(drop=mask(4), nudge={"means": torch.ones(6, 3)})
-    assert withheld(quiet, mask()) is quiet, "what multiplies nothing is allowed to anyone"
+    assert left.opacities.nan_to_num(-1).tolist() == [0.5, -1, 0.5, -1, 0.5, 0.5]
+    assert left.scale_by.tolist() == [0.5, 1, 0.5, 1, 0.5, 0.5]
+    assert left.move[:, 2].tolist() == [1, 0, 1, 0, 1, 1]
+    quiet = Edit(drop=mask(4), move=torch.ones(6, 3))
+    assert withheld(quiet, mask()) is quiet, "what adds nothing is allowed to anyone"
+
+
+def test_shared_parameters_belong_to_no_point():
+    params = {"means": torch.arange(9.0).view(3, 3), "net": torch.ones(3, 2)}
+    points = Points.fresh(params, ["net"])
+    points.exp_avg["net"] += 1
+    assert len(points) == 3 and list(points.params) == ["means"] and points.all_params().keys() == {"means", "net"}
+    fewer = points.take(mask(0, count=3))
+    more = points.append({"means": torch.zeros(2, 3)})
+    for found, count in ((fewer, 1), (more, 5)):
+        assert len(found) == count and found.exp_avg["means"].shape == (count, 3)
+        assert torch.equal(found.shared["net"], params["net"]) and found.exp_avg["net"].tolist() == [[1, 1]] * 3

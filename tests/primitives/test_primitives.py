@@ -7,9 +7,10 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.registry import components
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
-from surfkit.primitives.base import Primitive, apply, rotated
+from surfkit.primitives.base import Primitive, rotated
+from surfkit.primitives.edit import Edit, apply
 from surfkit.primitives.init import ALONE, SMALLEST, gaps
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.points import Points
 from surfkit.scene.scene import Cloud
 
 ALL = [Surfel2D(), Gaussian3D(), Flat3D()]

@@ -8,11 +8,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import Kind, Splats
+from surfkit.raster.api import KINDS, Splats
 from surfkit.scene.camera import Camera
 
 NEAR = 0.05
-KINDS: tuple[Kind, ...] = ("surfel", "gaussian")
 
 
 class Draw:
@@ -43,7 +42,7 @@ def axis_camera(width: int = 61, height: int = 47) -> Camera:
     return Camera(pose, 52.0, 56.0, width // 2 - 3 + 0.5, height // 2 + 4 + 0.5, width, height)
 
 
-def splats(draw: Draw, view: Camera, kind: Kind, degree: int, **given: Tensor) -> Splats:
+def splats(draw: Draw, view: Camera, kind: str, degree: int, **given: Tensor) -> Splats:
     """Splats from float64 tensors, with random orientation and colours; `centres` are in the camera frame."""
     centres = given["centres"]
     count, pose = len(centres), view.world_to_camera
@@ -60,11 +59,11 @@ def _box(draw: Draw, count: int, z_low: float = 1.0, z_high: float = 2.5) -> Ten
     return low + (high - low) * draw.uniform(0, 1, count, 3)
 
 
-def _columns(kind: Kind) -> int:
+def _columns(kind: str) -> int:
     return 2 if kind == "surfel" else 3
 
 
-def plain(kind: Kind, degree: int, seed: int, size: float = 1.0, depth: tuple[float, float] = (1.0, 2.5)):
+def plain(kind: str, degree: int, seed: int, size: float = 1.0, depth: tuple[float, float] = (1.0, 2.5)):
     """Splats of a few pixels, many sizes and opacities; `size` multiplies them."""
     draw = Draw(seed)
     view, count = camera(draw), 70
@@ -77,7 +76,7 @@ def plain(kind: Kind, degree: int, seed: int, size: float = 1.0, depth: tuple[fl
     return made, view
 
 
-def needle(kind: Kind, degree: int, seed: int):
+def needle(kind: str, degree: int, seed: int):
     """Aspect ratios up to 300."""
     draw = Draw(seed)
     view, count = camera(draw), 70
@@ -88,31 +87,31 @@ def needle(kind: Kind, degree: int, seed: int):
     return splats(draw, view, kind, degree, centres=_box(draw, count), scales=scales, opacities=opacities), view
 
 
-def huge(kind: Kind, degree: int, seed: int):
+def huge(kind: str, degree: int, seed: int):
     """Each covers most of the image."""
     return plain(kind, degree, seed, size=8.0)
 
 
-def tiny(kind: Kind, degree: int, seed: int):
+def tiny(kind: str, degree: int, seed: int):
     """Much smaller than a pixel."""
     return plain(kind, degree, seed, size=0.02)
 
 
-def around(kind: Kind, degree: int, seed: int):
+def around(kind: str, degree: int, seed: int):
     """Behind, across and close to the camera plane; one sits in the camera's centre."""
     made, view = plain(kind, degree, seed, depth=(-0.7, 0.8))
     made.means[0] = view.centre.float()
     return made, view
 
 
-def opaque(kind: Kind, degree: int, seed: int):
+def opaque(kind: str, degree: int, seed: int):
     """Rays end after a few splats of opacity 0.999, stacked closely in depth."""
     made, view = plain(kind, degree, seed, size=1.5, depth=(1.5, 1.9))
     made.opacities.fill_(0.999)
     return made, view
 
 
-def faint(kind: Kind, degree: int, seed: int):
+def faint(kind: str, degree: int, seed: int):
     """Many layers of opacity 0.01 to 0.06."""
     draw = Draw(seed)
     view, count = camera(draw), 120
@@ -125,7 +124,7 @@ def faint(kind: Kind, degree: int, seed: int):
     return made, view
 
 
-def edge_on(kind: Kind, degree: int, seed: int):
+def edge_on(kind: str, degree: int, seed: int):
     """Discs whose plane holds the camera's centre: exactly (whole columns and rows of pixels lie in it) and nearly."""
     draw, view = Draw(seed), axis_camera()
     count, exact = 60, 12
@@ -143,7 +142,7 @@ def edge_on(kind: Kind, degree: int, seed: int):
     return splats(draw, view, kind, degree, centres=centres, quats=quats, scales=scales, opacities=opacities), view
 
 
-def grazing(kind: Kind, degree: int, seed: int):
+def grazing(kind: str, degree: int, seed: int):
     """Discs that a ray through their centre meets at 0.001 to 0.1 of a radian, from a random pose."""
     draw = Draw(seed)
     view, count = camera(draw), 60
@@ -173,20 +172,20 @@ def quaternions(turns: Tensor) -> Tensor:
     return torch.stack(found)
 
 
-def antialias(kind: Kind, degree: int, seed: int):
+def antialias(kind: str, degree: int, seed: int):
     """Gaussians of all sizes, their opacity lowered by what the dilation adds."""
     small, view = plain(kind, degree, seed, size=0.3)
     return Splats(kind, *small.tensors().values(), antialias=True), view
 
 
-SCENES: dict[str, Callable[[Kind, int, int], tuple[Splats, Camera]]] = {
+SCENES: dict[str, Callable[[str, int, int], tuple[Splats, Camera]]] = {
     maker.__name__: maker for maker in (plain, needle, huge, tiny, around, opaque, faint, grazing, edge_on, antialias)
 }
 CASES = [(name, kind) for kind in KINDS for name in SCENES if (name, kind) != ("antialias", "surfel")]
 """Scene and kind; `antialias` says nothing about surfels."""
 
 
-def make(name: str, kind: Kind, degree: int | None = None, seed: int = 3) -> tuple[Splats, Camera]:
+def make(name: str, kind: str, degree: int | None = None, seed: int = 3) -> tuple[Splats, Camera]:
     """A scene by name; without a degree, one that differs from scene to scene."""
     return SCENES[name](kind, list(SCENES).index(name) % 4 if degree is None else degree, seed)
 

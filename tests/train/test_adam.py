@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.schedule import LearningRate
 from surfkit.primitives.points import Points
-from surfkit.train.adam import LearningRate, adam_step
+from surfkit.train.adam import adam_step
 
 
 def gradients(count: int, seed: int) -> dict[str, torch.Tensor]:

@@ -10,7 +10,8 @@ from surfkit.densify import ADC
 from surfkit.densify.base import Densify, Prune
 from surfkit.densify.filters import CountCap
 from surfkit.densify.trim import Trim
-from surfkit.primitives.points import Edit, Points
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 from surfkit.train import checkpoint
 from surfkit.train import streaming as pieces
 from surfkit.train.stage import Stage
@@ -27,7 +28,7 @@ class Greedy(Densify):
     def edit(self, points, step):
         self.parents.append(points.params["means"].clone())
         odd = torch.arange(len(points)) % 2 == 1
-        return Edit(clone=(~odd).long(), split=odd, nudge={"opacities": torch.full((len(points),), -0.1)})
+        return Edit(clone=(~odd).long(), split=odd, scale_by=torch.full((len(points),), 0.9))
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def cut(state, rows):
 
 
 def test_a_densifier_that_knows_nothing_of_blocks_obeys(begin):
-    """One step: each point in the west becomes two, none in the east, and only those that became two are nudged."""
+    """One step: each point in the west becomes two, none in the east, and only those that became two are made smaller."""
     greedy = Greedy()
     trainer, state = begin(replace(QUIET, densify=greedy))
     trainer = replace(trainer, owns=west)
@@ -71,8 +72,8 @@ def test_a_densifier_that_knows_nothing_of_blocks_obeys(begin):
     east = state.points.params["means"][: int((~own | (torch.arange(40) % 2 == 0)).sum())]
     kept = ~own | (torch.arange(40) % 2 == 0)
     assert torch.equal(east, moved["means"][kept])
-    lowered = state.points.params["opacities"][: len(east)] - moved["opacities"][kept]
-    assert torch.allclose(lowered, torch.where(own[kept], -0.1, 0.0), atol=1e-6)
+    factor = (state.points.params["scales"][: len(east)] - moved["scales"][kept]).exp()
+    assert torch.allclose(factor, torch.where(own[kept], 0.9, 1.0)[:, None].expand_as(factor), atol=1e-6)
 
 
 def test_who_owns_a_point_is_asked_anew_at_each_edit(begin):

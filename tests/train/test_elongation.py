@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import torch
 
+from surfkit.core.schedule import LearningRate
 from surfkit.densify import ADC, Elongation
 from surfkit.losses.photometric import SSIM
 from surfkit.primitives import Surfel2D
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.points import Points
-from surfkit.train.adam import LearningRate
-from surfkit.train.stage import RATES, Stage
+from surfkit.train.stage import Stage
 
 NEEDLES = 8
 

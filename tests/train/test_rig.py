@@ -7,18 +7,19 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.core.schedule import LearningRate
 from surfkit.losses import L1, SSIM, Reprojection, WarpedPatches
 from surfkit.losses.base import Target
 from surfkit.primitives import Surfel2D
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
 from surfkit.testing.synthetic import Flight, photograph
 from surfkit.train import checkpoint
-from surfkit.train.adam import LearningRate
 from surfkit.train.rig import CHOICE, Rig
-from surfkit.train.stage import RATES, Stage, Trainer
+from surfkit.train.stage import Stage, Trainer
 
 PAIRED = {
     "l1": L1(),

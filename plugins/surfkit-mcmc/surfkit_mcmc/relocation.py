@@ -63,10 +63,10 @@ class Relocation(Densify):
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Noise at every step, and moves every so often."""
         draw = torch.Generator().manual_seed(step.seed)
-        nudge = {"means": self._noise(step, draw)} if self.noise > 0 else {}
+        move = self._noise(step, draw) if self.noise > 0 else None
         if not (self.start < step.index <= self.until and step.index % self.every == 0):
-            return Edit(nudge=nudge) if nudge else None
-        return self._move(points, step, nudge, draw)
+            return None if move is None else Edit(move=move)
+        return self._move(step, move, draw)
 
     def _noise(self, step: Step, draw: torch.Generator) -> Tensor:
         """(N, 3) drawn with the covariance squared, so within the disc of a surfel; faint points move the most."""
@@ -76,21 +76,25 @@ class Relocation(Densify):
         faint = torch.sigmoid(100 * (1 - shape.opacities - 0.995))
         return self.noise * step.rates["means"] * faint[:, None] * rotated(spread * normal, shape.quats)
 
-    def _move(self, points: Points, step: Step, nudge: dict[str, Tensor], draw: torch.Generator) -> Edit:
-        opacities, scales = step.splats.opacities, step.splats.scales
+    def _move(self, step: Step, move: Tensor | None, draw: torch.Generator) -> Edit:
+        opacities = step.splats.opacities
         dead = opacities <= self.dead
         alive = admitted(self.filters, step, opacities * ~dead) * opacities
         count = len(opacities)
         moved = int(dead.sum()) + max(0, min(self.cap, int((1 + self.growth) * count)) - count)
         if not bool(alive.any()):
-            return Edit(nudge=nudge or None)
+            return Edit(move=move)
         copies = drawn(alive, moved, draw)
         opacity, shrink = shared(opacities, copies + 1, min(1.01 * self.dead, 0.999))
-        nudge = nudge | {
-            "opacities": torch.where(copies > 0, opacity.logit() - points.params["opacities"], 0.0),
-            "scales": torch.where(copies > 0, shrink.log(), 0.0)[:, None].expand_as(scales),
-        }
-        return Edit(drop=dead, clone=copies, nudge=nudge, forget=copies > 0)
+        copied = copies > 0
+        return Edit(
+            drop=dead,
+            clone=copies,
+            move=move,
+            opacities=torch.where(copied, opacity, torch.nan),
+            scale_by=torch.where(copied, shrink, 1.0),
+            forget=copied,
+        )
 
 
 def drawn(weights: Tensor, count: int, draw: torch.Generator) -> Tensor:

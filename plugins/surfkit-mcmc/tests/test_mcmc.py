@@ -12,16 +12,16 @@ from surfkit_mcmc.relocation import Relocation, drawn, shared
 
 from surfkit import BadInput, Densify, Points, Step, components
 from surfkit.core.registry import plugins
-from surfkit.core.schedule import rescale
+from surfkit.core.schedule import LearningRate, rescale
 from surfkit.densify import Elongation
 from surfkit.primitives import Gaussian3D, Surfel2D
-from surfkit.primitives.base import apply
+from surfkit.primitives.columns import RATES
+from surfkit.primitives.edit import apply
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
 from surfkit.testing import check_component, check_policy
-from surfkit.train.adam import LearningRate
-from surfkit.train.stage import RATES, Trainer
+from surfkit.train.stage import Trainer
 
 N = 400
 
@@ -91,10 +91,10 @@ def test_the_dead_move_and_a_few_more_come_up_to_the_cap():
     assert not edit.clone[:60].any() and torch.equal(edit.forget, edit.clone > 0)
     assert Relocation(cap=N + 5).edit(points, step).clone.sum() == 65
     assert Relocation(cap=N - 100).edit(points, step).clone.sum() == 60, "no point is taken away"
-    opacity = (points.params["opacities"] + edit.nudge["opacities"]).sigmoid()
+    opacity = torch.where(edit.opacities.isnan(), step.splats.opacities, edit.opacities)
     moved, number = edit.clone > 0, edit.clone + 1
     assert torch.allclose(1 - (1 - opacity[moved]) ** number[moved], step.splats.opacities[moved], atol=1e-4)
-    assert (edit.nudge["scales"][moved] < 0).all() and not edit.nudge["scales"][~moved].any()
+    assert (edit.scale_by[moved] < 1).all() and (edit.scale_by[~moved] == 1).all()
 
 
 def test_a_move_is_carried_out_as_asked():
@@ -111,7 +111,7 @@ def test_points_nearly_dead_and_wholly_opaque_move_too(logit):
     points.params["opacities"][60:] = logit  # 0.0055, less than twice that of the dead; 1 in float32
     step = replace(step, splats=primitive.activate(points.params, 1))
     edit = Relocation(noise=0).edit(points, step)
-    after = (points.params["opacities"] + edit.nudge["opacities"]).sigmoid()[edit.clone > 0]
+    after = edit.opacities[edit.clone > 0]
     wanted, _ = shared(step.splats.opacities, edit.clone + 1, 0.00505)
     assert torch.allclose(after, wanted[edit.clone > 0], rtol=1e-4) and (after > 0.005).all()
 
@@ -119,7 +119,7 @@ def test_points_nearly_dead_and_wholly_opaque_move_too(logit):
 def test_the_seed_of_the_step_decides():
     points, step = crowd()
     one, other = Relocation().edit(points, step), Relocation().edit(points, replace(step, seed=8))
-    assert not torch.equal(one.clone, other.clone) and not torch.equal(one.nudge["means"], other.nudge["means"])
+    assert not torch.equal(one.clone, other.clone) and not torch.equal(one.move, other.move)
 
 
 def test_steps_between_moves_only_add_noise():
@@ -157,14 +157,12 @@ def test_noise_has_the_covariance_squared_and_stays_within_a_disc():
     turn = torch.tensor([0.5, 0.5, 0.5, 0.5]).expand(N, 4)  # x to y, y to z, z to x
     shape = replace(shape, quats=turn, scales=torch.tensor([0.1, 0.2]).expand(N, 2), opacities=torch.full((N,), 0.005))
     step = replace(step, splats=shape, index=1)
-    noise = torch.cat(
-        [Relocation(noise=1e4).edit(points, replace(step, seed=seed)).nudge["means"] for seed in range(100)]
-    )
+    noise = torch.cat([Relocation(noise=1e4).edit(points, replace(step, seed=seed)).move for seed in range(100)])
     assert not noise[:, 0].abs().max() > 1e-6, "none along the normal"
     deviation = 1e4 * 1e-4 * 0.5 * torch.tensor([0.01, 0.04])
     assert torch.allclose(noise[:, 1:].std(0), deviation, rtol=0.03)
     opaque = replace(step, splats=replace(shape, opacities=torch.full((N,), 0.5)))
-    assert Relocation(noise=1e4).edit(points, opaque).nudge["means"].abs().max() < 1e-6
+    assert Relocation(noise=1e4).edit(points, opaque).move.abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("setting", [{"cap": 0}, {"every": 0}, {"dead": 0.0}, {"growth": -1.0}, {"noise": -1.0}])

@@ -1,0 +1,48 @@
+"""A primitive and a rasterizer as one: what draws the splats of the primitive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surfkit.primitives.base import Primitive
+from surfkit.raster.api import Rasterizer, Render, Splats
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class PrimitiveRasterizer(Rasterizer):
+    """Draws as the primitive wants it, by means of a rasterizer."""
+
+    primitive: Primitive
+    inner: Rasterizer
+
+    def title(self) -> str:
+        """See `Rasterizer.title`."""
+        return self.inner.title()
+
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
+        """See `Primitive.render`."""
+        return self.primitive.render(splats, camera, self.inner, near, geometry, distortion)
+
+    def contribution(
+        self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
+    ) -> tuple[Tensor, Tensor]:
+        """See `Rasterizer.contribution`."""
+        return self.inner.contribution(splats, camera, near, alpha_power, transmittance_power)
+
+    def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+        """See `Rasterizer.opacity_before`."""
+        return self.inner.opacity_before(splats, camera, near, points)
+
+
+def drawn_by(primitive: Primitive, rasterizer: Rasterizer) -> Rasterizer:
+    """What draws the splats of a primitive: `rasterizer`, through the primitive where that draws in its own way."""
+    if isinstance(rasterizer, PrimitiveRasterizer):
+        rasterizer = rasterizer.inner
+    if type(primitive).render is Primitive.render:
+        return rasterizer
+    return PrimitiveRasterizer(primitive, rasterizer)
