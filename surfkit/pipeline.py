@@ -15,6 +15,7 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import held
+from surfkit.core.registry import name_of
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.images.lpips import networks
 from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
@@ -28,7 +29,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
-from surfkit.recipe import Recipe
+from surfkit.recipe import Recipe, complete
 from surfkit.run.context import RunContext
 from surfkit.run.folder import (
     Run,
@@ -93,6 +94,7 @@ def run(
         Fault: Memory, disk or numbers gave out; the last checkpoint is whole.
         KeyboardInterrupt: The run was asked to stop, and has saved its state.
     """
+    recipe = complete(recipe)
     run = Run(out, recipe, replace(data, path=data.path.resolve()))
     compute, intervals, caches, meter = (
         compute or Compute(),
@@ -104,6 +106,7 @@ def run(
         intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_unready(run, compute, caches)
     with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
+        recipe.refuse_unfit()
         sweep(out, out / "blocks")
         refuse_other(run)
         scene = read(run.data)
@@ -150,14 +153,19 @@ def beginning(run: Run, scene: Scene, caches: CacheSettings, state: StageState |
 def results(ctx: RunContext, state: StageState, device: Device, meter: Meter) -> dict[str, Any]:
     """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
     run, scene, rasterizer = ctx.run, ctx.scene, ctx.rasterizer
-    if run.metrics.exists() and run.cloud.exists() and has_mesh(run, state.index):
+    if run.metrics.exists() and has_cloud(run) and has_mesh(run, state.index):
         say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
         return read_metrics(run.out)
-    if not run.cloud.exists():
+    if not has_cloud(run):
         export(run, state, scene)
     if not has_mesh(run, state.index):
         mesh(ctx, state, device)
     return evaluate(run, state, scene, rasterizer, meter, lpips_weights="gpu")
+
+
+def has_cloud(run: Run) -> bool:
+    """Whether the points are written, if they can be."""
+    return run.cloud.exists() or (not run.primitive.in_ply and run.cameras.exists())
 
 
 def export(run: Run, state: StageState, scene: Scene) -> None:
@@ -165,6 +173,9 @@ def export(run: Run, state: StageState, scene: Scene) -> None:
     params = run.stage.finished(state)
     write_cameras(run.cameras, scene)
     emit(FileWritten(run.cameras, "cameras"))
+    if not run.primitive.in_ply:
+        emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(run.primitive)}"))
+        return
     write_splats(run.cloud, run.primitive.table(params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(run.cloud, "points"))
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import tyro
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import choice
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import choice, components, name_of
 from surfkit.depth.base import DepthEstimator
 from surfkit.mesh.base import Mesher
 from surfkit.partition.assign import Assign, SSIMDifference
 from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.refine.base import Refine
 from surfkit.start.base import Start
@@ -79,3 +82,58 @@ class Recipe:
             blind = [name for name, loss in refine.stage.losses.items() if refine.taught and loss.needs_prior]
             if blind:
                 raise BadInput(f"refine.{at}: learns from what the model draws, where {blind[0]} finds no depth priors")
+
+    def stages(self) -> Iterator[tuple[str, Stage, Primitive]]:
+        """Every stage in its order: its path in the recipe, the stage, and the primitive of its points."""
+        yield "pretrain", self.pretrain, self.primitive
+        if self.partition is not None:
+            yield "tune", self.tune, self.primitive
+        primitive = self.primitive
+        for at, refine in enumerate(self.refine):
+            primitive = refine.primitive(primitive)
+            yield f"refine.{at}.stage", refine.stage, primitive
+
+    def refuse_unfit(self) -> None:
+        """BadInput if parts do not fit together; a note of learning rates that are not used."""
+        before = self.primitive
+        for at, refine in enumerate(self.refine):
+            try:
+                refine.refuse_unfit(before)
+            except BadInput as error:
+                raise BadInput(f"refine.{at}: {error}") from error
+            before = refine.primitive(before)
+        for path, stage, primitive in self.stages():
+            columns = primitive.columns()
+            lacking = [name for name in stage.rates if name not in columns]
+            if unknown := [name for name in lacking if name not in RATES]:
+                raise BadInput(
+                    f"{path}.rates.{unknown[0]}: primitive {name_of(primitive)} has no such column; it has "
+                    f"{', '.join(columns)}"
+                )
+            if lacking:
+                emit(Warned(f"{path}.rates: {', '.join(lacking)} not used, as primitive {name_of(primitive)} has none"))
+            if stage.appearance is not None:
+                stage.appearance.refuse_unfit(primitive)
+
+
+def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
+    """The recipe with every learning rate written out: those of the primitive, unless a stage has others.
+
+    Args:
+        recipe: To complete.
+        primitive: Name of the primitive that takes the place of its own, if another one does.
+    """
+
+    def with_rates(stage: Stage, primitive: Primitive) -> Stage:
+        known = {name: column.rate for name, column in primitive.columns().items()}
+        return replace(stage, rates=known | stage.rates)
+
+    kind, found = components(Primitive).get(primitive), recipe.primitive
+    if kind is not None and kind is not type(found):
+        found = kind()
+    pretrain, tune = with_rates(recipe.pretrain, found), with_rates(recipe.tune, found)
+    refined = []
+    for refine in recipe.refine:
+        found = refine.primitive(found)
+        refined.append(replace(refine, stage=with_rates(refine.stage, found)))
+    return replace(recipe, pretrain=pretrain, tune=tune, refine=tuple(refined))

@@ -156,7 +156,10 @@ def bare(monkeypatch):
 def world(bare, monkeypatch):
     """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and `surfkit.recipe`."""
     bare.plugins().register(Plugin(), "stand-in")
-    for name, values in {"surfkit.cli.train": {"COMMAND": Train}, "surfkit.recipe": {"Recipe": Recipe}}.items():
+    for name, values in {
+        "surfkit.cli.train": {"COMMAND": Train},
+        "surfkit.recipe": {"Recipe": Recipe, "complete": lambda recipe, _: recipe},
+    }.items():
         module = types.ModuleType(name)
         vars(module).update(values)
         monkeypatch.setitem(sys.modules, name, module)

@@ -9,6 +9,7 @@ from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.pipeline import with_steps
 from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.train.stage import rates_of
 
 
 def test_3dgs():
@@ -20,7 +21,7 @@ def test_3dgs():
     assert (grow.threshold, grow.small, grow.start, grow.until, grow.every) == (2e-4, 0.01, 500, 15_000, 100)
     assert (grow.cull_opacity, grow.cull_scale, grow.reset_every, grow.reset_opacity) == (0.005, 0.1, 3_000, 0.01)
     assert stage.signal.terms is None and stage.signal.boost == 0
-    at = {name: (rate.at(0, 30_000), rate.at(30_000, 30_000)) for name, rate in stage.rates.items()}
+    at = {name: (rate.at(0, 30_000), rate.at(30_000, 30_000)) for name, rate in rates_of(stage, Surfel2D()).items()}
     assert at["means"] == pytest.approx((1.6e-4, 1.6e-6))
     constant = {"scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "sh_rest": 1.25e-4}
     assert {name: ends for name, ends in at.items() if name != "means"} == {k: (v, v) for k, v in constant.items()}
@@ -81,8 +82,10 @@ def test_citygs2_t_begins_its_blocks_from_the_first_7000_steps_of_the_same_pretr
     whole, tiny = recipes()["citygs2-s"], recipes()["citygs2-t"]
     assert tiny.pretrain.steps == 7_000 and tiny.tune == whole.tune
     for index in (1, 2_500, 7_000):
-        for name, rate in whole.pretrain.rates.items():
-            assert tiny.pretrain.rates[name].at(index, 7_000) == pytest.approx(rate.at(index, 30_000))
+        for name, rate in rates_of(whole.pretrain, whole.primitive).items():
+            assert rates_of(tiny.pretrain, tiny.primitive)[name].at(index, 7_000) == pytest.approx(
+                rate.at(index, 30_000)
+            )
         for name, loss in whole.pretrain.losses.items():
             assert tiny.pretrain.losses[name].weight_at(index, 7_000) == pytest.approx(loss.weight_at(index, 30_000))
     assert tiny.pretrain.densify == whole.pretrain.densify
@@ -105,7 +108,7 @@ def test_citygs2_for_streets():
     street, at = recipes()["citygs2-street"], {}
     for part in ("pretrain", "tune"):
         stage = getattr(street, part)
-        at[part] = [stage.rates["means"].at(step, stage.steps) for step in (0, stage.steps)]
+        at[part] = [rates_of(stage, Surfel2D())["means"].at(step, stage.steps) for step in (0, stage.steps)]
         assert stage.densify.reset_every >= stage.densify.until  # never
     assert at == {"pretrain": pytest.approx([1.6e-5, 1.6e-6]), "tune": pytest.approx([8e-6, 8e-7])}
     assert street.assign.least == 0.01 and street.partition.blocks == (5, 4) and street.tune.prune == ()

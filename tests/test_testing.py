@@ -154,7 +154,7 @@ class Thick(Surfel2D):
         (Grows(), AssertionError, "Grows.split: a child is larger than its parent"),
         (OneChild(), AssertionError, "OneChild.split: 'means' is not 2 M rows"),
         (Unseeded(), AssertionError, "Unseeded.init: 'quats' differs for the same seed"),
-        (Thick(), ValueError, r"Thick.shape: scales: expected shape \(N, 2\)"),
+        (Thick(), ValueError, r"Thick.activate: scales: expected shape \(N, 2\)"),
     ],
 )
 def test_primitives_that_do_not_conform(primitive, error, message):

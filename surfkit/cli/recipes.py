@@ -44,8 +44,15 @@ def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
     named = {name: recipe for name, (_, recipe) in found.items()}
     named |= {file: _read(file) for file in _files(argv)}
     if (name := chosen_name(argv)) in named:
-        named[name], _ = with_parts(named[name], argv)
+        named[name] = _complete(with_parts(named[name], argv)[0], argv)
     return named
+
+
+def _complete(recipe: Any, argv: Sequence[str]) -> Any:
+    """The recipe with a flag for each learning rate of the primitive that `argv` chooses."""
+    from surfkit.recipe import complete
+
+    return complete(recipe, next((w.removeprefix("primitive:") for w in argv if w.startswith("primitive:")), None))
 
 
 def chosen_name(argv: Sequence[str]) -> str | None:

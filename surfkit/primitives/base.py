@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,6 +30,9 @@ class Primitive(Component):
     The methods that are not abstract suit splats whose columns "scales" and "opacities", where they have such, hold one
     number for each scale and opacity of `activate`; others replace them.
     """
+
+    in_ply: ClassVar[bool] = True
+    """Whether its splats can be written as PLY files of splats; without them a run has no point_cloud.ply."""
 
     sh_degree: int = 3
     """Highest degree of the spherical harmonics of a colour, 0 to 3; 0 is one colour for all directions."""
@@ -99,18 +103,32 @@ class Primitive(Component):
         """
         return rasterizer.render(splats, camera, near, geometry, distortion)
 
-    def table(self, params: Columns) -> SplatTable:
-        """The points as PLY files of splats hold them, local frame.
+    def contribution(
+        self,
+        splats: Splats,
+        camera: Camera,
+        rasterizer: Rasterizer,
+        near: float,
+        alpha_power: float,
+        transmittance_power: float,
+    ) -> tuple[Tensor, Tensor]:
+        """See `Rasterizer.contribution`; for a primitive with a `render` of its own that is to be trimmed or cut."""
+        return rasterizer.contribution(splats, camera, near, alpha_power, transmittance_power)
 
-        Raises:
-            BadInput: Such files have no place for these splats.
-        """
+    def opacity_before(
+        self, splats: Splats, camera: Camera, rasterizer: Rasterizer, near: float, points: Tensor
+    ) -> Tensor:
+        """See `Rasterizer.opacity_before`; for a primitive with a `render` of its own and mesh:tetra."""
+        return rasterizer.opacity_before(splats, camera, near, points)
+
+    def table(self, params: Columns) -> SplatTable:
+        """The points as PLY files of splats hold them, local frame; BadInput where `in_ply` is not set."""
         with torch.no_grad():
             splats = self.activate(params, self.sh_degree)
-            if splats.kind not in KINDS:
+            if not self.in_ply or splats.kind not in KINDS:
                 raise BadInput(
-                    f"splats of kind {splats.kind!r} have no place in a PLY file of splats, which holds "
-                    f"{' and '.join(KINDS)}s; primitive {kebab(type(self).__name__)} needs a `table` of its own"
+                    f"primitive {kebab(type(self).__name__)}: PLY files of splats have no place for it, only for "
+                    f"{' and '.join(KINDS)}s; the checkpoint in the run folder holds the model"
                 )
             exact = "opacities" in params and self._activation("opacities") is SIGMOID
             return SplatTable(

@@ -32,17 +32,18 @@ class PrimitiveRasterizer(Rasterizer):
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
         """See `Rasterizer.contribution`."""
-        return self.inner.contribution(splats, camera, near, alpha_power, transmittance_power)
+        return self.primitive.contribution(splats, camera, self.inner, near, alpha_power, transmittance_power)
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         """See `Rasterizer.opacity_before`."""
-        return self.inner.opacity_before(splats, camera, near, points)
+        return self.primitive.opacity_before(splats, camera, self.inner, near, points)
 
 
 def drawn_by(primitive: Primitive, rasterizer: Rasterizer) -> Rasterizer:
     """What draws the splats of a primitive: `rasterizer`, through the primitive where that draws in its own way."""
     if isinstance(rasterizer, PrimitiveRasterizer):
         rasterizer = rasterizer.inner
-    if type(primitive).render is Primitive.render:
+    own = type(primitive)
+    if all(getattr(own, name) is getattr(Primitive, name) for name in ("render", "contribution", "opacity_before")):
         return rasterizer
     return PrimitiveRasterizer(primitive, rasterizer)

@@ -6,9 +6,9 @@ from surfkit.testing.checks import (
     check_mesher,
     check_partition,
     check_policy,
-    check_primitive,
     check_refine,
 )
+from surfkit.testing.primitive import check_primitive
 
 __all__ = [
     "check_component",

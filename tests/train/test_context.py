@@ -58,7 +58,7 @@ def cut(state, rows):
 
 
 def test_a_densifier_that_knows_nothing_of_blocks_obeys(begin):
-    """One step: each point in the west becomes two, none in the east, and only those that became two are made smaller."""
+    """One step: each point in the west becomes two, none in the east, and only those that became two shrink."""
     greedy = Greedy()
     trainer, state = begin(replace(QUIET, densify=greedy))
     trainer = replace(trainer, owns=west)

@@ -1,0 +1,116 @@
+"""The check of a primitive."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from surfkit.core.check import expect
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from surfkit.primitives.base import Primitive
+    from surfkit.primitives.points import Columns
+    from surfkit.raster.api import Splats
+
+
+def check_primitive(primitive: Primitive, count: int = 50) -> None:
+    """A primitive declares the columns that it begins with, its splats have the right shapes, edits change them as
+    asked, children are no larger than their parents, and the same seed gives the same.
+
+    Args:
+        primitive: To check.
+        count: Points in the cloud that it starts from, 10 or more.
+    """
+    import torch
+
+    from surfkit.scene.scene import Cloud
+
+    name = type(primitive).__name__
+    seeded = torch.Generator().manual_seed(0)
+    xyz = torch.rand(count, 3, generator=seeded)
+    cloud = Cloud(xyz, torch.randint(0, 256, (count, 3), generator=seeded, dtype=torch.uint8))
+    params = primitive.init(cloud, torch.Generator().manual_seed(1))
+    _check_same(f"{name}.init", params, primitive.init(cloud, torch.Generator().manual_seed(1)))
+    _check_columns(name, primitive, params, count)
+    for degree in range(primitive.sh_degree + 1):
+        _check_splats(f"{name}.activate", primitive.activate(params, degree), degree)
+    assert torch.allclose(primitive.activate(params, 0).means, xyz, atol=1e-5), f"{name}: points begin elsewhere"
+    _check_edits(name, primitive, params)
+    _check_split(name, primitive, params, count // 2)
+
+
+def _check_columns(name: str, primitive: Primitive, params: Columns, count: int) -> None:
+    """What begins is what is declared, and every activation has its inverse."""
+    import torch
+
+    columns = primitive.columns()
+    assert "means" in columns and not columns["means"].shared, f"{name} needs a column 'means', (N, 3) positions"
+    assert set(params) == set(columns), f"{name}.init gives {sorted(params)}, and columns() declares {sorted(columns)}"
+    for key, column in columns.items():
+        value, wanted = params[key], column.shape if column.shared else (count, *column.shape)
+        assert tuple(value.shape) == tuple(wanted), f"{name}.init: {key!r} has shape {tuple(value.shape)}, not {wanted}"
+        assert value.dtype == torch.float32, f"{name}.init: {key!r} is {value.dtype}, not float32"
+        assert torch.isfinite(value).all(), f"{name}.init: {key!r} is not finite"
+        raw = torch.linspace(-2, 2, 9, dtype=torch.float64)
+        there = column.activation.value(raw)
+        back = column.activation.inverse(there)
+        assert torch.allclose(back, raw, atol=1e-6), f"{name}: the inverse of {key!r}'s activation does not lead back"
+        assert bool((there.diff() > 0).all()), f"{name}: the activation of {key!r} does not increase"
+
+
+def _check_splats(name: str, splats: Splats, degree: int) -> None:
+    import torch
+
+    sizes = {"N": len(splats.means)}
+    expect(f"{name}: means", splats.means, ("N", 3), sizes)
+    expect(f"{name}: quats", splats.quats, ("N", 4), sizes)
+    expect(f"{name}: scales", splats.scales, ("N", 2 if splats.kind == "surfel" else 3), sizes)
+    expect(f"{name}: opacities", splats.opacities, ("N",), sizes)
+    expect(f"{name}: sh", splats.sh, ("N", (degree + 1) ** 2, 3), sizes)
+    assert (splats.scales > 0).all(), f"{name}: scales must be positive"
+    assert ((splats.opacities >= 0) & (splats.opacities <= 1)).all(), f"{name}: opacities must lie in [0, 1]"
+    assert torch.isfinite(splats.means).all() and torch.isfinite(splats.sh).all(), f"{name}: values are not finite"
+    assert not set(splats.extra) & set(splats.shared), f"{name}: extra and shared tensors have names in common"
+
+
+def _check_edits(name: str, primitive: Primitive, params: Columns) -> None:
+    """Moved, scaled and dimmed points are so when they are drawn."""
+    import torch
+
+    before, count = primitive.activate(params, 0), len(params["means"])
+    moved = primitive.activate(primitive.moved(params, torch.full((count, 3), 0.25)), 0)
+    assert torch.allclose(moved.means, before.means + 0.25, atol=1e-5), f"{name}.moved does not move as asked"
+    factor = torch.linspace(0.5, 2, count)
+    for given, wanted in ((0.5, torch.tensor(0.5)), (factor, factor[:, None])):
+        scaled = primitive.activate(primitive.scaled(params, given), 0).scales
+        assert torch.allclose(scaled, before.scales * wanted, rtol=1e-3), f"{name}.scaled does not scale as asked"
+    asked = torch.linspace(0.01, 0.99, count)
+    asked[::2] = torch.nan
+    dimmed = primitive.activate(primitive.with_opacities(params, asked), 0).opacities
+    expected = torch.where(asked.isnan(), before.opacities, asked)
+    assert torch.allclose(dimmed, expected, atol=1e-4), f"{name}.with_opacities does not give the opacities asked for"
+
+
+def _check_split(name: str, primitive: Primitive, params: Columns, count: int) -> None:
+    import torch
+
+    shared = primitive.shared()
+    rows = {key: value if key in shared else value[:count] for key, value in params.items()}
+    twins = primitive.split(rows, torch.Generator().manual_seed(2))
+    _check_same(f"{name}.split", twins, primitive.split(rows, torch.Generator().manual_seed(2)))
+    own = set(params) - shared
+    assert set(twins) == own, f"{name}.split gives {sorted(twins)}, not {sorted(own)}"
+    for key, value in twins.items():
+        assert value.shape == (2 * count, *params[key].shape[1:]), f"{name}.split: {key!r} is not 2 M rows"
+    common = {key: params[key] for key in shared}
+    parents, children = primitive.activate(rows, 0).scales, primitive.activate(twins | common, 0).scales
+    assert (children <= torch.cat([parents, parents]) + 1e-6).all(), f"{name}.split: a child is larger than its parent"
+
+
+def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
+    import torch
+
+    assert first.keys() == second.keys(), f"{what} is not repeatable"
+    for key, value in first.items():
+        assert torch.equal(value, second[key]), f"{what}: {key!r} differs for the same seed; draw from the generator"

@@ -1,0 +1,263 @@
+"""Primitives of a stranger's package: other columns, another activation, a way of their own to draw, a network."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+import surfkit
+from surfkit import Activation, Column, Edit, LearningRate, Primitive, hookimpl, standard_columns
+from surfkit.cli import main
+from surfkit.core import registry
+from surfkit.core.check import BadInput
+from surfkit.export.ply import read_splats
+from surfkit.pipeline import load_run
+from surfkit.primitives.base import harmonics
+from surfkit.primitives.edit import apply
+from surfkit.primitives.init import seeds
+from surfkit.primitives.points import Points
+from surfkit.raster.api import Splats
+from surfkit.raster.autograd import AutogradRender, DerivedRender
+from surfkit.raster.reference import draw
+from surfkit.raster.select import select
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.scene.camera import Camera
+from surfkit.scene.photos import photo_cache
+from surfkit.scene.scene import Cloud
+from surfkit.testing import check_primitive
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train import checkpoint
+from surfkit.train.stage import Stage, Trainer
+
+
+@dataclass(frozen=True)
+class Balls(Primitive):
+    """Balls: no rotations, one radius."""
+
+    sh_degree: int = 1
+
+    def columns(self):
+        known = standard_columns(1, self.sh_degree)
+        del known["quats"]
+        return known
+
+    def init(self, cloud, generator):
+        return seeds(self.columns(), cloud)
+
+    def activate(self, params, degree):
+        means = params["means"]
+        quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
+        scales = params["scales"].exp().expand(-1, 3)
+        return Splats("gaussian", means, quats, scales, params["opacities"].sigmoid(), harmonics(params, degree))
+
+
+DENSITY = Activation(lambda raw: 1 - torch.exp(-torch.exp(raw)), lambda value: torch.log(-torch.log1p(-value)))
+
+
+@dataclass(frozen=True)
+class Fog(Primitive):
+    """Discs whose opacity is 1 - exp(-exp(x))."""
+
+    sh_degree: int = 1
+
+    def columns(self):
+        return standard_columns(2, self.sh_degree) | {"opacities": Column((), LearningRate(0.02), DENSITY)}
+
+    def init(self, cloud, generator):
+        return seeds(self.columns(), cloud) | {"quats": torch.randn(len(cloud.xyz), 4, generator=generator)}
+
+    def activate(self, params, degree):
+        opacities = DENSITY.value(params["opacities"])
+        parts = params["means"], params["quats"], params["scales"].exp(), opacities, harmonics(params, degree)
+        return Splats("surfel", *parts)
+
+
+@dataclass(frozen=True)
+class Anchors(Primitive):
+    """Points that a network, common to all, moves and colours: two balls each. Drawn by the usual rasterizer."""
+
+    in_ply: ClassVar[bool] = False
+
+    sh_degree: int = 0
+
+    def columns(self):
+        known = standard_columns(1, 0)
+        keep = {name: known[name] for name in ("means", "scales", "opacities", "sh0")}
+        net = Column((4, 6), LearningRate(1e-2), shared=True)
+        return keep | {"feature": Column((4,), LearningRate(1e-2)), "net": net}
+
+    def init(self, cloud, generator):
+        feature = torch.randn(len(cloud.xyz), 4, generator=generator)
+        return seeds(self.columns(), cloud) | {"feature": feature, "net": 0.01 * torch.randn(4, 6, generator=generator)}
+
+    def activate(self, params, degree):
+        means = params["means"]
+        quats, scales = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4), params["scales"].exp().expand(-1, 3)
+        return Splats(
+            "anchor", means, quats, scales, params["opacities"].sigmoid(), params["sh0"],
+            extra={"feature": params["feature"]}, shared={"net": params["net"]},
+        )  # fmt: skip
+
+    def derive(self, anchors):
+        made = anchors.extra["feature"] @ anchors.shared["net"]
+        shift = torch.cat([torch.zeros_like(anchors.means), made[:, :3] * anchors.scales])
+        twice = [torch.cat([value, value]) for value in anchors.tensors().values()]
+        twice[0] = twice[0] + shift
+        twice[4] = twice[4] + torch.cat([torch.zeros_like(made[:, None, 3:]), made[:, None, 3:]])
+        return Splats("gaussian", *twice), torch.arange(len(anchors)).repeat(2)
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        return DerivedRender(
+            splats, camera, self.derive, lambda made: rasterizer.render(made, camera, near, geometry, distortion)
+        )
+
+    def contribution(self, splats, camera, rasterizer, near, alpha_power, transmittance_power):
+        made, owner = self.derive(splats.detached())
+        found = rasterizer.contribution(made, camera, near, alpha_power, transmittance_power)
+        return tuple(value.new_zeros(len(splats)).index_add(0, owner, value) for value in found)
+
+
+class Package:
+    @hookimpl
+    def surfkit_components(self):
+        return {"balls": Balls, "fog": Fog, "anchors": Anchors}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed():
+    registry.plugins().register(Package(), "stranger")
+    yield
+    registry.plugins().unregister(name="stranger")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("source")
+    write_colmap(folder, photograph(Flight(views=12, width=40, height=30, points=150)))
+    return folder
+
+
+@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors()], ids=["balls", "fog", "anchors"])
+def test_they_keep_the_contract(primitive):
+    check_primitive(primitive)
+
+
+def notes(out):
+    return json.loads((out / "run.json").read_text())["notes"]
+
+
+SHORT = ("--steps", "20", "--pretrain.densify.start", "4", "--pretrain.densify.every", "5")
+
+
+def train(source, out, *words):
+    return main(["train", *words, "--data", str(source), "--out", str(out), "mesh:none", *SHORT])
+
+
+@pytest.mark.parametrize("name", ["balls", "fog", "anchors"])
+def test_one_word_swaps_the_primitive(source, tmp_path, name, capsys):
+    """Trained, resumed after a stop in the middle to the same bits, and measured."""
+    words = ["recipe:2dgs", f"primitive:{name}"] + ["--pretrain.losses.normal.weight", "0"] * (name != "fog")
+    assert train(source, tmp_path / "whole", *words) == 0
+    metrics = json.loads((tmp_path / "whole" / "metrics.json").read_text())
+    assert metrics["images"]["psnr"] > 8 and (tmp_path / "whole" / "point_cloud.ply").exists() == (name != "anchors")
+    _, state, _ = load_run(tmp_path / "whole")
+    assert set(state.points.all_params()) == set(registry.components(Primitive)[name]().columns())
+    if name == "anchors":
+        assert state.points.shared["net"].abs().max() > 0.05, "the network learns"
+        assert "no point_cloud.ply: PLY files of splats have no place for anchors" in notes(tmp_path / "whole")
+
+
+def test_a_network_goes_on_as_if_nothing_had_happened(source, tmp_path):
+    """Half of the steps, saved and read again, then the rest: the same bits as all at once."""
+    scene = read(Data(source))
+    trainer = Trainer(Stage(steps=12), Anchors(), scene.train, photo_cache(scene.train), select("cpu")[0])
+
+    def begin():
+        draw = torch.Generator().manual_seed(0)
+        return trainer.begin(Points.fresh(Anchors().init(scene.cloud, draw), ["net"]), draw)
+
+    whole, half = begin(), begin()
+    for _ in trainer.run(whole):
+        pass
+    for _ in range(6):
+        trainer.step(half)
+    checkpoint.save(tmp_path / "half.safetensors", half)
+    again = checkpoint.load(tmp_path / "half.safetensors")
+    for _ in trainer.run(again):
+        pass
+    assert again.index == 12 and whole.points.exp_avg["net"].abs().max() > 0
+    for group in ("params", "exp_avg", "exp_avg_sq", "shared"):
+        for name, value in getattr(whole.points, group).items():
+            assert torch.equal(value, getattr(again.points, group)[name]), (group, name)
+
+
+def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
+    assert train(source, tmp_path / "run", "recipe:3dgs", "primitive:fog") == 0
+    run, state, _ = load_run(tmp_path / "run")
+    drawn = run.primitive.activate(state.points.params, 0).opacities
+    table = read_splats(tmp_path / "run" / "point_cloud.ply")
+    assert torch.allclose(table.opacity_logits.sigmoid(), drawn, atol=1e-6)
+    points = Points.fresh({"means": torch.zeros(2, 3), "opacities": torch.zeros(2)})
+    points = Points.fresh(Fog().init(Cloud(torch.rand(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator()))
+    points.params["opacities"].zero_()  # drawn as 0.632
+    lowered = apply(Fog(), points, Edit(max_opacity=0.3), torch.Generator())
+    assert Fog().activate(lowered.params, 0).opacities.tolist() == pytest.approx([0.3, 0.3])
+
+
+def test_blocks_with_a_network_are_merged_by_the_stated_rule(source, tmp_path):
+    words = (
+        "recipe:citygs2 primitive:anchors --min-views 4 --partition.blocks 2 1 assign:picture-share --steps 8".split()
+    )
+    words += ["pretrain.losses.normal:none", "tune.losses.normal:none", "mesh:none", "depth:none"]
+    assert main(["train", *words, "--data", str(source), "--out", str(tmp_path)]) == 0
+    _, merged, _ = load_run(tmp_path)
+    shares = json.loads((tmp_path / "blocks" / "merge.json").read_text())["blocks"]
+    folders = [tmp_path / "blocks" / f"{share['index']:03}" / "tune" for share in shares]
+    nets = [checkpoint.load(folder / "checkpoint.safetensors").points.shared["net"].numpy() for folder in folders]
+    kept = np.array([share["kept"] for share in shares], float)
+    assert len(nets) == 2 and not np.allclose(*nets)
+    assert np.allclose(merged.points.shared["net"].numpy(), np.average(nets, axis=0, weights=kept), atol=1e-6)
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_path, capsys):
+    assert train(source, tmp_path / "a", "recipe:3dgs", "primitive:anchors", "refine.0:distil") == 2
+    assert "refine.0: distil cuts the column sh_rest, which primitive anchors does not have" in capsys.readouterr().err
+    assert not (tmp_path / "a" / "pretrain").exists()
+    with pytest.raises(BadInput, match=r"pretrain.rates.wings: primitive surfel2d has no such column; it has means"):
+        recipe = surfkit.Recipe(pretrain=surfkit.Stage(rates={"wings": LearningRate(1.0)}))
+        recipe.refuse_unfit()
+
+
+def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
+    splats = Anchors().activate(
+        Anchors().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
+        0,
+    )
+    camera = Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 8.0, 8.0, 16, 16)
+    for name in ("native", "reference"):
+        with pytest.raises(BadInput, match="splats of kind 'anchor': the rasterizers draw surfel and gaussians"):
+            select(name)[0].render(splats, camera, 0.01)
+
+
+def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
+    """`AutogradRender` around the reference's own drawing, against the reference's way back."""
+    params = Balls().init(Cloud(torch.rand(12, 3) - 0.5, torch.full((12, 3), 90, dtype=torch.uint8)), torch.Generator())
+    params["scales"] -= 1
+    splats = Balls().activate(params, 0).detached()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 2
+    camera = Camera(pose, 20.0, 20.0, 8.0, 8.0, 16, 16)
+    true = select("reference")[0].render(splats, camera, 0.01)
+    own = AutogradRender(splats, camera, lambda s: draw(s, camera, 0.01).maps, true.seen, true.radii)
+    cotangent = type(true.maps)(color=torch.randn(3, 16, 16))
+    a, b = true.backward(cotangent, cotangent), own.backward(cotangent, cotangent)
+    for name, value in a.tensors().items():
+        assert torch.allclose(value, b.tensors()[name], atol=1e-6), name
+    seen = a.signal.norm(dim=1) > 1e-4
+    ratio = b.signal.norm(dim=1)[seen] / a.signal.norm(dim=1)[seen]
+    assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
