@@ -47,7 +47,7 @@ class Recipe:
     """Optimisation of the whole scene."""
 
     partition: Annotated[Partition | None, choice(Partition, optional=True)] = None
-    """How the scene is cut into blocks that are tuned apart, after pretraining; none leaves it whole."""
+    """How the scene is cut into blocks that are tuned separately, after pretraining; none keeps it whole."""
 
     assign: Annotated[Assign, choice(Assign)] = SSIMDifference()
     """Which views a block is tuned on, where the scene is cut."""

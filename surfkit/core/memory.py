@@ -20,7 +20,7 @@ ASKED = re.compile(r"allocate ([\d.]+ ?\w+)")
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether memory gave out, of the processor or of the device."""
+    """Whether memory ran out, of the CPU or of the device."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     if isinstance(error, OSError):

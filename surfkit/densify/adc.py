@@ -30,7 +30,7 @@ class ADC(Densify):
     """Clone small and split large points whose screen-space gradient is high; drop faint and huge ones (3DGS)."""
 
     threshold: float = 2e-4
-    """Mean length of the gradient above which a point multiplies, in units of half the image size."""
+    """Mean length of the gradient above which a point is densified, in units of half the image size."""
 
     small: float = 0.01
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
@@ -66,7 +66,7 @@ class ADC(Densify):
     """Steps after a reset before faint points are dropped again; short runs keep at least 100."""
 
     filters: tuple[Annotated[Filter, choice(Filter)], ...] = ()
-    """Conditions that a point must also meet to multiply; filters.0:NAME adds the first."""
+    """Conditions that a point must also meet to be densified; filters.0:NAME adds the first."""
 
     def __post_init__(self) -> None:
         for name in ("every", "reset_every"):
@@ -114,6 +114,6 @@ class ADC(Densify):
         return self.start < index < self.until and index % self.every == 0
 
     def _hot(self, points: Points, step: Step) -> Tensor:
-        """(N,) bool, points that should multiply."""
+        """(N,) bool, points to be densified."""
         mean = points.stat(GRAD) / points.stat(SEEN).clamp_min(1)
         return admitted(self.filters, step, mean * (mean >= self.threshold))

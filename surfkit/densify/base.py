@@ -1,4 +1,4 @@
-"""What decides how the set of points grows and shrinks."""
+"""What decides which points are added and removed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Contribution:
 
     Attributes:
         mean: (N,) mean over the views of the point's mean alpha^a T^b over the pixels it is blended into; a view that
-            does not see the point counts as 0 (CityGaussianV2, eq. 4).
+            does not see the point counts as 0 (CityGaussianV2, eq. average contribution).
         peak: (N,) the same of the view where it is largest.
         hits: (N,) int64, pixels of all views that the point is blended into.
         views: (N,) int64, views with such a pixel.
@@ -49,7 +49,7 @@ class Views(Protocol):
 
 @dataclass(frozen=True)
 class Step:
-    """What policies are told after one optimisation step.
+    """What policies know after one optimisation step.
 
     Attributes:
         index: Steps done, this one included.
@@ -79,7 +79,7 @@ class Step:
     seed: int = 0
     owns: Callable[[Tensor], Tensor] | None = None
 
-    def may_multiply(self) -> Tensor:
+    def may_be_densified(self) -> Tensor:
         """(N,) bool, the points that stand where this block owns them now; a trainer copies and splits no others."""
         means = self.splats.means
         return torch.ones(len(means), dtype=torch.bool) if self.owns is None else self.owns(means)
@@ -100,9 +100,9 @@ class Densify(Policy):
     """A policy that adds points where detail is missing."""
 
     def edit_steps(self, steps: int) -> Sequence[int] | None:
-        """The steps 1 to `steps` of a stage after which points may multiply, in order; None where that is not known.
+        """The steps 1 to `steps` of a stage after which points may be densified, in order; None if unknown.
 
-        Where there are none, the user is told so before the run.
+        Where there are none, a note says so before the run.
         """
         return None
 
@@ -112,11 +112,11 @@ class Prune(Policy):
 
 
 class Filter(Component):
-    """A condition that a point must meet to multiply."""
+    """A condition that a point must meet to be densified."""
 
     @abstractmethod
     def admits(self, step: Step, want: Tensor) -> Tensor:
-        """(N,) bool, who may multiply.
+        """(N,) bool, the points that may be densified.
 
         Args:
             step: About the N points.
@@ -125,8 +125,8 @@ class Filter(Component):
 
 
 def admitted(filters: Sequence[Filter], step: Step, want: Tensor) -> Tensor:
-    """(N,) bool, the points with a `want` above 0 that may multiply and pass one filter after the other."""
-    want = want * step.may_multiply()
+    """(N,) bool, the points with a `want` above 0 that may be densified and pass one filter after the other."""
+    want = want * step.may_be_densified()
     for condition in filters:
         want = want * condition.admits(step, want)
     return want > 0
@@ -139,7 +139,7 @@ class Signal(Component):
     """Whether the pixels' shares of the chosen gradient are to be summed without their signs."""
 
     terms: tuple[str, ...] | None
-    """Losses, by name, whose gradient is wanted apart; None when only the total is needed."""
+    """Losses, by name, whose gradient is computed separately; None when only the total is needed."""
 
     @abstractmethod
     def combine(self, chosen: Tensor, total: Tensor) -> Tensor:

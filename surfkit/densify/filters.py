@@ -1,4 +1,4 @@
-"""Conditions that a point must meet to multiply, whatever policy wants it to."""
+"""Conditions that a point must meet to be densified, whatever policy asks for it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from surfkit.densify.base import Filter, Step
 
 @dataclass(frozen=True)
 class Elongation(Filter):
-    """Keep needle-like points from multiplying (CityGaussianV2, section 3.2).
+    """Do not densify needle-like points: the elongation filter (CityGaussianV2, section 3.2).
 
     A surfel seen nearly edge-on is as thin on the screen as a line: its gradient is that of a few pixels, always large,
-    and it multiplies without end.
+    and it is densified without end.
     """
 
     min_ratio: float = 0.01
-    """Ratio of the second longest to the longest axis (eta) above which a point may multiply. The third axis of an
+    """Ratio of the second longest to the longest axis (eta) above which a point may be densified. The third axis of an
     ellipsoid does not count: where it is short, the point is flat, which is no needle."""
 
     def __post_init__(self) -> None:

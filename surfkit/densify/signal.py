@@ -13,7 +13,8 @@ from surfkit.densify.base import Signal
 
 @dataclass(frozen=True)
 class LossGradient(Signal):
-    """Screen-space gradient of the chosen losses, raised towards the size of the total (CityGaussianV2, eq. 3)."""
+    """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised towards the size of the total
+    (CityGaussianV2, eq. gradient)."""
 
     terms: tuple[str, ...] | None = None
     """Losses, by name, that drive densification; all of them if unset."""

@@ -20,7 +20,7 @@ RELEASED_TOP = 5
 
 @dataclass(frozen=True)
 class Trim(Prune):
-    """Drop the points that contribute least to the training views (CityGaussianV2, eq. 4 and 5)."""
+    """Drop the points that contribute least to the training views (CityGaussianV2, eq. average contribution)."""
 
     ratio: float = 0.025
     """Share of the points that each trim drops."""

@@ -1,4 +1,4 @@
-"""Terms of the objective, by the name users type."""
+"""Loss terms, by the name users type."""
 
 from surfkit.core.registry import hookimpl
 from surfkit.losses.depth import DepthRegression

@@ -56,7 +56,7 @@ class Target:
 
 
 def ignoring(maps: Maps, target: Target) -> tuple[Maps, Target]:
-    """Maps and sample that teach nothing where the mask is False.
+    """Maps and target without any gradient where the mask is False.
 
     There the photograph is what was rendered, no depth is known, and the maps are constants, so that no gradient
     reaches them through the windows of their neighbours either.
@@ -74,7 +74,7 @@ def ignoring(maps: Maps, target: Target) -> tuple[Maps, Target]:
 
 
 class Loss(Component):
-    """A term of the objective.
+    """A loss term.
 
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
     priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
@@ -97,7 +97,7 @@ class Loss(Component):
 
 
 class Regularizer(Component):
-    """A term of the objective that looks at the points alone, not at what is rendered."""
+    """A loss term on the points alone, not on what is rendered."""
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:

@@ -26,11 +26,11 @@ class DepthRegression(Loss):
     needs_prior: ClassVar[bool] = True
 
     start: float = 0.5
-    """Share in the objective at the first step; from there to `end` along a straight line in the logarithm, constant
+    """Loss weight at the first step; from there to `end` along a straight line in the logarithm, constant
     where both are the same."""
 
     end: float = 0.0025
-    """Share in the objective at the last step: small for estimates that are coarser than what was learnt by then, as
+    """Loss weight at the last step: small for estimates that are coarser than what was learnt by then, as
     large as `start` or larger for those to be trusted to the end."""
 
     error: Literal["l1", "ssim"] = "l1"

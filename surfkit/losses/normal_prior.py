@@ -31,10 +31,10 @@ class NormalPrior(Loss):
     needs_normals: ClassVar[bool] = True
 
     start: float = 0.05
-    """Share in the objective at the first step."""
+    """Loss weight at the first step."""
 
     end: float = 0.05
-    """Share in the objective at the last step, reached along a straight line in the logarithm."""
+    """Loss weight at the last step, reached along a straight line in the logarithm."""
 
     error: Literal["cosine", "l1", "both"] = "cosine"
     """One minus the cosine, the sum of the absolute differences of the three components, or the sum of the two."""

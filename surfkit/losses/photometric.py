@@ -1,4 +1,4 @@
-"""How far a rendered colour is from the photograph (3DGS, eq. 7)."""
+"""How far a rendered colour is from the photograph (3DGS, loss of L1 and D-SSIM)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class L1(Loss):
     """Mean absolute colour error."""
 
     weight: float = 0.8
-    """Share in the objective."""
+    """Loss weight."""
 
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight
@@ -30,7 +30,7 @@ class SSIM(Loss):
     """One minus the structural similarity with the photograph (11 x 11 window, sigma 1.5)."""
 
     weight: float = 0.2
-    """Share in the objective."""
+    """Loss weight."""
 
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight

@@ -15,7 +15,7 @@ class MeanOpacity(Regularizer):
     """Mean opacity: points that explain nothing fade away."""
 
     weight: float = 0.01
-    """Share in the objective."""
+    """Loss weight."""
 
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight
@@ -29,7 +29,7 @@ class MeanScale(Regularizer):
     """Mean scale: points shrink to what they are needed for."""
 
     weight: float = 0.01
-    """Share in the objective, for scales as a share of the scene extent."""
+    """Loss weight, for scales as a share of the scene extent."""
 
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight

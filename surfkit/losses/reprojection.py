@@ -25,7 +25,7 @@ class Reprojection(TwoViews, Loss):
     reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median")
 
     weight: float = 0.03
-    """Share in the objective of the steps that count, for errors in pixels."""
+    """Loss weight in the steps that have the term, for errors in pixels."""
 
     stride: int = 2
     """One pixel at random is looked at in each square of so many pixels a side; 1 takes all."""

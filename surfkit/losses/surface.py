@@ -16,12 +16,12 @@ from surfkit.raster.normals import disagreement
 
 @dataclass(frozen=True)
 class NormalConsistency(Loss):
-    """Splats' normals against the normals of the rendered depth (2DGS, eq. 14)."""
+    """Splats' normals against the normals of the rendered depth (2DGS, normal consistency)."""
 
     reads: ClassVar[tuple[str, ...]] = ("alpha", "depth", "median", "normal")
 
     weight: float = 0.0125
-    """Share in the objective, from `start` on."""
+    """Loss weight, from `start` on."""
 
     end: float | None = None
     """Share at the last step, reached along a straight line in the logarithm; constant if unset."""
@@ -52,12 +52,12 @@ class NormalConsistency(Loss):
 
 @dataclass(frozen=True)
 class Distortion(Loss):
-    """Spread of the splats along each ray, in inverse depth (2DGS, eq. 13)."""
+    """Spread of the splats along each ray, in inverse depth (2DGS, depth distortion)."""
 
     reads: ClassVar[tuple[str, ...]] = ("distortion",)
 
     weight: float = 0.0
-    """Share in the objective; the paper finds that it harms large scenes."""
+    """Loss weight; the paper finds that it harms large scenes."""
 
     start: Steps = 3_000
     """First step that counts."""

@@ -30,7 +30,7 @@ class TwoViews:
     needs_neighbour: ClassVar[bool] = True
 
     weight: float
-    """Share in the objective of the steps that count."""
+    """Loss weight in the steps that have the term."""
 
     start: Steps = 7_000
     """Steps without this term, as a surface must form first; 0 has it from the first step."""

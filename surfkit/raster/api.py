@@ -236,7 +236,10 @@ class Rasterizer(Component):
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
-        """Sum and count, each (N,), of alpha^a T^b over the pixels that each splat is blended into (paper eq. 4)."""
+        """Sum and count, each (N,), of alpha^a T^b over the pixels that each splat is blended into.
+
+        CityGaussianV2, eq. single-view contribution.
+        """
 
     @abstractmethod
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Normals of rendered depth, and how far the splats' own normals are from them (2DGS, eq. 14)."""
+"""Normals of rendered depth, and how far the splats' own normals are from them (2DGS, normal consistency)."""
 
 from __future__ import annotations
 

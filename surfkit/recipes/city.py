@@ -1,4 +1,4 @@
-"""CityGaussian in its two versions (Liu et al. 2024): pretraining, blocks that are tuned apart, and what follows."""
+"""CityGaussian in its two versions (Liu et al. 2024): pretraining, blocks that are tuned separately, and refinement."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ COARSE = Recipe(
 
 CITY = replace(
     COARSE,
-    about="CityGaussianV2 (Liu et al. 2024): pretraining, then blocks that are tuned apart and trimmed, then merged",
+    about="CityGaussianV2 (Liu et al. 2024): pretraining, then blocks tuned separately and trimmed, then merged",
     partition=ContractedGrid(blocks=(2, 2)),
     tune=replace(
         COARSE.pretrain,
@@ -90,7 +90,7 @@ TINY = replace(
 
 AERIAL = replace(
     CITY,
-    about="CityGaussianV2 for aerial photographs of a whole city, as in MatrixCity: 36 blocks, multiplying less often",
+    about="CityGaussianV2 for aerial photographs of a whole city, as in MatrixCity: 36 blocks, densified less often",
     partition=ContractedGrid(blocks=(6, 6)),
     tune=replace(CITY.tune, densify=ADC(cull_opacity=0.005, every=200, filters=FILTERS)),
 )
@@ -98,7 +98,7 @@ AERIAL = replace(
 # Streets are seen by few views, and none sees far: small steps, rare edits, opacities that are never reset, no trim.
 STREET = replace(
     CITY,
-    about="CityGaussianV2 for photographs from streets, as in MatrixCity: 20 blocks, slow and rarely multiplying",
+    about="CityGaussianV2 for photographs from streets, as in MatrixCity: 20 blocks, slow and rarely densified",
     pretrain=replace(
         COARSE.pretrain,
         losses=LOSSES | {"depth": DepthRegression(start=1.0, end=0.1)},

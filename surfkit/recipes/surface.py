@@ -30,7 +30,7 @@ SURFACE = Recipe(
             "normal": NormalConsistency(weight=0.05, start=3_000, depth="median"),
             "depth": DepthRegression(start=10.0, end=10.0),
         },
-        # Stereo leaves holes, which few views see or which show no texture: points multiply there. Opacities are never
+        # Stereo leaves holes, which few views see or which show no texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
     ),
@@ -40,7 +40,7 @@ SURFACE = Recipe(
 
 SURFACE_BLOCKS = replace(
     SURFACE,
-    about="The most accurate surface of a scene that one model cannot hold: blocks that are tuned apart, then merged",
+    about="The most accurate surface of a scene that one model cannot hold: blocks tuned separately, then merged",
     partition=ContractedGrid(blocks=(2, 2)),
     context="tuned",
     tune=SURFACE.pretrain,

@@ -40,7 +40,7 @@ MOST_COPIES = 1000
 
 @dataclass(frozen=True)
 class PruneAndRecover(Refine):
-    """Drop the points of least importance, and let the others make up for them."""
+    """Drop the points of least importance, then optimise the others."""
 
     stage: Stage = field(
         default_factory=lambda: Stage(densify=None, prune=(Importance(at=(0,), ratio=0.5),), rates=RECOVERY)
@@ -50,7 +50,8 @@ class PruneAndRecover(Refine):
 
 @dataclass(frozen=True)
 class DistilSH(Refine):
-    """Cut the harmonics of the colours, and learn from what the model drew before, also beside the photographs."""
+    """Lower the degree of the spherical harmonics, and learn from renders of the model before, by more cameras than the
+    photographs have."""
 
     taught: ClassVar[bool] = True
 

@@ -48,7 +48,7 @@ class Stage:
     """One optimisation run over a set of views."""
 
     steps: Interval = 30_000
-    """Photographs shown, one a step."""
+    """Optimisation steps; each shows one photograph."""
 
     losses: dict[str, Annotated[Loss, choice(Loss)]] = field(default_factory=lambda: {"l1": L1(), "ssim": SSIM()})
     """What is minimised: the weighted sum of these. losses.KEY:NAME adds or changes one, losses.KEY:none drops it."""
@@ -63,7 +63,7 @@ class Stage:
     """Which gradient drives densification."""
 
     densify: Annotated[Densify | None, choice(Densify, optional=True)] = ADC()
-    """How points multiply; none keeps their number."""
+    """Densification: how points are added; none keeps their number."""
 
     prune: tuple[Annotated[Prune, choice(Prune)], ...] = ()
     """Further ways to remove points; prune.0:NAME adds the first, prune.1:NAME the next, prune.0:none drops one."""
@@ -118,7 +118,7 @@ class StageState:
     seconds: float = 0.0
     """Wall time of the steps done."""
     cpu_seconds: float = 0.0
-    """Processor time of the steps done, all threads."""
+    """CPU time of the steps done, all threads, seconds."""
     peak_memory_bytes: int = 0
     """Most memory held so far; 0 where the system does not tell."""
     looks: Columns = field(default_factory=dict)
@@ -218,7 +218,7 @@ class Trainer:
             self.expect(order.queue[order.at :].tolist())
 
     def step(self, state: StageState) -> Done:
-        """Show one photograph, and let points and policies learn from it."""
+        """One optimisation step: render a view, compare it with its photograph, update the points, then edit them."""
         stage, index = self.stage, state.index + 1
         shown, target = self.target(state)
         active = stage.weights_at(index)
@@ -320,7 +320,7 @@ class Trainer:
     def cotangents(
         self, active: Mapping[str, float], maps: Maps, target: Target, look: Look | None
     ) -> tuple[dict[str, float], Maps, Maps | None]:
-        """The weighted losses, their gradient by the maps, and that of the losses which the signal asks for apart."""
+        """The weighted losses, their gradient by the maps, and that of the losses that `Signal.terms` names."""
         losses, terms = self.stage.losses, self.stage.signal.terms
         leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
         leafy = Maps(**leaves)
@@ -368,7 +368,7 @@ class Trainer:
         for policy in self.stage.policies:
             policy.watch(points, step)
         edit = merge([policy.edit(points, step) for policy in self.stage.policies])
-        return edit if edit is None or self.owns is None else withheld(edit, step.may_multiply())
+        return edit if edit is None or self.owns is None else withheld(edit, step.may_be_densified())
 
     def edited(self, state: StageState, edit: Edit, index: int) -> Points:
         """The points after an edit."""
