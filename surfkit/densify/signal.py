@@ -13,7 +13,7 @@ from surfkit.densify.base import Signal
 
 @dataclass(frozen=True)
 class LossGradient(Signal):
-    """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised towards the size of the total
+    """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised to the size of the total
     (CityGaussianV2, eq. gradient)."""
 
     terms: tuple[str, ...] | None = None

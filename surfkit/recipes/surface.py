@@ -30,7 +30,7 @@ SURFACE = Recipe(
             "normal": NormalConsistency(weight=0.05, start=3_000, depth="median"),
             "depth": DepthRegression(start=10.0, end=10.0),
         },
-        # Stereo leaves holes, which few views see or which show no texture: densification fills them. Opacities are never
+        # Stereo leaves holes, where few views see or nothing has texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
     ),
