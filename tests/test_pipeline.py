@@ -24,6 +24,7 @@ from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
+from surfkit.recipe import complete
 from surfkit.run import stage as optimise
 from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -279,7 +280,7 @@ def test_bad_data_leaves_nothing_behind(recipe, tmp_path):
 
 def test_load_run_gives_back_what_was_run(finished, data, recipe, tmp_path):
     loaded, state, scene = load_run(finished[0])
-    assert loaded.recipe == recipe and loaded.data == data and state.index == STEPS and len(scene.train) == 10
+    assert loaded.recipe == complete(recipe) and loaded.data == data and state.index == STEPS and len(scene.train) == 10
     with pytest.raises(BadInput, match="no run folder"):
         load_run(tmp_path)
 

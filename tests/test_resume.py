@@ -27,6 +27,7 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
+from surfkit.recipe import complete
 from surfkit.run import journal
 from surfkit.run import stage as optimise
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -123,7 +124,7 @@ def test_a_run_is_made_longer(finished, recipe, whole_recipe, tmp_path, monkeypa
     else:
         shutil.copytree(whole, out)
     metrics = run(long, data, out)
-    assert metrics["steps"] == 40 and load_run(out)[0].recipe == long and steps(out) == list(range(1, 41))
+    assert metrics["steps"] == 40 and load_run(out)[0].recipe == complete(long) and steps(out) == list(range(1, 41))
     assert len(notes(out)) == 1 and notes(out)[0].startswith("the run is made longer, from 24 steps to 40")
     assert run(long, data, out) == metrics and len(notes(out)) == 1
     with pytest.raises(BadInput, match=r"pretrain.steps 40, and this one has 24"):
