@@ -102,6 +102,7 @@ GRADIENT = Table(
     ),
 )
 
+NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; as its splats are not looked at, they take one step, and their PSNR is that of the dense start.
 SURFACE = Table(
@@ -112,9 +113,11 @@ SURFACE = Table(
         Row("2DGS, sparse points"),
         Row("+ stereo depth as a loss", DEPTH | {"depth": BEST.depth}),
         Row("+ dense start", {"start": BEST.start, "pretrain.densify": BEST.pretrain.densify}),
-        Row("+ constant depth weight", {"pretrain.losses.depth": BEST.pretrain.losses["depth"]}),
-        Row("+ normals of depth", {"pretrain.losses.normal": BEST.pretrain.losses["normal"]}),
+        Row("+ stronger depth loss", {"pretrain.losses.depth": BEST.pretrain.losses["depth"]}),
+        Row("+ no normal consistency", {"pretrain.losses": BEST.pretrain.losses}),
         Row("+ fusion by agreement", {"mesh": BEST.mesh}),
+        Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
+        Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),

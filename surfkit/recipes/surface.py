@@ -9,7 +9,6 @@ from surfkit.densify.filters import Elongation
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
-from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.grid import ContractedGrid
@@ -19,7 +18,7 @@ from surfkit.start.stereo import StereoStart
 from surfkit.train.stage import Stage
 
 SURFACE = Recipe(
-    about="The most accurate surface: 2DGS that begins at stereo depth, is held to it, and is fused where views agree",
+    about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
     primitive=Surfel2D(),
     depth=PatchMatch(),
     start=StereoStart(),
@@ -27,9 +26,10 @@ SURFACE = Recipe(
         losses={
             "l1": L1(),
             "ssim": SSIM(),
-            "normal": NormalConsistency(weight=0.05, start=3_000, depth="median"),
-            "depth": DepthRegression(start=10.0, end=10.0),
+            "depth": DepthRegression(start=10.0, end=0.1),
         },
+        # On shibuya-synth, 1,000 steps, F1 at 0.5 m within 100 m of the middle: 0.789 as it is; 0.779 with normal
+        # consistency, 0.781 with a depth weight that stays, 0.773 with both. Both keep errors of stereo in place.
         # Stereo leaves holes, where few views see or nothing has texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
