@@ -1,6 +1,8 @@
 """A folder imports only folders on lower floors, and no file grows too long."""
 
 import ast
+import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -53,6 +55,25 @@ def test_nothing_imports_upwards():
         if here != "__init__":
             wrong += [f"{path.relative_to(ROOT)} imports {there}" for there in upward(path.read_text(), here)]
     assert not wrong
+
+
+def included(path: Path) -> list[str]:
+    """Folders of surfkit that a C++ file includes files of."""
+    found = re.findall(r'(?m)^#include "([^"]+)"', path.read_text())
+    inside = [os.path.relpath((path.parent / name).resolve(), ROOT) for name in found]
+    return [Path(name).parts[0] for name in inside]
+
+
+def test_nothing_includes_upwards():
+    """The same floors hold for the C++ sources; the one module that binds them all names the others' functions only."""
+    sources = [*ROOT.rglob("*.cpp"), *ROOT.rglob("*.h")]
+    wrong = []
+    for path in sources:
+        here = path.relative_to(ROOT).parts[0]
+        lower = {here, *(name for name, level in LEVEL.items() if level < LEVEL[here])}
+        wrong += [f"{path.relative_to(ROOT)} includes {there}" for there in included(path) if there not in lower]
+    assert len(sources) > 10 and not wrong
+    assert any("native" in included(path) for path in sources), "the check reads includes"
 
 
 def test_every_folder_has_a_floor():
