@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import tyro
 
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import WHOLE, choices_first, explain_choice, owners, slots
+from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, owners, slots
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.recipe import Recipe
@@ -49,7 +49,7 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
         BadInput: One line about the words that do not fit, or about the values they give.
         SystemExit: After `--help` was printed.
     """
-    argv = [*argv, *_default(command, argv)]
+    argv = flags_as_choices(command, [*argv, *_default(command, argv)])
     token = ARGV.set(tuple(argv))
     said = io.StringIO()
     try:
@@ -129,6 +129,8 @@ def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequ
     if not word.startswith("-"):
         return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
     flag = word.partition("=")[0]
+    if names := slots(command, argv).get(flag.removeprefix("--")):
+        return f"{flag}: one of {', '.join(names)} must follow"
     if plain := difflib.get_close_matches(flag, list(_plain_flags(command)), n=2, cutoff=0.75):
         return f"no option {flag}; perhaps you meant {' or '.join(plain)}"
     similar = [line.strip() for section in more if _about(flag, section[0].strip()) for line in section[1:]]

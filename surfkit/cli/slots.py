@@ -29,8 +29,22 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
                 found |= open_places(chosen, argv) | _below(type(chosen), chosen, "")
         elif get_origin(hint) is Annotated and chosen_table in get_args(hint):
             found["table"] = tuple(tables())
+        elif get_origin(hint) is Annotated and any(getattr(mark, "name", None) == "" for mark in get_args(hint)[1:]):
+            found |= slots(get_args(hint)[0], argv)  # its settings are typed as if they were the command's own
         else:
             found |= _below(hint, getattr(command, name, None), _flag(name))
+    return found
+
+
+def flags_as_choices(command: type, argv: Sequence[str]) -> list[str]:
+    """The same words, where `--SLOT NAME` and `--SLOT=NAME` became `SLOT:NAME`: a slot is no flag, but looks like one."""
+    known, found, rest = slots(command, argv), [], list(argv)
+    while rest:
+        word = rest.pop(0)
+        flag, equals, name = word.partition("=")
+        if flag.startswith("--") and flag[2:] in known and (equals or (rest and not rest[0].startswith("-"))):
+            word = f"{flag[2:]}:{name if equals else rest.pop(0)}"
+        found.append(word)
     return found
 
 

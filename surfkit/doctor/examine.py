@@ -19,14 +19,13 @@ from surfkit.core.registry import name_of
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
-from surfkit.doctor.gather import Gathered, gather
+from surfkit.doctor.gather import Gathered, depth_maps, gather
 from surfkit.doctor.geometry import Geometry, seen_by, survey
 from surfkit.doctor.photographs import Photograph, Wanted, look_at
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
-from surfkit.readers.depth_files import find_maps
 from surfkit.readers.depth_prior import how_to_make, lacking_normals
-from surfkit.readers.read import RANDOM_POINTS, check_size, model_folder
+from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.scene.groups import apart
@@ -258,7 +257,7 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     normals = needs_normals(losses)
     make = how_to_make(data, normals)
     try:
-        maps = find_maps(data.path, model_folder(data), [shot.name for shot in train])
+        maps = depth_maps(data, gathered)
     except BadInput as error:
         return from_errors("depth-priors", [error])
     if not maps and recipe.depth is not None:
@@ -332,7 +331,8 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
         return ()
     train, held = len(gathered.train), len(shots) - len(gathered.train)
     whose = "its own split" if gathered.capture.held_out is not None else f"every {data.test_every}th"
-    whose = data.split or ("as listed" if data.test_list is not None else whose)
+    whose = "as listed" if data.test_list is not None else whose
+    whose = name_of(data.split) if data.split is not None else whose
     told = [f"train on {train} photographs, and measure on {held}" + (f" ({whose})" if held else "")]
     changes = {(look.size, data.size(*look.size)) for look in known.values() if look.size}
     if smaller := sorted((a, b) for a, b in changes if a != b):

@@ -14,14 +14,13 @@ from surfkit.core.check import BadInput
 from surfkit.doctor.estimate import Estimate, Load, Room, advice, estimate
 from surfkit.doctor.examine import Examined, Told
 from surfkit.doctor.finding import Finding, from_errors
-from surfkit.doctor.gather import heard
+from surfkit.doctor.gather import depth_maps, heard
 from surfkit.doctor.growth import Growth, growth
 from surfkit.doctor.probe import Job, Part, Probed, probe
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
-from surfkit.readers.depth_files import find_maps
 from surfkit.readers.depth_prior import prior_bytes
-from surfkit.readers.read import assembled, model_folder
+from surfkit.readers.read import assembled
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.run.stage import CHECKPOINT_EVERY
@@ -139,7 +138,7 @@ def _sizes(data: Data, examined: Examined, names: set[str]) -> list[tuple[int, i
 def _with_maps(data: Data, examined: Examined, recipe: Recipe) -> set[str]:
     """Names of the training photographs that have a depth map, or will have."""
     names = [shot.name for shot in examined.gathered.train]
-    found = set(find_maps(data.path, model_folder(data), names))
+    found = set(depth_maps(data, examined.gathered))
     return found or (set(names) if recipe.depth is not None else set())
 
 

@@ -12,12 +12,14 @@ import numpy as np
 
 from surfkit.core.check import BadInput, collecting
 from surfkit.core.events import Warned
-from surfkit.core.registry import components, hookimpl, plugins
+from surfkit.core.registry import hookimpl, name_of, plugins
 from surfkit.doctor.finding import Finding, from_errors
-from surfkit.readers.capture import Capture, Reader, Shot
+from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
+from surfkit.readers.depth_files import DepthFile
+from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.masks import FOLDER, MARKS, find_masks
-from surfkit.readers.read import captured, reader_of
+from surfkit.readers.read import captured, model_folder, reader_of
 from surfkit.scene.names import PICTURES
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
@@ -62,13 +64,22 @@ def gather(data: Data) -> Gathered:
         said = said if masks else list(warnings)  # how many masks there are is told anyway
         held_out: set[str] = set()
         try:
-            held_out = (
-                data.held_out([shot.name for shot in capture.shots], capture.held_out) if capture.shots else held_out
-            )
+            held_out = data.held_out(capture) if capture.shots else held_out
         except BadInput as error:
             faults.append(error)
     findings = from_errors("data-set", faults) + from_errors("data-set", map(BadInput, said), "warning")
     return Gathered(layout, capture, masks, frozenset(held_out), _loose(data, capture.shots), tuple(findings))
+
+
+def depth_maps(data: Data, gathered: Gathered) -> dict[str, DepthFile]:
+    """The depth map of each photograph to train on that has one, by name.
+
+    Raises:
+        BadInput: A file that describes the maps is damaged.
+    """
+    metres = data.metres_per_unit or gathered.capture.metres
+    query = DepthQuery(data.path, [shot.name for shot in gathered.train], model_folder(data), metres)
+    return find_maps(query, data.depth_layout)
 
 
 @contextmanager
@@ -100,7 +111,7 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
     layout = None
     try:
         reader = reader_of(data)
-        layout = next((name for name, cls in components(Reader).items() if isinstance(reader, cls)), None)
+        layout = name_of(reader)
         capture = captured(data, reader)
     except BadInput as error:
         faults.append(error)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import Component
-from surfkit.readers.data import Data
 
 
 @dataclass(frozen=True)
@@ -48,6 +45,7 @@ class Capture:
         shift: What files of these coordinates are to leave out; None leaves it to `Frame.around`.
         groups: Names of photographs that sparse points connect, the largest group first; none where the layout keeps no
             observations.
+        numbered: Whether the order of the photographs is that of the numbers which COLMAP has given them.
     """
 
     shots: Sequence[Shot]
@@ -58,6 +56,7 @@ class Capture:
     crs: str | None = None
     shift: tuple[float, float, float] | None = None
     groups: Sequence[Sequence[str]] = ()
+    numbered: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,37 +74,6 @@ class Tracks:
     error_px: np.ndarray
     seen: Mapping[str, tuple[np.ndarray, np.ndarray]]
     cameras: Mapping[str, Any]
-
-
-class Reader(Component):
-    """A layout of data sets: what lies where, and what the numbers mean."""
-
-    @abstractmethod
-    def recognises(self, root: Path) -> bool:
-        """Whether a folder looks like this layout, whole or damaged."""
-
-    @abstractmethod
-    def read(self, data: Data) -> Capture:
-        """What is in the folder `data.path`.
-
-        What is wrong with one photograph, or can be gone on after, goes through `core.check.reject` or `leaving_out`:
-        so `surfkit doctor` finds everything that is wrong at once.
-
-        Raises:
-            BadInput: Something is missing or damaged; one line says what to do.
-        """
-
-
-class Tracked(ABC):
-    """What a reader also offers when its layout keeps a sparse model with observations."""
-
-    @abstractmethod
-    def model_folder(self, data: Data) -> Path:
-        """Where the sparse model lies."""
-
-    @abstractmethod
-    def tracks(self, data: Data) -> Tracks:
-        """The observations of the sparse model."""
 
 
 def camera_of(where: str, model: str, size: tuple[int, int], params: Sequence[float]) -> Any:

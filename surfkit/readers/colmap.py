@@ -6,13 +6,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
-from surfkit.readers.capture import Capture, Reader, Shot, Tracked, Tracks, library
+from surfkit.readers.base import Reader
+from surfkit.readers.capture import Capture, Shot, Tracks, library
 from surfkit.readers.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.readers.data import Data, nearest
 from surfkit.scene.groups import connected
@@ -27,8 +28,10 @@ ENDS = (".bin", ".txt")
 
 
 @dataclass(frozen=True)
-class COLMAP(Reader, Tracked):
+class COLMAP(Reader):
     """COLMAP: images/ and a sparse model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, binary or text."""
+
+    priority: ClassVar[int] = 1  # other layouts have no observations of the sparse points, which aligned priors need
 
     def recognises(self, root: Path) -> bool:
         return any(len(_lacking(place, end)) < len(PARTS) for place in _places(root) for end in ENDS)
@@ -46,7 +49,7 @@ class COLMAP(Reader, Tracked):
         images, xyz, rgb, groups = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
         shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
-        return Capture(shots, xyz, rgb, groups=groups)
+        return Capture(shots, xyz, rgb, groups=groups, numbered=True)
 
     def model_folder(self, data: Data) -> Path:
         return _largest(data.path) if data.model is None else _named(data.path / data.model)

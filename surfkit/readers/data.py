@@ -1,17 +1,20 @@
-"""Which data set, at which size, and which of its photographs are kept from training."""
+"""Which data set, at which size, and which of its photographs are held out."""
 
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from surfkit.core.check import BadInput
+from surfkit.core.registry import choice, name_of
+from surfkit.readers.capture import Capture
+from surfkit.readers.depth_layout import DepthLayout
+from surfkit.readers.split import Split
 
 LONGEST = 1600
 """Default for the longest side of a photograph, pixels."""
@@ -19,20 +22,20 @@ LONGEST = 1600
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How a data set is read: at which size, from which of its files, and what is kept from training."""
+    """How a data set is read: at which size, from which of its files, and which photographs are held out."""
 
     scale: float | None = None
     """Divide the size of every photograph by this, such as 4 or 3.4175; where images_4/ holds them all, use those."""
 
     longest: int | None = None
-    """Longest side of a photograph in pixels; larger ones are reduced. 1600 when no scale is given."""
+    """Longest side of a photograph in pixels; larger ones are downscaled. 1600 when no scale is given."""
 
     test_every: int = 8
-    """Keep every Nth photograph from training, in name order from the first on, to measure with; 0 keeps none. A data
-    set with test photographs of its own keeps those."""
+    """Hold out every Nth photograph, in name order from the first on: not trained on, used to measure; 0 holds out
+    none. A data set with test photographs of its own holds out those."""
 
     test_list: Path | None = None
-    """Keep the photographs named in this file from training instead: one name a line, as below images/."""
+    """Hold out the photographs named in this file instead: one name per line, relative to images/."""
 
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
@@ -41,24 +44,27 @@ class Reading:
     """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
 
     layout: str | None = None
-    """How the data set is laid out, such as colmap (`surfkit components reader` lists them); recognised if left out."""
+    """Layout of the data set, such as colmap (`surfkit components reader` lists them); recognised if left out."""
 
     white: bool = False
-    """Lay transparent pixels of photographs over white instead of black."""
+    """Composite transparent pixels of photographs over white instead of black."""
 
     metres_per_unit: float | None = None
-    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+    """Metres per unit of the data set's coordinates, where it does not say. Settings in metres need it."""
 
     model: Path | None = None
-    """Folder of the COLMAP model, such as sparse/1, where there are several; the one of most photographs by default."""
+    """Folder of the COLMAP model, such as sparse/1, where there are several; the one with most photographs by
+    default."""
 
-    split: Literal["gauu-scene"] | None = None
-    """Keep the photographs from training that a paper kept: gauu-scene, of n, every k-th in the order of COLMAP's
-    numbers, k = n // ceil(n / 10)."""
+    split: Annotated[Split | None, choice(Split, optional=True)] = None
+    """Rule of which photographs are held out, such as gauu-scene, instead of --test-every."""
+
+    depth_layout: Annotated[DepthLayout | None, choice(DepthLayout, optional=True)] = None
+    """Layout of the data set's depth maps, such as nerfstudio-depths; recognised if left out."""
 
     test_data: Path | None = None
-    """Another data set, of the same layout and in the same coordinates, whose photographs are all kept from training:
-    the test folder of MatrixCity as CityGaussian prepares it."""
+    """Another data set, of the same layout and in the same coordinates, whose photographs are all held out: the test
+    folder of MatrixCity as CityGaussian prepares it."""
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 1 <= self.scale < float("inf"):
@@ -66,11 +72,11 @@ class Reading:
         if self.longest is not None and self.longest < 1:
             raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
         if sum(given is not None for given in (self.split, self.test_list, self.test_data)) > 1:
-            raise BadInput("--split, --test-list and --test-data each choose what is kept from training; give one")
+            raise BadInput("--split, --test-list and --test-data each choose what is held out; give one")
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every < 0:
-            raise BadInput(f"--test-every {self.test_every}: it must be 0 (keep no photograph from training) or more")
+            raise BadInput(f"--test-every {self.test_every}: it must be 0 (hold out none) or more")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height to use, for a photograph of `width` x `height` pixels; never larger than it is."""
@@ -78,26 +84,36 @@ class Reading:
         by = max(self.scale or 1.0, max(width, height) / longest)
         return max(1, round(width / by)), max(1, round(height / by))
 
-    def held_out(self, names: Sequence[str], own: Collection[str] | None = None) -> set[str]:
-        """Which photographs are kept from training.
+    def held_out(self, capture: Capture) -> set[str]:
+        """Names of the photographs that are held out: not trained on, kept to measure with.
 
-        Args:
-            names: Of all photographs, in the data set's own order.
-            own: Those that the data set itself keeps; None if it keeps none.
+        Raises:
+            BadInput: All of them, or some that are not there.
         """
-        chosen = set(sorted(names)[:: self.test_every]) if self.test_every else set()
-        if own is not None:
-            chosen = set(own)
+        names = [shot.name for shot in capture.shots]
         if self.split is not None:
-            chosen = set(names[:: len(names) // math.ceil(len(names) / 10)])
-        if self.test_list is not None:
-            chosen = _listed(self.test_list, names)
+            chosen, rule = self._by_rule(self.split, capture)
+        elif self.test_list is not None:
+            chosen, rule = _listed(self.test_list, names), f"--test-list {self.test_list}"
+        elif capture.held_out is not None:
+            chosen, rule = set(capture.held_out), "the data set's own split"
+        else:
+            chosen = set(sorted(names)[:: self.test_every]) if self.test_every else set()
+            rule = f"--test-every {self.test_every}"
         if len(chosen) == len(names):
-            what = f"--test-every {self.test_every}" if own is None else "the data set's own split"
-            what = f"--split {self.split}" if self.split else what
-            what = f"--test-list {self.test_list}" if self.test_list else what
-            raise BadInput(f"{what} keeps all {len(names)} photographs from training; use --test-every 0 to keep none")
+            raise BadInput(f"{rule} holds out all {len(names)} photographs; use --test-every 0 to hold out none")
         return chosen
+
+    def _by_rule(self, split: Split, capture: Capture) -> tuple[set[str], str]:
+        """What a split holds out, and how the user chose it."""
+        rule = f"--split {name_of(split)}"
+        try:
+            chosen = set(split.held_out(capture))
+        except BadInput as error:
+            raise BadInput(f"{rule}: {error}") from error
+        if unknown := chosen - {shot.name for shot in capture.shots}:
+            raise BadInput(f"{rule} holds out {min(unknown)!r}, which is no photograph of the data set")
+        return chosen, rule
 
     def of(self, path: Path) -> Data:
         """The data set at `path`, read so."""

@@ -14,7 +14,9 @@ from torch.nn.functional import interpolate
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.readers.data import Data
-from surfkit.readers.depth_files import DepthFile, find_maps, normal_path, read_record
+from surfkit.readers.depth_files import DepthFile, normal_path, read_record
+from surfkit.readers.depth_layout import DepthQuery, find_maps
+from surfkit.readers.depth_layouts import EstimatedDepths
 from surfkit.readers.made_maps import located
 from surfkit.readers.read import model_folder, observations
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
@@ -145,8 +147,9 @@ def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
     """The depth map of each training photograph that has one, by name: of the data set, or made for it."""
     names = [view.name for view in scene.train]
     if data.priors is not None:
-        return find_maps(folder := located(data.priors), folder, names)
-    return find_maps(data.path, model_folder(data), names, scene.frame.metres)
+        return find_maps(DepthQuery(folder := located(data.priors), names, folder), EstimatedDepths())
+    query = DepthQuery(data.path, names, model_folder(data), scene.frame.metres)
+    return find_maps(query, data.depth_layout)
 
 
 def read_priors(
@@ -312,7 +315,7 @@ def _warn_of_leaks(data: Data, scene: Scene) -> None:
     seen = [view.name for view in scene.held_out if isinstance(used, list) and view.name in used]
     if seen:
         text = (
-            f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs kept from training, "
+            f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs held out, "
             f"{seen[0]} for one, so the quality will look better than it is; "
             f"{how_to_make(data)} --again, with the same split"
         )

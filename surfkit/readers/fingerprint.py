@@ -44,7 +44,7 @@ class Print:
         size: Of the file, bytes; -1 if it cannot be read.
         time_ns: When the file was last written. While this and the size stay, its content is not read again.
         content: Digest of three pieces of the file, or of all of it when it is not longer.
-        held_out: Whether it is kept from training.
+        held_out: Whether it is held out.
         beside: Its mask, depth map, confidence and normals, those that there are, by what they are.
     """
 
@@ -165,7 +165,7 @@ def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Pa
     if view.mask is not None:
         yield "mask", view.mask, ""
     if file := maps.get(view.name):
-        yield "depth map", file.path, digest((file.aligned, file.scale, file.offset, file.metric))
+        yield "depth map", file.path, digest(file.meaning)
         if (path := confidence_path(file.path)).exists():
             yield "confidence of depth", path, ""
         if (path := normal_path(file.path)).exists():

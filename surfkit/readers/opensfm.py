@@ -12,7 +12,8 @@ import numpy as np
 from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
-from surfkit.readers.capture import Capture, Reader, Shot, camera_of
+from surfkit.readers.base import Reader
+from surfkit.readers.capture import Capture, Shot, camera_of
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import placed
 from surfkit.scene.names import find_files

@@ -13,8 +13,9 @@ import torch
 
 from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
-from surfkit.core.registry import components, find
-from surfkit.readers.capture import Capture, Reader, Shot, Tracked
+from surfkit.core.registry import components, find, name_of
+from surfkit.readers.base import Reader
+from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.colmap import COLMAP, MODELS
 from surfkit.readers.data import Data
 from surfkit.readers.masks import check_mask, find_masks
@@ -39,7 +40,7 @@ def read(data: Data) -> Scene:
     reader = reader_of(data)
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
-        emit(Warned(f"{data.path}: read as COLMAP; it could also be read with --layout {others}"))
+        emit(Warned(f"{data.path}: read as {name_of(reader)}; it could also be read with --layout {others}"))
     capture = captured(data, reader)
     if text := apart(capture.groups):
         emit(Warned(text))
@@ -48,9 +49,8 @@ def read(data: Data) -> Scene:
 
 def captured(data: Data, reader: Reader) -> Capture:
     """What a reader finds in a data set, and in the one that is for tests."""
-    for name, value in {"model": data.model, "split": data.split}.items():
-        if value is not None and not isinstance(reader, Tracked):
-            raise BadInput(f"--{name} {value}: is for COLMAP data sets; leave it out")
+    if data.model is not None and reader.model_folder(data) is None:
+        raise BadInput(f"--model {data.model}: a data set of layout {name_of(reader)} has no such model; leave it out")
     capture = reader.read(data)
     return capture if data.test_data is None else _with_tests(capture, reader, data)
 
@@ -64,7 +64,7 @@ def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Coll
         keep: Folder of the undistorted photographs; by default one that later runs find again.
         only: Names of the photographs to make views of; all by default.
     """
-    held_out = data.held_out([shot.name for shot in capture.shots], capture.held_out)
+    held_out = data.held_out(capture)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     if twice := next((a.name for a, b in pairwise(shots) if a.name == b.name), None):
         reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
@@ -119,11 +119,11 @@ def reader_of(data: Data) -> Reader:
     if data.layout is not None:
         return find(Reader, data.layout)()
     fitting = _fitting(root)
-    if "colmap" in fitting:  # it has the points and their observations
-        return fitting["colmap"]
-    if len(fitting) > 1:
-        raise BadInput(f"{root}: could be of layout {' or '.join(fitting)}; choose one with --layout")
-    return next(iter(fitting.values()), COLMAP())
+    highest = max((reader.priority for reader in fitting.values()), default=0)
+    first = {name: reader for name, reader in fitting.items() if reader.priority == highest}
+    if len(first) > 1:
+        raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
+    return next(iter(first.values()), COLMAP())  # which says what it lacks
 
 
 def _fitting(root: Path) -> dict[str, Reader]:
@@ -138,10 +138,9 @@ def observations(data: Data, scene: Scene) -> Observations:
         data: The data set.
         scene: That `read` gave for it.
     """
-    reader = reader_of(data)
-    if not isinstance(reader, Tracked):
+    tracks, seen = reader_of(data).tracks(data), {}
+    if tracks is None:
         return Observations(np.zeros((0, 3)), np.zeros(0), {})
-    tracks, seen = reader.tracks(data), {}
     for view in (*scene.train, *scene.held_out):
         if view.name in tracks.seen:
             rows, pixels = tracks.seen[view.name]
@@ -151,8 +150,7 @@ def observations(data: Data, scene: Scene) -> Observations:
 
 def model_folder(data: Data) -> Path:
     """Where the sparse model of a data set lies; the data set itself if its layout has none."""
-    reader = reader_of(data)
-    return reader.model_folder(data) if isinstance(reader, Tracked) else data.path
+    return reader_of(data).model_folder(data) or data.path
 
 
 def _wanted() -> str:

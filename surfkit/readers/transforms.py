@@ -13,10 +13,12 @@ import numpy as np
 
 from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
-from surfkit.readers.capture import Capture, Reader, Shot, camera_of, shortened
+from surfkit.readers.base import Reader
+from surfkit.readers.capture import Capture, Shot, camera_of, shortened
 from surfkit.readers.data import Data
 from surfkit.readers.depth_cloud import points_of_depth
-from surfkit.readers.depth_files import matrixcity_maps
+from surfkit.readers.depth_layout import DepthQuery, find_maps
+from surfkit.readers.depth_layouts import MatrixCityDepths
 from surfkit.readers.sparse_ply import read_points
 from surfkit.scene.photos import photo_size
 
@@ -49,7 +51,7 @@ class Nerfstudio(Reader):
 
 @dataclass(frozen=True)
 class Blender(Reader):
-    """Blender renders of NeRF: transforms_train.json and transforms_test.json, which is kept from training."""
+    """Blender renders of NeRF: transforms_train.json and transforms_test.json, which is held out."""
 
     def recognises(self, root: Path) -> bool:
         return (root / "transforms_train.json").is_file()
@@ -79,8 +81,8 @@ class MatrixCity(Reader):
         held = [shot for path in _blocks(data.path / "test") for shot in frames(path, data)[1]]
         metres, sparse = _metres(read[0][0]), points(data.path, {})
         if not len(sparse[0]):
-            maps = matrixcity_maps(data.path, [shot.name for shot in train], metres) if metres else {}
-            sparse = points_of_depth(train, maps)
+            query = DepthQuery(data.path, [shot.name for shot in train], data.path, metres)
+            sparse = points_of_depth(train, find_maps(query, MatrixCityDepths()))
         return replace(_split(train, held, sparse), metres=metres)
 
 

@@ -193,8 +193,11 @@ def read_record(out: Path) -> dict[str, Any]:
 
 def read_data(out: Path) -> Data:
     """The data that a run was made from."""
+    data = read_record(out).get("data")
+    if isinstance(data, dict) and isinstance(name := data.get("split"), str):
+        data |= {"split": {"use": name}}  # of an older run: a split was a name
     try:
-        return load(Data, read_record(out).get("data"), "data")
+        return load(Data, data, "data")
     except BadInput as error:
         raise BadInput(f"{out / 'run.json'}: {error}") from error
 

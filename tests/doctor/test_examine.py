@@ -404,7 +404,7 @@ def test_no_folder_and_a_wrong_layout(tmp_path, farm):
     assert "no Reader named" in told(farm, layout="nonsense")["data-set"][0].text
     (tmp_path / "empty").mkdir()
     assert "the folder is empty" in told(tmp_path / "empty")["data-set"][0].text
-    assert "keeps all 16 photographs" in told(farm, test_every=1)["data-set"][0].text
+    assert "holds out all 16 photographs" in told(farm, test_every=1)["data-set"][0].text
 
 
 def test_distorted_photographs_are_not_undistorted_yet(farm):

@@ -12,10 +12,11 @@ from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.read import RANDOM_POINTS, read
+from surfkit.readers.split import GauUScene
 from surfkit.run.notes import noted
 from surfkit.testing.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
-from .folders import DEPTHS, FLIGHT, city, renumbered, squarely, with_tests_apart
+from .folders import DEPTHS, FLIGHT, city, nerfstudio, renumbered, squarely, with_tests_apart
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +93,17 @@ def test_the_split_of_gauu_scene(tmp_path):
     """24 images: step 24 // 3 = 8, in the order of COLMAP's numbers, not of the names."""
     write_colmap(tmp_path, photograph(Flight(views=24, width=16, height=12, points=30, test_every=0)))
     renumbered(tmp_path / "sparse/0")
-    held = [view.name for view in read(Data(tmp_path, split="gauu-scene")).held_out]
+    held = [view.name for view in read(Data(tmp_path, split=GauUScene())).held_out]
     assert held == ["view_007.png", "view_015.png", "view_023.png"]
     assert [view.name for view in read(Data(tmp_path)).held_out] == ["view_000.png", "view_008.png", "view_016.png"]
     with pytest.raises(BadInput, match="--split, --test-list and --test-data each choose"):
-        Data(tmp_path, split="gauu-scene", test_list=Path("a.txt"))
-    with pytest.raises(BadInput, match="--split gauu-scene: is for COLMAP data sets"):
-        (tmp_path / "transforms.json").write_text("{}")
-        read(Data(tmp_path, split="gauu-scene", layout="nerfstudio"))
+        Data(tmp_path, split=GauUScene(), test_list=Path("a.txt"))
+
+
+def test_the_split_of_gauu_scene_needs_the_numbers_of_colmap(tmp_path, truth):
+    data = nerfstudio(tmp_path, truth)
+    with pytest.raises(BadInput, match="^--split gauu-scene: is for COLMAP data sets; leave it out$"):
+        read(Data(data, split=GauUScene()))
 
 
 def test_a_test_folder_with_a_model_of_its_own(tmp_path, truth):

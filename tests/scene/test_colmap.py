@@ -181,7 +181,7 @@ def test_split_by_a_list(made, tmp_path):
         ({"scale": 0.5}, "--scale 0.5"),
         ({"longest": 0}, "--longest 0"),
         ({"test_every": -1}, "--test-every -1"),
-        ({"test_every": 1}, "--test-every 1 keeps all 5 photographs"),
+        ({"test_every": 1}, "--test-every 1 holds out all 5 photographs"),
         ({"test_list": "view_003.jpg"}, "no photograph 'view_003.jpg' in the model; did you mean 'view_003.png'?"),
         ({"test_list": "\n"}, "names no photograph"),
         ({"test_list": None}, "cannot be read as text: No such file"),

@@ -13,7 +13,8 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.readers import read as scenes
 from surfkit.readers.data import Data
-from surfkit.readers.depth_files import confidence_path, find_maps, map_path, normal_path, write_map, write_record
+from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
+from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_prior import read_priors, resized
 from surfkit.readers.read import observations
 from surfkit.run.notes import noted
@@ -257,7 +258,7 @@ def test_round_trip_of_files(tmp_path):
     inverse, confidence = draw.random((5, 7)).astype(np.float32), draw.random((5, 7))
     inverse[0, 0] = 0
     write_map(tmp_path, "left/a.jpg", inverse, confidence)
-    file = find_maps(tmp_path, tmp_path, ["left/a.jpg", "b.jpg"])
+    file = find_maps(DepthQuery(tmp_path, ["left/a.jpg", "b.jpg"], tmp_path))
     assert list(file) == ["left/a.jpg"] and file["left/a.jpg"].path == tmp_path / "estimated_depths/left/a.jpg.npy"
     again = file["left/a.jpg"].read()
     assert np.isnan(again[0, 0]) and np.array_equal(np.nan_to_num(again), inverse)

@@ -171,7 +171,7 @@ def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, t
     with noted() as kept:
         notes = kept.texts
         assert observations(Data(tmp_path), read(Data(tmp_path))).seen
-    assert len(notes) == 1 and "read as COLMAP; it could also be read with --layout nerfstudio, odm" in notes[0]
+    assert len(notes) == 1 and "read as colmap; it could also be read with --layout nerfstudio, odm" in notes[0]
 
 
 def test_opendronemap_on_the_map(tmp_path, truth):
