@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from surfkit.cli.recipes import ARGV
+from surfkit.cli.result import mesh_rows
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -100,17 +101,7 @@ class MeshOf:
 
 def show(run: Run, record: dict[str, Any]) -> None:
     """Print what the mesh is, and the paths of what was written."""
-    cleaning, lengths = record["cleaning"], record["lengths"]
-    rows = [
-        ("triangles", f"{cleaning['triangles']:,}"),
-        ("vertices", f"{cleaning['vertices']:,}"),
-        ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
-        ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
-        *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
-        *((name.replace("_", " "), f"{value:.6g}") for name, value in lengths.items()),
-        ("seconds", f"{record['seconds']:.1f}"),
-    ]
-    print_table(("mesh", "value"), rows)
+    print_table(("mesh", "value"), mesh_rows(record))
     print()
     paths = [("mesh", run.out / name) for name in record["files"]] + [("facts", run.mesh_record)]
     paths += [("picture", path) for path in sorted(run.mesh_pictures.glob("*.png"))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
 from surfkit.run.folder import Run
 
 LPIPS = {
@@ -34,6 +36,10 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
             rows += geometry_rows(metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
+    if run.mesh_record.exists():
+        with sound(run.mesh_record, "damaged; delete it, and the surfkit train command of the run makes the mesh anew"):
+            print_table(("mesh", "value"), mesh_rows(read_json(run.mesh_record, dict[str, Any])))
+        print()
     written = [("metrics", run.metrics), ("points", run.cloud)]
     if run.mesh_record.exists():  # without it, what is there is of an earlier model
         meshes = sorted(path for path in run.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
@@ -111,6 +117,29 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
     return rows
+
+
+def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """What mesh.json says of a mesh: its size, and whatever facts its mesher gives."""
+    cleaning, facts = record["cleaning"], record.get("facts", record.get("lengths", {}))  # so called by older versions
+    return [
+        ("triangles", f"{cleaning['triangles']:,}"),
+        ("vertices", f"{cleaning['vertices']:,}"),
+        ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
+        ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
+        *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
+        *((in_words(name.replace("_", " ")), in_words(value)) for name, value in facts.items()),
+        ("seconds", f"{record['seconds']:.1f}"),
+    ]
+
+
+def in_words(value: Any) -> str:
+    """A plain value for a table: on one line, and short."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    printable = isinstance(value, str) and value.isprintable()
+    text = value if printable else json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def zone_rows(images: dict[str, Any]) -> list[tuple[str, str]]:

@@ -37,7 +37,7 @@ def slots(command: type, argv: Sequence[str]) -> Slots:
 
 
 def flags_as_choices(command: type, argv: Sequence[str]) -> list[str]:
-    """The same words, where `--SLOT NAME` and `--SLOT=NAME` became `SLOT:NAME`: a slot is no flag, but looks like one."""
+    """The same words, with `--SLOT NAME` and `--SLOT=NAME` rewritten to `SLOT:NAME`."""
     known, found, rest = slots(command, argv), [], list(argv)
     while rest:
         word = rest.pop(0)

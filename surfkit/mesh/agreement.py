@@ -71,8 +71,8 @@ class Agreement(Trust):
             )
 
     @property
-    def needs_prior(self) -> bool:  # type: ignore[override] (a setting decides)
-        """Whether priors count."""
+    def needs_prior(self) -> bool:
+        """See `Trust.needs_prior`."""
         return self.priors == "weigh"
 
     def within(self, maps: Maps, depth: Tensor, prior: DepthPrior | None) -> Tensor:

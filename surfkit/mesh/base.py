@@ -6,16 +6,20 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Frame, View
+
+MOST_LEVELS = 50
+"""Lists and dicts within one another that facts may have."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Mesh:
         vertices: (V, 3) float32 local positions.
         faces: (F, 3) int32 rows of `vertices`, counter-clockwise seen from outside.
         colors: (V, 3) uint8, or None.
-        facts: How it was made, for mesh.json: what automatic settings became, how many tiles there were. Plain values.
+        facts: How it was made, such as the values of automatic settings: any plain values, see `require_plain`, written
+            to mesh.json and shown to the user.
     """
 
     vertices: np.ndarray
@@ -69,20 +74,22 @@ class MeshInput:
 
 
 class Mesher(Component):
-    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`.
+    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`."""
 
-    Depth priors are only made for a run whose data set has none, and read, when it has `needs_prior`.
-    """
+    @property
+    def needs_prior(self) -> bool:
+        """Whether it looks at depth priors.
+
+        Only then are they read and, where the data set has none, made.
+        """
+        return False
 
     def ready(self) -> None:
-        """Look, before hours are spent, whether it can work.
+        """Check, before hours are spent, whether it can work.
 
         Raises:
-            BadInput: A package that it is made with cannot be loaded on this machine.
+            BadInput: A package that it needs cannot be loaded on this machine.
         """
-
-    needs_prior: ClassVar[bool] = False
-    """Whether the mesher looks at depth priors, where there are any; settings of some decide."""
 
     @abstractmethod
     def mesh(self, subject: MeshInput) -> Mesh:
@@ -91,3 +98,29 @@ class Mesher(Component):
         Raises:
             BadInput: There is nothing to mesh, such as no depth in any view.
         """
+
+
+def require_plain(value: Any, at: str, levels: int = MOST_LEVELS) -> None:
+    """BadInput unless a value can be written to JSON: None, a bool, number or text, or lists and dicts of plain values.
+
+    Args:
+        value: The value.
+        at: Its dotted path, for messages.
+        levels: How many lists and dicts may be nested in one another.
+    """
+    if value is None or isinstance(value, (bool, float, str)) or (isinstance(value, int) and abs(value) < 2**63):
+        return
+    if isinstance(value, int):
+        raise BadInput(f"{at} is an int beyond 64 bits; give text, or a float")
+    if not isinstance(value, (dict, list, tuple)):
+        text = repr(value)
+        raise BadInput(
+            f"{at} is {text if len(text) <= 60 else text[:57] + '...'} ({type(value).__name__}), which is not plain: "
+            "give None, a bool, a number, text, or lists and dicts of these"
+        )
+    if not levels:
+        raise BadInput(f"{at}: lists and dicts are nested more than {MOST_LEVELS} levels deep")
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        if isinstance(value, dict) and not isinstance(key, str):
+            raise BadInput(f"{at} has the key {key!r} ({type(key).__name__}), which is not text")
+        require_plain(item, f"{at}.{key}", levels - 1)

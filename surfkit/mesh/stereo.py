@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -24,8 +23,6 @@ POINTS = 2_000_000
 class Stereo(Mesher):
     """Fuse the depth priors of the data set, coloured by its photographs; the splats are not looked at."""
 
-    needs_prior: ClassVar[bool] = True
-
     min_confidence: float = 0.375
     """Least confidence of a pixel that counts; maps without a confidence count everywhere."""
 
@@ -35,6 +32,11 @@ class Stereo(Mesher):
     def __post_init__(self) -> None:
         if not 0 < self.min_confidence <= 1:
             raise BadInput(f"mesh.min_confidence is {self.min_confidence:g}; it must be more than 0 and at most 1")
+
+    @property
+    def needs_prior(self) -> bool:
+        """See `Mesher.needs_prior`."""
+        return True
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
 
 from torch import Tensor
 
@@ -19,8 +18,10 @@ class Trust(Component):
     A pixel that is left out also clears nothing of what lies before it.
     """
 
-    needs_prior: ClassVar[bool] = False
-    """Whether `within` looks at depth priors, where there are any."""
+    @property
+    def needs_prior(self) -> bool:
+        """Whether `within` looks at depth priors, where there are any."""
+        return False
 
     @abstractmethod
     def within(self, maps: Maps, depth: Tensor, prior: DepthPrior | None) -> Tensor:

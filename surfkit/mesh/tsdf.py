@@ -71,7 +71,7 @@ class TSDF(Mesher):
             raise BadInput(f"mesh.least_views is {self.least_views:g}; it must be more than 0 and at most 1000")
 
     @property
-    def needs_prior(self) -> bool:  # type: ignore[override] (a setting decides)
+    def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
         return self.trust is not None and self.trust.needs_prior
 

@@ -21,7 +21,7 @@ PHOTOS = ("rgb", "images", "input")
 
 @dataclass(frozen=True)
 class EstimatedDepths(DepthLayout):
-    """CityGaussianV2 and `surfkit prepare depth`: inverse depth in estimated_depths/IMAGE.npy, IMAGE with its extension.
+    """CityGaussianV2 and `surfkit prepare depth`: inverse depth in estimated_depths/a.jpg.npy for the photograph a.jpg.
 
     Relative, unless surfkit's estimated_depths/depth.json says that it is in units of the data set.
     """

@@ -12,7 +12,6 @@ from surfkit.core.tree import evolve
 from surfkit.densify.filters import CountCap
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe
-from surfkit.start.stereo import StereoStart
 
 
 @dataclass(frozen=True)
@@ -91,9 +90,7 @@ def capped(recipe: Recipe, points: int | None) -> Recipe:
     if points is None:
         return recipe
     limit = CountCap(points)
-    if isinstance(start := recipe.start, StereoStart):
-        given = start.points if start.points == "auto" else min(start.points, points)
-        recipe = replace(recipe, start=replace(start, points=given, most=min(start.most, points)))
+    recipe = replace(recipe, start=recipe.start.limited(points))
     if recipe.pretrain.densify is None:
         return recipe
     filters = getattr(recipe.pretrain.densify, "filters", ())

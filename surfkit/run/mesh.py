@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, emit
+from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
-from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain
 from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
@@ -132,9 +133,9 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
     for left in run.out.glob(TILES):
         shutil.rmtree(left)  # of a process that was killed
     raw = mesher.mesh(subject)
+    facts = plain_facts(mesher, raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
-    facts = dict(raw.facts)
     del raw
     forget(run)
     written = list(write_files(run, mesh, delivery, subject))
@@ -142,7 +143,7 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
         "mesher": mesher,
         "delivery": delivery,
         "steps": steps,
-        "lengths": facts,
+        "facts": facts,
         "cleaning": describe(report, subject),
         "files": [path.name for path in written],
         "crs": frame.crs,
@@ -153,6 +154,19 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
     write_json(run.mesh_record, record)
     emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
+
+
+def plain_facts(mesher: Mesher, mesh: Mesh) -> dict[str, Any]:
+    """The facts that come with a mesh; BadInput, which names the mesher, if they cannot be written to JSON."""
+    facts = {} if mesh.facts is None else mesh.facts
+    facts = dict(facts) if isinstance(facts, Mapping) else facts
+    try:
+        if not isinstance(facts, dict):
+            raise BadInput(f"facts is a {type(facts).__name__}, not a dict")
+        require_plain(facts, "facts")
+    except BadInput as error:
+        raise BadInput(f"mesh:{name_of(mesher)}: {error}") from error
+    return facts
 
 
 def describe(report: Report, subject: MeshInput) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -35,9 +34,16 @@ class StartInput:
 
 
 class Start(Component):
-    """A way to find the points that splats begin at. Depth priors are only read when it has `needs_prior`."""
+    """A way to find the points that the optimisation starts from."""
 
-    needs_prior: ClassVar[bool] = False
+    @property
+    def needs_prior(self) -> bool:
+        """Whether it looks at depth priors. Only then are they read and, where the data set has none, made."""
+        return False
+
+    def limited(self, points: int) -> Start:
+        """The same start, limited to a number of points where it has a setting for that; for comparisons."""
+        return self
 
     @abstractmethod
     def cloud(self, known: StartInput) -> Cloud:

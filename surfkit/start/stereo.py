@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -40,8 +40,6 @@ class StereoStart(Start):
     are used only where the maps have none; what neither knows is left to densification.
     """
 
-    needs_prior: ClassVar[bool] = True
-
     points: int | Literal["auto"] = "auto"
     """How many; auto is one every `spacing_px` pixels at the typical depth of the data set, `most` at most."""
 
@@ -69,6 +67,16 @@ class StereoStart(Start):
             raise BadInput("start.most must be 1 or more, and start.spacing_px and start.size above 0")
         if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
             raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
+
+    @property
+    def needs_prior(self) -> bool:
+        """See `Start.needs_prior`."""
+        return True
+
+    def limited(self, points: int) -> StereoStart:
+        """See `Start.limited`."""
+        wanted = self.points if self.points == "auto" else min(self.points, points)
+        return replace(self, points=wanted, most=min(self.most, points))
 
     def cloud(self, known: StartInput) -> Cloud:
         """See `Start.cloud`."""

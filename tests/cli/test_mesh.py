@@ -32,7 +32,7 @@ def test_training_ends_with_a_mesh(finished, capsys):
     facts = record(out)
     mesh = trimesh.load(out / "mesh.ply", process=False)
     assert len(mesh.faces) == facts["cleaning"]["triangles"] > 100 and facts["steps"] == 60
-    assert facts["mesher"]["use"] == "tsdf" and facts["lengths"]["voxel"] > 0
+    assert facts["mesher"]["use"] == "tsdf" and facts["facts"]["voxel"] > 0
     # The ground is at z = 0 in the frame of the input, and the box and the ball are below 5 m.
     assert abs(np.median(mesh.vertices[:, 2])) < 2 and mesh.vertices[:, 2].max() < 30
     pictures = sorted(path.name for path in (out / "mesh_pictures").iterdir())
@@ -63,7 +63,7 @@ def test_another_mesh_of_the_same_run(finished, tmp_path, capsys):
     words += ["--formats", "ply", "obj", "glb", "--lods", "0.5", "--least-triangles", "20", "--crop-box"]
     assert main(["mesh", str(out), *words, "-50", "-50", "-2", "50", "50", "3"]) == 0
     facts = record(out)
-    assert facts["lengths"]["voxel_m"] == pytest.approx(0.5) and facts["metres_per_unit"] == 1
+    assert facts["facts"]["voxel_m"] == pytest.approx(0.5) and facts["metres_per_unit"] == 1
     assert sorted(facts["files"]) == sorted(
         ["mesh.ply", "mesh.obj", "mesh.glb", "mesh.glb.json"]
         + [f"mesh-lod1.{end}" for end in ("ply", "obj", "glb", "glb.json")]

@@ -246,7 +246,7 @@ def test_a_sound_data_set_is_sound_and_is_not_touched(made):
     )
     assert examined.diagnosis.will == (
         "train on 14 photographs, and measure on 2 (every 8th)",
-        "start from 1,500 sparse points",
+        "start from about 1,500 points (start:sparse)",
     )
 
 
