@@ -37,7 +37,7 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     print_table(("metric", "value"), rows)
     print()
     if run.mesh_record.exists():
-        with sound(run.mesh_record, "damaged; delete it, and the surfkit train command of the run makes the mesh anew"):
+        with sound(run.mesh_record, "damaged; delete it, and surfkit mesh makes the mesh again"):
             print_table(("mesh", "value"), mesh_rows(read_json(run.mesh_record, dict[str, Any])))
         print()
     written = [("metrics", run.metrics), ("points", run.cloud)]

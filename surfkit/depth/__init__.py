@@ -1,4 +1,4 @@
-"""Estimators of depth, by the name users type."""
+"""Depth estimators, by registered name."""
 
 from surfkit.core.registry import hookimpl
 from surfkit.depth.depth_anything import DepthAnythingV2

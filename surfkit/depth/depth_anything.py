@@ -27,7 +27,7 @@ LARGEST = 8400
 
 @dataclass(frozen=True)
 class DepthAnythingV2(DepthEstimator):
-    """Relative inverse depth of single photographs by Depth Anything V2 (Yang et al. 2024), aligned afterwards.
+    """Relative inverse depth of single photographs by Depth Anything V2 (Yang et al. 2024), aligned to sparse points.
 
     Needs `pip install surfkit[depth]`, and weights: small is under Apache-2.0, base and large are under CC BY-NC 4.0,
     which forbids commercial use. The paper uses large.
@@ -40,7 +40,7 @@ class DepthAnythingV2(DepthEstimator):
     """Folder of weights, or their name on the Hugging Face hub; the published ones of `size` if empty."""
 
     shortest: int = 518
-    """Shortest side of the pictures that the network sees, pixels; rounded to patches of 14."""
+    """Shortest side of the images given to the network, pixels; rounded to patches of 14."""
 
     def __post_init__(self) -> None:
         if not PATCH <= self.shortest <= LARGEST:
@@ -73,7 +73,7 @@ class DepthAnythingV2(DepthEstimator):
         """The network with its weights.
 
         Raises:
-            BadInput: transformers is missing or cannot be loaded, or the weights cannot be had.
+            BadInput: transformers is missing or cannot be loaded, or the weights cannot be downloaded.
         """
         with needed("transformers", "estimator:depth-anything-v2"):
             from transformers import AutoModelForDepthEstimation
@@ -81,8 +81,8 @@ class DepthAnythingV2(DepthEstimator):
             return AutoModelForDepthEstimation.from_pretrained(self.source)
         except (OSError, ValueError, RuntimeError) as error:
             raise BadInput(
-                f"the weights {self.source} cannot be had: download them where there is a network, and give the folder "
-                f"with --estimator.weights ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
+                f"the weights {self.source} cannot be loaded: download them on a machine with a network, and give the "
+                f"folder with --estimator.weights ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
             ) from error
 
     def inverse_depth(self, network: Any, rgb: Tensor) -> Tensor:

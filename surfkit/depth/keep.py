@@ -1,4 +1,4 @@
-"""Depth maps for runs whose data set has none: made once, kept in the user's cache, and thrown away when it is full."""
+"""Depth maps for runs whose data set has none: made once, kept in the user's cache, deleted when the cache is full."""
 
 from __future__ import annotations
 

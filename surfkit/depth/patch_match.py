@@ -54,7 +54,7 @@ RANGES = {
 
 @dataclass(frozen=True)
 class PatchMatch(DepthEstimator):
-    """PatchMatch stereo (Bleyer et al. 2011): every pixel has a slanted plane, and tries those of other pixels.
+    """PatchMatch stereo (Bleyer et al. 2011): each pixel has a slanted plane, improved by the planes of other pixels.
 
     Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency,
     in the views that match best at each pixel; then also by the reprojection error in the depth maps of other views
@@ -70,44 +70,49 @@ class PatchMatch(DepthEstimator):
     """Longest side of a depth map in pixels; never more than that of the photograph."""
 
     neighbours: int = 16
-    """Photographs that each one is compared with; each pixel is matched in the `best` of them, so more cost little and
-    help where few see a place."""
+    """Source photographs for each photograph. A pixel is matched in the `best` of them, so more cost little and help
+    where few show a place."""
 
     angle: float = 12.0
-    """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
+    """Preferred angle between the rays of two photographs, degrees: a smaller one gives less parallax, at a larger one
+    they look different."""
 
     best: int = 3
-    """Photographs that count for a plane: those that match it best, of twice as many that match best at and around the
-    pixel."""
+    """Source photographs that a plane is scored by: those that match best, out of twice as many that match best at the
+    pixel and around it."""
 
     window: int = 7
-    """Side of the windows compared, pixels; odd. Smaller ones keep edges sharp, larger ones stand noise."""
+    """Side of the matching window, pixels; odd. Smaller windows keep edges sharp, larger ones are less sensitive to
+    noise."""
 
     spread: float = 0.12
-    """Difference of grey values, of 1, at which a pixel of a window counts 1 / e: windows end at edges."""
+    """Difference of grey values, in [0, 1], at which the weight of a pixel of the window falls to 1 / e: windows end at
+    image edges."""
 
     smoothness: float = 0.03
-    """Cost of a difference of one pixel of parallax between a plane and its neighbours, where the picture is even; 1 is
-    that of a wrong match."""
+    """Cost of a difference of one pixel of parallax between the planes of neighbouring pixels, where the image is
+    uniform; 1 is the cost of a wrong match."""
 
     passes: int = 3
-    """Passes over the pixels at the smallest size, and one less at the larger ones, where the last one compares depth
-    maps at full size."""
+    """Passes over the pixels at the smallest image size, and one less at the larger sizes, where the last pass compares
+    depth maps at full size."""
 
     consistency: float = 0.1
-    """Cost of one pixel of reprojection error in the depth maps of the photographs compared; 0 compares none."""
+    """Cost of one pixel of reprojection error in the depth maps of the source photographs; 0 turns this comparison
+    off."""
 
     coarsest: int = 80
-    """Longest side of the pictures in which the planes begin, pixels."""
+    """Longest side of the smallest images, where the planes are initialised, pixels."""
 
     tolerance_px: float = 1.0
-    """Reprojection error, pixels, up to which the depth maps of two photographs agree."""
+    """Largest reprojection error, pixels, at which the depth maps of two photographs agree."""
 
     agree: int = 3
-    """Photographs whose depth maps must agree with a depth to trust it fully; all where fewer show the place."""
+    """Photographs whose depth maps must agree for full confidence; all of them where fewer show the place."""
 
     edge: float = 0.01
-    """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
+    """Relative jump in depth that makes an edge; the nearer side of an edge gets no confidence, as matching widens
+    it."""
 
     def __post_init__(self) -> None:
         require_within(RANGES, self)

@@ -46,49 +46,51 @@ RANGES = {
 
 @dataclass(frozen=True)
 class PlaneSweep(DepthEstimator):
-    """Photographs compared with neighbours at many depths, smoothed along scanlines, checked against each other."""
+    """Plane-sweep stereo (Collins 1996) with semi-global matching and a consistency check between the depth maps."""
 
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
 
     longest: int = 480
-    """Longest side of a depth map in pixels; the time grows with its third power."""
+    """Longest side of a depth map in pixels; time grows with its third power."""
 
     neighbours: int = 5
-    """Photographs that each one is compared with."""
+    """Source photographs for each photograph."""
 
     angle: float = 8.0
-    """Best angle between the rays of two photographs, degrees: less gives little parallax, more looks different."""
+    """Preferred angle between the rays of two photographs, degrees: a smaller one gives less parallax, at a larger one
+    they look different."""
 
     visible: float = 0.5
-    """Share of the neighbours that must see a point: the others may be occluded."""
+    """Share of the source photographs that a point is scored by; in the others it may be occluded."""
 
     step_px: float = 1.0
-    """How far a picture moves from one depth to the next, pixels."""
+    """Distance between two depth planes: by how many pixels a source image moves."""
 
     max_planes: int = 192
-    """Most depths tried, which bounds time and memory."""
+    """Maximum number of depth planes; it bounds time and memory."""
 
     margin: float = 0.15
-    """How far beyond the sparse points to look, as a share of their range of inverse depths."""
+    """Margin added to the range of inverse depths of the sparse points, as a share of that range."""
 
     window: int = 5
-    """Side of the windows compared, pixels; odd."""
+    """Side of the matching window, pixels; odd."""
 
     step_cost: float = 0.1
-    """Cost of a change of depth by one plane from a pixel to the next; 1 is that of a wrong match."""
+    """Cost of a change by one depth plane from a pixel to the next; 1 is the cost of a wrong match."""
 
     jump_cost: float = 1.0
-    """Cost of a jump in depth from a pixel to the next."""
+    """Cost of a larger change of depth from a pixel to the next."""
 
     tolerance: float = 0.015
-    """Share by which depths may differ for the maps of two photographs to agree."""
+    """Relative difference of depth up to which the maps of two photographs agree."""
 
     edge: float = 0.02
-    """Share by which depth must jump to be an edge, whose nearer side is not trusted: it comes out too large."""
+    """Relative jump in depth that makes an edge; the nearer side of an edge gets no confidence, as matching widens
+    it."""
 
     agree: int = 2
-    """Neighbours whose maps must agree with a depth to trust it fully."""
+    """Source photographs whose depth maps must agree for full confidence."""
 
     def __post_init__(self) -> None:
         require_within(RANGES, self)

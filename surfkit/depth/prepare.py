@@ -1,4 +1,4 @@
-"""Depth priors for a whole data set: what is there already is kept, and an interrupted estimate goes on."""
+"""Depth priors for a whole data set: existing maps are kept, and an interrupted estimate resumes."""
 
 from __future__ import annotations
 
@@ -85,14 +85,14 @@ class Preparation:
         """What the estimator works from; `tracks` are read if None.
 
         Raises:
-            BadInput: The sparse model does not tell which photographs to compare, or the settings do not fit them.
+            BadInput: The sparse model does not show which photographs to compare, or the settings do not fit them.
         """
         tracks = tracks or observations(self.data, scene)
         self.refuse_unfit(scene, tracks)
         return DepthInput(self.views(scene), tracks, self.device, self.work)
 
     def refuse_unfit(self, scene: Scene, tracks: Observations) -> None:
-        """BadInput if the settings do not fit the photographs, or the sparse model does not tell which to compare."""
+        """BadInput if the settings do not fit the photographs, or the sparse model does not show which to compare."""
         self.estimator.refuse_unfit(self.views(scene))
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(

@@ -24,39 +24,39 @@ APART = 3.0
 
 @dataclass(frozen=True)
 class Agreement(Trust):
-    """Weigh pixels by how many other views see a surface in the same place, and leave out those that nobody confirms.
+    """Weigh pixels by how many other views see a surface in the same place, and leave out those that no view confirms.
 
     After Merrell et al. (2007): a depth is carried into other views, and what these see there is carried back.
     """
 
     neighbours: int = 8
-    """Other views that each view is compared with: those that see most of it from another angle."""
+    """Other views that each view is compared with: those that share most of its surface at another angle."""
 
     angle: float = 12.0
-    """Best angle between the rays of two views that are compared, degrees."""
+    """Preferred angle between the rays of two views that are compared, degrees."""
 
     tolerance: float = 0.01
-    """Depths agree that differ by less than this share."""
+    """Relative difference up to which two depths agree."""
 
     enough: float = 2.0
-    """Views that must agree for the full weight; fewer give a share of it."""
+    """Number of agreeing views for the full weight; fewer give a share of it."""
 
     alone: float = 0.25
     """Weight of pixels that no other view can confirm or contradict, as a share of the full one."""
 
     opaque: float = 0.5
-    """Least alpha of a pixel that counts."""
+    """Minimum alpha of a pixel that counts."""
 
     spread: float = 0.0
-    """Share of the depth by which median and expected depth may lie apart for half the weight, as splats are spread
-    along the ray then; 0 does not look."""
+    """Relative difference between median and expected depth at which the weight is halved, as splats are spread along
+    the ray there; 0 turns this off."""
 
     priors: Literal["ignore", "weigh"] = "ignore"
-    """Whether stereo depth counts, where the data set has it: pixels that agree with it count for `confirmed` times as
-    much, and those that it contradicts are left out."""
+    """Whether depth priors count, where the data set has them: weigh raises the weight of pixels that agree with them
+    by the factor `confirmed`, and leaves out those that they contradict."""
 
     confirmed: float = 2.0
-    """See `priors`; confidence of less than 1 brings it nearer to 1."""
+    """See `priors`; at a confidence below 1 the factor is closer to 1."""
 
     def __post_init__(self) -> None:
         for name, low, high in (("tolerance", 0, 1), ("angle", 0, 45)):
@@ -111,7 +111,7 @@ def compare(camera: Camera, depth: Tensor, there: Camera, other: Tensor, toleran
 
     The point that a pixel shows is carried into the other view. If what is seen there is as far, they agree; if it is
     further, the other view sees through the point. If it is nearer, it hides the point, unless this view in turn sees
-    through what is nearer. Views that do not see the point, or that it is hidden from, tell nothing.
+    through what is nearer. Views that do not see the point, or that it is hidden from, are ignored.
 
     Args:
         camera: Of the pixels.

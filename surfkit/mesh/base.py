@@ -74,7 +74,7 @@ class MeshInput:
 
 
 class Mesher(Component):
-    """A way to turn splats into triangles. Progress is told by `surfkit.core.events.Progress`."""
+    """A way to turn splats into triangles; progress is reported by `surfkit.core.events.Progress`."""
 
     @property
     def needs_prior(self) -> bool:

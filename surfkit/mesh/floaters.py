@@ -22,9 +22,9 @@ def without_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, rati
 
     Args:
         mesh: Local frame.
-        pictures: What each view sees; pixels without weight tell nothing.
+        pictures: What each view sees; pixels without weight are ignored.
         reach: A depth that differs by less than this from that of the part sees it, local units.
-        ratio: A part goes if it is seen through more than this many times as often as it is seen.
+        ratio: A component is dropped if it is seen through more than this many times as often as it is seen.
     """
     labels, sizes = clusters(mesh)
     order = np.argsort(labels, kind="stable")

@@ -46,7 +46,7 @@ class Task:
         scratch: Folder for what the views see, if there are tiles, or views are compared.
         label: Of the progress.
         compare: What the weights of the pixels of a view are multiplied with, by what all views see; None leaves them.
-        floaters: Parts go that are seen through so many times as often as seen; 0 keeps all.
+        floaters: Connected components are dropped that are seen through so many times as often as seen; 0 keeps all.
         stored: Whether `see` costs little, as what the views see is on disk.
     """
 

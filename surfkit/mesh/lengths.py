@@ -53,8 +53,8 @@ def resolve(
     cut = cut or truncation_voxels * size
     if cut < 2 * size:
         raise BadInput(
-            f"mesh.truncation is {told(cut, subject.frame)} with voxels of {told(size, subject.frame)}; it must be at "
-            "least two voxels"
+            f"mesh.truncation is {with_unit(cut, subject.frame)} with voxels of {with_unit(size, subject.frame)}; "
+            "it must be at least two voxels"
         )
     return Lengths(size, cut, far)
 
@@ -71,7 +71,7 @@ def in_local(value: Length, frame: Frame) -> float | None:
     return value / frame.local_metres
 
 
-def told(length: float, frame: Frame) -> str:
+def with_unit(length: float, frame: Frame) -> str:
     """A local length in metres, or in units of the data set where metres are not known."""
     if frame.local_metres is not None:
         return f"{length * frame.local_metres:.3g} m"

@@ -26,13 +26,15 @@ class Poisson(Mesher):
     """Depth of the octree: the longest side of the scene is divided into 2^octree cells."""
 
     points: int = 2_000_000
-    """Oriented points, taken evenly from all views."""
+    """Number of oriented points, taken evenly from all views."""
 
     thin: float = 0.1
-    """Share of the vertices, those with the fewest points around them, that go: Poisson closes what is open."""
+    """Share of the vertices to remove, those with the lowest point density: Poisson reconstruction closes open
+    surfaces."""
 
     depth: Literal["median", "expected"] = "median"
-    """Which depth of a pixel makes a point."""
+    """Depth of a pixel: median is the depth of the splat where the accumulated opacity reaches 0.5, expected the mean of
+    all."""
 
     def __post_init__(self) -> None:
         if not 3 <= self.octree <= 16:

@@ -12,7 +12,7 @@ from surfkit.mesh.base import Mesh
 
 
 def require(what: str = "--lods") -> ModuleType:
-    """Open3D, which `what` is made with; BadInput that tells what to install where it cannot be loaded."""
+    """Open3D, which `what` needs; BadInput that says what to install where it cannot be loaded."""
     with needed("open3d", what):
         import open3d
     return open3d

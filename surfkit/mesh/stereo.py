@@ -1,4 +1,4 @@
-"""The stereo depth maps of a data set alone, fused: what any trained surface has to beat."""
+"""The stereo depth maps of a data set alone, fused: the baseline of every trained surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POINTS = 2_000_000
 
 @dataclass(frozen=True)
 class Stereo(Mesher):
-    """Fuse the depth priors of the data set, coloured by its photographs; the splats are not looked at."""
+    """Fuse the depth priors of the data set, coloured by its photographs; the splats are not used."""
 
     min_confidence: float = 0.375
     """Least confidence of a pixel that counts; maps without a confidence count everywhere."""

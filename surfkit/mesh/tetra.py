@@ -35,28 +35,30 @@ class Tetra(Mesher):
     """Marching tetrahedra on points around the splats, with the opacity field of the views (GOF)."""
 
     reach: float = 3.0
-    """Sigmas from the centre of a splat to the sides of its box, whose corners become points."""
+    """Half side of the box around a splat, whose corners become points, in standard deviations."""
 
     thickness: float = 0.1
-    """Half thickness of a surfel's box, as a share of its smaller half side."""
+    """Half thickness of the box of a surfel, as a share of its smaller half side."""
 
     faint: float = 0.05
-    """Splats of less opacity give no points."""
+    """Minimum opacity of splats that give points."""
 
     level: float = 0.5
     """Opacity at the surface."""
 
     bisections: int = 8
-    """Halvings of each edge in search of the surface."""
+    """Bisection steps along each edge to find the surface."""
 
     agree: float = 0.2
-    """Share of the views looking at a place that must see it in the open for it to be so; at 0 one is enough (GOF)."""
+    """Share of the views of a place that must see it as free space for it to be outside; at 0 one view is enough
+    (GOF)."""
 
     min_views: int = 2
-    """Where fewer views look, nothing is known, and no surface ends."""
+    """Minimum number of views that see a place; with fewer it is unknown, and there is no surface there."""
 
     longest: float = 1.0
-    """No triangle comes from an edge longer than this times the boxes of the splats at its ends; 0 allows any."""
+    """Maximum length of an edge that gives triangles, as a multiple of the boxes of the splats at its ends; 0 sets no
+    limit."""
 
     def __post_init__(self) -> None:
         if not (self.reach > 0 and self.thickness > 0):

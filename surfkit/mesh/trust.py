@@ -1,4 +1,4 @@
-"""How far a pixel of a depth map may be trusted: what its own view says, and what other views see in the same place."""
+"""Weights of the pixels of depth maps: by their own view, and by what other views see in the same place."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from surfkit.readers.depth_prior import DepthPrior
 
 
 class Trust(Component):
-    """What the weight of each pixel is multiplied with when depth maps are fused; 0 leaves the pixel out.
+    """A factor for the weight of each pixel when depth maps are fused; 0 leaves the pixel out.
 
     A pixel that is left out also clears nothing of what lies before it.
     """
@@ -25,7 +25,7 @@ class Trust(Component):
 
     @abstractmethod
     def within(self, maps: Maps, depth: Tensor, prior: DepthPrior | None) -> Tensor:
-        """(H, W) 0 or more, by what the view itself tells.
+        """(H, W) 0 or more, from the view itself.
 
         Args:
             maps: Of the view.
@@ -35,7 +35,7 @@ class Trust(Component):
 
     @abstractmethod
     def among(self, at: int, depths: Depths) -> Tensor:
-        """(H, W) 0 or more, by what other views tell of the depths of the view at a position.
+        """(H, W) 0 or more, from what other views show of the depths of the view at a position.
 
         Depths that `within` left out are 0 in every view.
         """

@@ -15,7 +15,7 @@ from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, told
+from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, with_unit
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
@@ -31,34 +31,36 @@ class TSDF(Mesher):
     """Fuse the depth of every training view into a grid of signed distances (Curless and Levoy 1996; KinectFusion)."""
 
     voxel: Length = "auto"
-    """Side of a voxel, metres; auto is one pixel at the median depth, or as large as it takes to get no more than about
-    ten million triangles."""
+    """Voxel size, metres; auto is the size of one pixel at the median depth, larger where there would be more than
+    about ten million triangles."""
 
     truncation: Length = "auto"
-    """Distance from a surface over which it is averaged, metres; auto is `truncation_voxels`. Walls thinner than this
-    may get lost."""
+    """Truncation distance, metres; auto is `truncation_voxels` voxels. Walls thinner than this may get lost."""
 
     truncation_voxels: float = 4.0
-    """Automatic truncation, voxels: less averages less noise, and keeps apart what lies close together."""
+    """Truncation distance in voxels where it is auto: a smaller one averages less noise, but separates surfaces that
+    lie close together."""
 
     depth_limit: Length = "auto"
-    """Depth from which a view no longer counts, metres; auto is twice the median depth."""
+    """Depth beyond which pixels are not fused, metres; auto is twice the median depth."""
 
     depth: Which = "median"
-    """Depth of a pixel: of the splat that makes it half opaque, or the mean of all."""
+    """Depth of a pixel: median is the depth of the splat where the accumulated opacity reaches 0.5, expected the mean of
+    all."""
 
     carve: bool = True
-    """Let every view clear what it sees through, also where it sees no surface near by; floaters get fewer."""
+    """Free-space carving: pixels also count as free space in front of their truncation band, which removes floaters."""
 
     least_views: float = 1.0
-    """Views that must have seen a voxel, for it to count; one that looks aslant or from afar is less than one."""
+    """Sum of the weights of the views that must have seen a voxel; a view at a grazing angle or from far away weighs
+    less than one."""
 
     floaters: float = 0.0
-    """Drop loose parts that views see through more than this many times as often as they see them; 0 keeps all. Without
-    `trust` every view is drawn once more for it."""
+    """Drop connected components that views see through more than this many times as often as they see them; 0 keeps
+    all. Without `trust` every view is rendered once more for it."""
 
     trust: Annotated[Trust | None, choice(Trust, optional=True)] = None
-    """How far pixels are trusted beyond their angle and size; none trusts all of them alike."""
+    """Weight of each pixel, in addition to its angle and size; none weighs all alike."""
 
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
@@ -132,7 +134,7 @@ class TSDF(Mesher):
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(
-                    f"voxels of a pixel, {told(lengths.voxel, subject.frame)}, would give about "
+                    f"voxels of a pixel, {with_unit(lengths.voxel, subject.frame)}, would give about "
                     f"{found.total * BLOCK_TRIANGLES / 1e6:.0f} million triangles: they are made larger"
                 )
             )
@@ -149,7 +151,7 @@ class TSDF(Mesher):
 
 def words(lengths: Lengths, subject: MeshInput) -> str:
     """The lengths for a person."""
-    voxel, cut, far = (told(value, subject.frame) for value in (lengths.voxel, lengths.truncation, lengths.limit))
+    voxel, cut, far = (with_unit(value, subject.frame) for value in (lengths.voxel, lengths.truncation, lengths.limit))
     return f"voxels of {voxel}, truncation {cut}, depth up to {far}"
 
 
@@ -167,9 +169,9 @@ def refuse_too_fine(lengths: Lengths, subject: MeshInput, farthest: float) -> No
     if blocks > MOST - 2:
         least = farthest / ((MOST - 2) * SIDE)
         raise BadInput(
-            f"mesh.voxel is {told(lengths.voxel, subject.frame)}, too small for a scene of "
-            f"{told(2 * farthest, subject.frame)}; give {told(1.01 * least, subject.frame)} or more, or a lower "
-            "--mesh.depth-limit"
+            f"mesh.voxel is {with_unit(lengths.voxel, subject.frame)}, too small for a scene of "
+            f"{with_unit(2 * farthest, subject.frame)}; give {with_unit(1.01 * least, subject.frame)} or more, or a "
+            "lower --mesh.depth-limit"
         )
 
 
@@ -184,7 +186,8 @@ def refuse_too_large(lengths: Lengths, subject: MeshInput, blocks: int) -> None:
     if needed > most:
         least = lengths.voxel * (needed / most) ** 0.5
         raise BadInput(
-            f"voxels of {told(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} million "
-            f"triangles, which take {needed / 1e9:.1f} GB, and {most / 1e9:.1f} GB may be used; give "
-            f"--mesh.voxel {told(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more --memory"
+            f"voxels of {with_unit(lengths.voxel, subject.frame)} give about {blocks * BLOCK_TRIANGLES / 1e6:.0f} "
+            f"million triangles, which take {needed / 1e9:.1f} GB, and {most / 1e9:.1f} GB may be used; give "
+            f"--mesh.voxel {with_unit(1.1 * least, subject.frame)} or more, a lower --mesh.depth-limit, or more "
+            "--memory"
         )

@@ -149,7 +149,7 @@ def read_record(root: Path) -> Mapping[str, Any]:
     try:
         return read_json(path, dict[str, Any])
     except BadInput as error:
-        raise BadInput(f"{error}; it tells what made the maps: delete it or make them again") from error
+        raise BadInput(f"{error}; it says what made the maps: delete it or make them again") from error
 
 
 def write_record(root: Path, record: Mapping[str, Any]) -> None:

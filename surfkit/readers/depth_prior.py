@@ -33,7 +33,7 @@ TRUSTED = 0.5
 """Pixels of a higher confidence count as trusted."""
 HARDLY = 0.02
 """Where a smaller share of all pixels is trusted, something is wrong with what the maps were made from."""
-OFF = "what needs them is off, such as the losses depth and normal-prior"
+OFF = "everything that needs them is switched off, such as the losses depth and normal-prior"
 """What becomes of a run without depth priors."""
 WITH_NORMALS = "estimator:patch-match"
 """Words that have normals estimated too."""
@@ -41,7 +41,7 @@ WITH_NORMALS = "estimator:patch-match"
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """What is known beforehand of the depth of a photograph.
+    """The depth prior of a photograph.
 
     Attributes:
         inverse: (H, W) float32 inverse camera z, 1/local units; 0 where there is none.
@@ -75,9 +75,9 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Fit:
-    """A map, and what its values are multiplied with and moved by to be inverse depths in 1/local units.
+    """A map, and the scale and offset that turn its values into inverse depths in 1/local units.
 
-    `trusted` is the share of its pixels that are, if that was looked at.
+    `trusted` is the share of its pixels with high confidence, 1 where that is not known.
     """
 
     file: DepthFile
@@ -174,7 +174,7 @@ def read_priors(
     maps = prior_files(data, scene)
     lost = [view.name for view in scene.train if view.name in known.fits and view.name not in maps]
     if lost:
-        again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it anew"
+        again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it again"
         raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
     fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
@@ -184,7 +184,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
     """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning; where `normals` are wanted
-    too, another one tells that there are none.
+    too, another one says that there are none.
     """
     maps = prior_files(data, scene)
     if not maps:
@@ -214,7 +214,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
 
 
 def untrusted(share: float) -> str | None:
-    """What to tell of depth maps of which a share of the pixels is trusted; None where that is enough."""
+    """A warning about depth maps with a low share of trusted pixels; None where it is high enough."""
     if share >= HARDLY:
         return None
     causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
@@ -323,9 +323,9 @@ def _warn_of_leaks(data: Data, scene: Scene) -> None:
 
 
 def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
-    """What to tell of maps that a loss of normals looks at; None where all have normals.
+    """A warning about maps without normals, for a loss that needs them; None where all have normals.
 
-    Not every estimator finds normals, and a loss that is 0 throughout shows nowhere else.
+    Not every estimator gives normals, and a loss that is always 0 is noticed nowhere else.
     """
     without = sum(not normal_path(file.path).exists() for file in files)
     if not without:
@@ -337,5 +337,5 @@ def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
 
 
 def how_to_make(data: Data, normals: bool = False) -> str:
-    """Which command makes depth priors, with normals if a loss looks at them."""
+    """Which command makes depth priors, with normals if a loss needs them."""
     return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"

@@ -105,7 +105,7 @@ def load(path: Path) -> Extract:
         return _extract(arrays)
     except Exception as error:  # of a damaged file, zipfile and numpy raise whatever comes
         told = "is not there" if isinstance(error, FileNotFoundError) else f"cannot be used ({error})"
-        raise BadInput(f"{path} {told}; give the surfkit train command again, which makes it anew") from error
+        raise BadInput(f"{path} {told}; give the surfkit train command again, which writes it again") from error
 
 
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:

@@ -63,7 +63,7 @@ class Fingerprint:
     Attributes:
         points: Digest of the sparse points, in the local frame.
         photographs: By name.
-        beside: Whether what lies beside them was looked at too; runs of before did not.
+        beside: Whether the files beside them are included; older runs did not include them.
     """
 
     points: str
@@ -87,7 +87,7 @@ def fingerprint(
     Args:
         scene: The scene.
         before: Files that were not touched since then are not read again.
-        maps: Depth maps by name of the photograph, if training looks at them.
+        maps: Depth maps by name of the photograph, if training uses them.
     """
     known = before.photographs if before else {}
     views = [(view, False) for view in scene.train] + [(view, True) for view in scene.held_out]

@@ -1,4 +1,4 @@
-"""Depth maps that runs made by themselves: in the user's cache, where data sets may be read-only."""
+"""Depth maps that runs have made: in the user's cache, as data sets may be read-only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Made:
 
     Attributes:
         maps: How many there are.
-        cpu_seconds: That making them has taken so far, of all processors together.
+        cpu_seconds: CPU time that making them has taken so far.
         without: Names of the photographs of which none could be made.
     """
 

@@ -138,7 +138,7 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
 
 
 def _cached(picture: Picture, lens: _Lens, root: Path) -> str:
-    """The name of the undistorted picture, which tells what went into it."""
+    """The name of the undistorted picture, which depends on all that it was made from."""
     paths = [path for path in (picture.path, picture.mask) if path is not None]
     return f"{picture.path.stem}-{digest(root, f'{RECIPE} {lens} {picture.white}', paths)}.png"
 

@@ -219,7 +219,7 @@ def has_mesh(run: Run, steps: int) -> bool:
         return True
     if not run.mesh_record.exists():
         return False
-    remedy = "delete it, and the mesh is made anew"
+    remedy = "delete it, and the mesh is made again"
     record = read_keys(run.mesh_record, {"files": tuple[str, ...], "steps": int}, remedy)
     there = all((run.out / name).exists() for name in record["files"])
     return there and record["steps"] == steps

@@ -11,7 +11,7 @@ MAX_ERROR_PX = 1.5
 MIN_POINTS = 10
 """More points than this are needed."""
 MIN_RANGE = 0.01
-"""The inverse depths of the points must differ by this share of their median: a flat view tells no scale."""
+"""The inverse depths of the points must differ by this share of their median: a flat view determines no scale."""
 SCALE_BAND = 5.0
 """A scale that differs by a larger factor from the median of all images is a failed alignment."""
 

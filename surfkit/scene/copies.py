@@ -33,7 +33,7 @@ class Copies:
         """The copy of a file, or what `make` gives, which is then the copy.
 
         Args:
-            path: The file; when it changes, the copy is made anew.
+            path: The file; when it changes, the copy is made again.
             key: How it is used.
             shape: Of the copy.
             make: Gives an array of uint8.
@@ -59,7 +59,7 @@ def place(root: Path, name: str) -> Path:
 
 
 def digest(root: Path, key: str, paths: Sequence[Path]) -> str:
-    """A name that tells what went into a copy: a key, and the first file's place and the content of all."""
+    """A name that depends on all that went into a copy: a key, and the first file's place and the content of all."""
     found = hashlib.blake2b(f"{key} {os.path.relpath(paths[0], root)}".encode(), digest_size=8)
     for path in paths:
         found.update(_content(path))

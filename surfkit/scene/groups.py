@@ -1,4 +1,4 @@
-"""Photographs that sparse points connect, and what to tell of those that none does."""
+"""Photographs that sparse points connect, and a warning about those that none does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 BATCH = 20_000
 """Points after which is looked whether all photographs are connected."""
 SHOWN = 4
-"""Smaller groups that are told, each with its size."""
+"""Smaller groups that are listed, each with its size."""
 
 
 def connected(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarray]:
@@ -39,7 +39,7 @@ def connected(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarray]:
 
 
 def apart(groups: Sequence[Sequence[str]]) -> str | None:
-    """What to tell of photographs that fall into several groups; None where there is one, or nothing is known.
+    """A warning about photographs that fall into several groups; None where there is one, or nothing is known.
 
     Args:
         groups: Names of the photographs of each, the largest group first.

@@ -20,7 +20,7 @@ SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
 
 
 def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The file of each name that has one, by name; one note tells of all that are spelt otherwise.
+    """The file of each name that has one, by name; one note lists all that are spelt otherwise.
 
     Another spelling counts when it fits one file only and no other name.
     """
@@ -37,7 +37,7 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         found |= pairs
         lost = [name for name in lost if name not in pairs]
         spare = [path for path in spare if path not in pairs.values()]
-    _tell(folder, {name: path for name, path in found.items() if path not in taken})
+    _warn(folder, {name: path for name, path in found.items() if path not in taken})
     return found
 
 
@@ -48,7 +48,7 @@ def _groups(keys: Mapping[T, str]) -> dict[str, list[T]]:
     return groups
 
 
-def _tell(folder: Path, otherwise: dict[str, Path]) -> None:
+def _warn(folder: Path, otherwise: dict[str, Path]) -> None:
     if otherwise:
         name, path = next(iter(otherwise.items()))
         there = path.relative_to(folder).as_posix()

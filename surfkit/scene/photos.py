@@ -80,7 +80,7 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def is_turned(path: Path) -> bool:
-    """Whether EXIF says to turn or mirror a picture before it is looked at."""
+    """Whether EXIF says to rotate or mirror a picture for display."""
     with _picture(path) as image:
         if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode all of it, to look behind
             return False

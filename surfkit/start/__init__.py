@@ -1,4 +1,4 @@
-"""Ways to begin, by the name users type."""
+"""Initial points of the optimisation, by registered name."""
 
 from surfkit.core.registry import hookimpl
 from surfkit.start.plain import RandomStart, SparseStart

@@ -1,4 +1,4 @@
-"""Where the points of a run begin."""
+"""The initial points of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from surfkit.scene.scene import Cloud, Scene
 
 @dataclass(frozen=True)
 class StartInput:
-    """What is known before the first step.
+    """What is known before the first optimisation step.
 
     Attributes:
         scene: Its training views, cameras and sparse points.
@@ -50,7 +50,7 @@ class Start(Component):
         """The points, the same for the same settings, data and state of the generator.
 
         Raises:
-            BadInput: There is nothing to begin from.
+            BadInput: There is nothing to start from.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Begin without depth maps."""
+"""Initial points that need no depth maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OUTLIERS = 0.01
 
 @dataclass(frozen=True)
 class SparseStart(Start):
-    """Begin at the sparse points of the data set, as 3DGS does (Kerbl et al. 2023)."""
+    """Start from the sparse points of the data set, as 3DGS does (Kerbl et al. 2023)."""
 
     def cloud(self, known: StartInput) -> Cloud:
         """See `Start.cloud`."""
@@ -31,10 +31,10 @@ class SparseStart(Start):
 
 @dataclass(frozen=True)
 class RandomStart(Start):
-    """Begin at random grey points in the box of the sparse points and the cameras, for comparison with other starts."""
+    """Start from random grey points in the bounding box of sparse points and cameras, as a baseline."""
 
     points: int = 50_000
-    """How many."""
+    """Number of points."""
 
     def __post_init__(self) -> None:
         if self.points < 1:

@@ -1,4 +1,4 @@
-"""Begin at the points of depth maps that several photographs agree on."""
+"""Initial points from depth maps."""
 
 from __future__ import annotations
 
@@ -34,31 +34,32 @@ OVERLAP = 10
 
 @dataclass(frozen=True)
 class StereoStart(Start):
-    """Begin at the depth maps of all views, fused and thinned evenly (as EDGS, Kotovenko et al. 2025, from matches).
+    """Start from the fused depth maps of all views, thinned evenly (as EDGS, Kotovenko et al. 2025, from matches).
 
     Colours come from the photographs, and directions from normal maps or the slopes of the depth maps. Sparse points
     are used only where the maps have none; what neither knows is left to densification.
     """
 
     points: int | Literal["auto"] = "auto"
-    """How many; auto is one every `spacing_px` pixels at the typical depth of the data set, `most` at most."""
+    """Number of points; auto places one every `spacing_px` pixels at the median depth of the data set, `most` at
+    most."""
 
     spacing_px: float = 3.0
-    """Distance between points when their number is auto, pixels of a training photograph at the typical depth."""
+    """Distance between points when their number is auto, in pixels of a training photograph at the median depth."""
 
     most: int = 2_000_000
-    """Most points when their number is auto."""
+    """Maximum number of points when it is auto."""
 
     min_confidence: float = 0.25
-    """Pixels of a lower confidence are not used. Wrong points are soon moved or pruned, missing ones are hard to
-    make up for."""
+    """Pixels of lower confidence are not used. Wrong points are soon moved or pruned; missing ones are harder to
+    replace."""
 
     opacity: float = 0.5
-    """Opacity to begin with; what depth maps show is there, so it may be higher than that of sparse points, 0.1."""
+    """Initial opacity; depth maps are reliable, so it may be higher than that of sparse points, 0.1."""
 
     size: float = 0.65
-    """Standard deviation of a splat to begin with, as a share of the gaps between points; that of sparse points is the
-    whole gap between them."""
+    """Initial standard deviation of a splat, as a share of the distance between points; for sparse points it is the
+    whole distance."""
 
     def __post_init__(self) -> None:
         if self.points != "auto" and self.points < 1:
@@ -82,7 +83,7 @@ class StereoStart(Start):
         """See `Start.cloud`."""
         stereo = self.fused(known)
         if not len(stereo):
-            emit(Warned("no pixel of a depth map is trusted, so the run begins at the sparse points alone"))
+            emit(Warned("no pixel of a depth map is trusted, so the run starts from the sparse points alone"))
             return known.scene.cloud
         return filled(stereo, known, self)
 

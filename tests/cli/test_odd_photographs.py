@@ -101,7 +101,7 @@ NONE = (2, "no depth can be estimated of any of 7 photographs")
 CASES = {
     # what is done to the data set; exit status and words of `surfkit prepare depth`, and those of `surfkit train`
     "one pixel wide": (None, (0, HARDLY), (2, "; see whether photographs and cameras belong together")),
-    "grey": (grey, (0, HARDLY), (0, "no pixel of a depth map is trusted, so the run begins at the sparse points")),
+    "grey": (grey, (0, HARDLY), (0, "no pixel of a depth map is trusted, so the run starts from the sparse points")),
     "the same": (same, (0, HARDLY), (0, HARDLY)),
     "mirrored": (mirrored, (0, HARDLY), (0, HARDLY)),
     "two groups": (two_groups, (0, "7/7 view_007.png"), (0, "depth maps of 7 photographs made")),

@@ -59,7 +59,7 @@ def test_maps_have_the_shape_of_the_photograph_and_weights_come_from_the_folder(
 
 def test_weights_that_cannot_be_had_are_one_line(tmp_path):
     needs("transformers", "depth-anything-v2")
-    with pytest.raises(BadInput, match="cannot be had: download them .* --estimator.weights"):
+    with pytest.raises(BadInput, match="cannot be loaded: download them .* --estimator.weights"):
         DepthAnythingV2(weights=str(tmp_path)).network()
 
 

@@ -199,7 +199,11 @@ def test_what_cannot_be_used_is_listed_once(farm):
     assert f"constant: {names[2]}" in notes[0] and "cannot be read" in notes[0] and names[3] in notes[0]
     np.save(paths[4], np.full_like(good, np.nan))
     priors, notes = read(data, scene)
-    assert priors is None and "what needs them is off" in notes[0] and f"no value in it: {names[4]}" in notes[0]
+    assert (
+        priors is None
+        and "everything that needs them is switched off" in notes[0]
+        and f"no value in it: {names[4]}" in notes[0]
+    )
 
 
 def test_a_scale_far_from_the_others_is_a_failure(farm):
@@ -216,7 +220,7 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
 
 def test_without_any_map_the_warning_says_what_to_run(farm):
     data, scene, _ = farm
-    off = "so what needs them is off, such as the losses depth and normal-prior"
+    off = "so everything that needs them is switched off, such as the losses depth and normal-prior"
     for normals, more in ((False, ""), (True, " estimator:patch-match")):
         priors, notes = read(data, scene, normals)
         assert priors is None and notes == [
