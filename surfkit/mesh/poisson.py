@@ -33,7 +33,7 @@ class Poisson(Mesher):
     surfaces."""
 
     depth: Literal["median", "expected"] = "median"
-    """Depth of a pixel: median is the depth of the splat where the accumulated opacity reaches 0.5, expected the mean of
+    """Depth of a pixel: median is that of the splat where the accumulated opacity reaches 0.5, expected the mean of
     all."""
 
     def __post_init__(self) -> None:

@@ -45,7 +45,7 @@ class TSDF(Mesher):
     """Depth beyond which pixels are not fused, metres; auto is twice the median depth."""
 
     depth: Which = "median"
-    """Depth of a pixel: median is the depth of the splat where the accumulated opacity reaches 0.5, expected the mean of
+    """Depth of a pixel: median is that of the splat where the accumulated opacity reaches 0.5, expected the mean of
     all."""
 
     carve: bool = True
