@@ -41,9 +41,9 @@ def main() -> int:
 
     from surfkit import pipeline  # noqa: F401
     from surfkit.cli.recipes import recipes
-    from surfkit.readers.capture import library
+    from surfkit.readers.capture import load_pycolmap
 
-    recipes(), library()
+    recipes(), load_pycolmap()
     found: dict[tuple[str, str], Finding] = {}
     counts = dict.fromkeys(chosen.targets, 0)
     seed, start = chosen.seed * 1_000_003, time.monotonic()

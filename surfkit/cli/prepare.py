@@ -25,7 +25,7 @@ from surfkit.evaluate.images.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
 from surfkit.readers.depth_files import FOLDER, RECORD, DepthFile, map_path
-from surfkit.readers.depth_prior import untrusted
+from surfkit.readers.depth_prior import trust_warning
 from surfkit.readers.read import read
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
@@ -110,7 +110,7 @@ def show(done: list[Prepared]) -> None:
     print_table(("photographs", "covered", "least covered", "seconds"), [row])
     if failed := [step.view.name for step in done if step.coverage is None]:
         print(f"too few sparse points or neighbours, no depth: {', '.join(failed)}")
-    if covered and (text := untrusted(sum(covered) / len(covered))):
+    if covered and (text := trust_warning(sum(covered) / len(covered))):
         print(f"note: {text}", file=sys.stderr)
 
 

@@ -69,17 +69,17 @@ def maps(
     """
     folder = folder_of(key)
     with ExitStack() as use:
-        with entered(folder, preparation.data.path):
+        with hold_folder(folder, preparation.data.path):
             sweep(folder)
             use.enter_context(used(folder))
-            fresh, made = completed(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
+            fresh, made = make_missing(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
         if fresh:
             make_room(folder, budget_bytes)
         yield folder, made
 
 
 @contextmanager
-def entered(folder: Path, data: Path) -> Iterator[None]:
+def hold_folder(folder: Path, data: Path) -> Iterator[None]:
     """Within, no other process writes into a folder of the cache; waits for one that does."""
     with ExitStack() as inside:
         told = False
@@ -102,7 +102,7 @@ def entered(folder: Path, data: Path) -> Iterator[None]:
         yield
 
 
-def completed(preparation: Preparation, scene: Scene, tracks: Observations) -> tuple[bool, Made]:
+def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -> tuple[bool, Made]:
     """Make the maps that are not there, one after the other; whether there were any, and what is known of all."""
     folder, names = preparation.place, [view.name for view in scene.train]
     made = read_made(folder)
@@ -151,14 +151,14 @@ def make_room(mine: Path, budget_bytes: int) -> None:
     for left in mine.parent.glob(f"{DROPPED}*"):  # of a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     folders = [path for path in mine.parent.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    sizes = {path: taken(path) for path in folders}
+    sizes = {path: folder_bytes(path) for path in folders}
     total = sum(sizes.values())
     for path in sorted(folders, key=last_used):
-        if total > budget_bytes and path != mine and dropped(path):
+        if total > budget_bytes and path != mine and drop_folder(path):
             total -= sizes[path]
 
 
-def taken(folder: Path) -> int:
+def folder_bytes(folder: Path) -> int:
     """Bytes of the files in a folder."""
     found = 0
     for path in folder.rglob("*"):
@@ -174,7 +174,7 @@ def last_used(folder: Path) -> float:
     return 0.0
 
 
-def dropped(folder: Path) -> bool:
+def drop_folder(folder: Path) -> bool:
     """Delete a folder of maps, unless somebody works with it; whether it is gone."""
     aside = folder.with_name(f"{DROPPED}{folder.name}-{os.getpid()}")
     try:

@@ -18,7 +18,7 @@ from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
-from surfkit.depth.scanlines import best_planes, smoothed
+from surfkit.depth.scanlines import best_planes, smooth_costs
 from surfkit.readers.depth_files import save_array
 from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo
@@ -151,7 +151,7 @@ class PlaneSweep(DepthEstimator):
         self.refuse_too_large(here, count, given.device)
         planes = torch.linspace(*span, count, device=given.device)
         volume = cost_volume(here, others, planes, self.window, self.visible)
-        plane, position = best_planes(smoothed(volume, here.light, self.step_cost, self.jump_cost))
+        plane, position = best_planes(smooth_costs(volume, here.light, self.step_cost, self.jump_cost))
         inverse = span[0] + position * ((span[1] - span[0]) / (count - 1))
         matched = 1 - volume.gather(0, plane[None])[0]
         inner = (plane > 0) & (plane < count - 1)

@@ -9,7 +9,7 @@ CONTRAST = 0.04
 """Difference of luminance at which a jump in depth costs half as much: depth jumps where the picture does."""
 
 
-def smoothed(volume: Tensor, light: Tensor, step: float, jump: float) -> Tensor:
+def smooth_costs(volume: Tensor, light: Tensor, step: float, jump: float) -> Tensor:
     """The mean of the costs of the best paths to each pixel and plane from the left, right, top and bottom.
 
     Args:

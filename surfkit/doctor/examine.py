@@ -24,11 +24,11 @@ from surfkit.doctor.geometry import Geometry, seen_by, survey
 from surfkit.doctor.photographs import Photograph, Wanted, look_at
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import how_to_make, lacking_normals
+from surfkit.readers.depth_prior import normals_warning, prepare_command
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
-from surfkit.scene.groups import apart
+from surfkit.scene.groups import groups_warning
 from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
@@ -224,7 +224,7 @@ def _split(gathered: Gathered) -> list[Finding]:
 def _groups(gathered: Gathered) -> list[Finding]:
     """Photographs that no sparse points connect."""
     largest, *others = gathered.capture.groups or [()]
-    text = apart(gathered.capture.groups)
+    text = groups_warning(gathered.capture.groups)
     return [Finding("warning", "unconnected", text, tuple(name for names in others for name in names))] if text else []
 
 
@@ -254,7 +254,7 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     if not train or not (stereo or needs_priors(losses)):
         return []
     normals = needs_normals(losses)
-    make = how_to_make(data, normals)
+    make = prepare_command(data, normals)
     try:
         maps = depth_maps(data, gathered)
     except BadInput as error:
@@ -271,7 +271,7 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     if missing := [shot.name for shot in train if shot.name not in maps]:
         text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
         found.append(Finding("warning", "depth-priors", text, tuple(missing)))
-    if normals and (text := lacking_normals(data, list(maps.values()))):
+    if normals and (text := normals_warning(data, list(maps.values()))):
         found.append(Finding("warning", "prior-normals", text))
     return found
 

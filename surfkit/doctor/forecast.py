@@ -20,7 +20,7 @@ from surfkit.doctor.probe import Job, Part, Probed, probe
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import prior_bytes
-from surfkit.readers.read import assembled
+from surfkit.readers.read import build_scene
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.run.stage import CHECKPOINT_EVERY
@@ -175,7 +175,7 @@ def _scene(data: Data, examined: Examined, load: Load, folder: Path) -> tuple[Sc
     chosen = [train[at * len(train) // min(VIEWS, len(train))] for at in range(min(VIEWS, len(train)))]
     start = time.perf_counter()
     with heard():
-        scene = assembled(data, examined.gathered.capture, folder, {shot.name for shot in chosen})
+        scene = build_scene(data, examined.gathered.capture, folder, {shot.name for shot in chosen})
     seconds = (time.perf_counter() - start) * min(load.threads, len(chosen)) / len(chosen)
     written = sum(path.stat().st_size for path in folder.iterdir())
     bent = sum(not is_pinhole(shot.camera) for shot in chosen)

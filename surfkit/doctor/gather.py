@@ -19,7 +19,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import DepthFile
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.masks import FOLDER, MARKS, find_masks
-from surfkit.readers.read import captured, model_folder, reader_of
+from surfkit.readers.read import model_folder, read_capture, reader_of
 from surfkit.scene.names import PICTURES
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
@@ -112,7 +112,7 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
     try:
         reader = reader_of(data)
         layout = name_of(reader)
-        capture = captured(data, reader)
+        capture = read_capture(data, reader)
     except BadInput as error:
         faults.append(error)
         return layout, EMPTY

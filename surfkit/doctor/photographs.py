@@ -15,7 +15,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.doctor.exposure import luminance
 from surfkit.readers.masks import check_mask, read_mask
-from surfkit.scene.photos import opened, read_draft
+from surfkit.scene.photos import open_picture, read_draft
 
 DRAFT = 256
 """Longer side at which photographs are looked at, pixels, or up to twice that."""
@@ -90,7 +90,7 @@ def _look(wanted: Wanted, quick: bool) -> Photograph:
     found: dict = {}
     try:
         found["bytes"] = wanted.path.stat().st_size
-        opened(wanted.path, lambda image: found.update(_header(image)))
+        open_picture(wanted.path, lambda image: found.update(_header(image)))
         if not quick:
             found |= _pixels(read_draft(wanted.path, DRAFT), wanted.places)
     except BadInput as error:

@@ -29,7 +29,7 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.edit import Edit, apply
 from surfkit.primitives.points import Points
 from surfkit.raster.select import Device, select
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.readers.masks import view_mask
 from surfkit.recipe import Recipe
@@ -220,7 +220,7 @@ def _work(connection: Connection, job: bytes) -> None:
 
 def measure(job: Job) -> Iterator[Started | Taken | Written]:
     """Measure, in this process."""
-    library()  # a run has loaded it too, to read the data
+    load_pycolmap()  # a run has loaded it too, to read the data
     recipe, views, start = job.recipe, job.scene.train, time.perf_counter()
     photos = [view_photo(view) for view in views]
     photo_seconds = (time.perf_counter() - start) / len(views)

@@ -15,7 +15,7 @@ SAMPLES = 32
 """Triangles of a connected part whose middles are looked for in the views."""
 
 
-def without_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: float) -> tuple[Mesh, int]:
+def drop_floaters(mesh: Mesh, pictures: Iterator[Picture], reach: float, ratio: float) -> tuple[Mesh, int]:
     """The mesh without the connected parts that views see through more than they see them, and how many these were.
 
     However small, a part stays that enough views see: thin and small things are no floaters.

@@ -16,7 +16,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.floaters import without_floaters
+from surfkit.mesh.floaters import drop_floaters
 from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
 from surfkit.mesh.overlap import Depths
@@ -86,7 +86,7 @@ def see_through(task: Task, made: Made) -> tuple[Made, int]:
             yield task.see(at)
             emit(Progress("looking for floaters", at + 1, len(task.cameras)))
 
-    mesh, dropped = without_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
+    mesh, dropped = drop_floaters(Mesh(*made), pictures(), task.lattice.truncation, task.floaters)
     return (mesh.vertices, mesh.faces, made[2]), dropped
 
 

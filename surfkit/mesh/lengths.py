@@ -44,7 +44,7 @@ def resolve(
     Raises:
         BadInput: There is no depth in any view, or lengths are in metres and nobody knows how long a unit is.
     """
-    given = [in_local(value, subject.frame) for value in (voxel, truncation, limit)]
+    given = [to_local(value, subject.frame) for value in (voxel, truncation, limit)]
     if given[0] is None or given[2] is None:
         depth, pixel = look(subject, which)
         given[0] = given[0] or PIXELS * pixel
@@ -59,7 +59,7 @@ def resolve(
     return Lengths(size, cut, far)
 
 
-def in_local(value: Length, frame: Frame) -> float | None:
+def to_local(value: Length, frame: Frame) -> float | None:
     """A length in metres in local units; None if it is automatic."""
     if value == "auto":
         return None

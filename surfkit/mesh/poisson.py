@@ -12,7 +12,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.simplify import require
+from surfkit.mesh.simplify import require_open3d
 
 ENOUGH = 100
 """Fewest oriented points that make a surface."""
@@ -45,11 +45,11 @@ class Poisson(Mesher):
 
     def ready(self) -> None:
         """See `Mesher.ready`."""
-        require("mesh:poisson")
+        require_open3d("mesh:poisson")
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
-        open3d = require("mesh:poisson")
+        open3d = require_open3d("mesh:poisson")
         found = [self._seen(subject, at) for at in range(len(subject.views))]
         points, normals, colors = (torch.cat(parts).double().numpy() for parts in zip(*found, strict=True))
         if len(points) < ENOUGH:

@@ -11,16 +11,16 @@ from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
 
 
-def require(what: str = "--lods") -> ModuleType:
+def require_open3d(what: str = "--lods") -> ModuleType:
     """Open3D, which `what` needs; BadInput that says what to install where it cannot be loaded."""
     with needed("open3d", what):
         import open3d
     return open3d
 
 
-def simplified(mesh: Mesh, share: float) -> Mesh:
+def simplify(mesh: Mesh, share: float) -> Mesh:
     """The mesh with about a share of its triangles, by quadric error (Garland and Heckbert 1997, in Open3D)."""
-    open3d = require()
+    open3d = require_open3d()
     whole = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
     )

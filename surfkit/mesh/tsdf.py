@@ -91,7 +91,7 @@ class TSDF(Mesher):
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)
         least = max(1, round(FULL * self.least_views))
-        label = f"fusing views, {words(lengths, subject)}"
+        label = f"fusing views, {describe_lengths(lengths, subject)}"
         compare = None if self.trust is None else self.trust.among
         see = self._eyes(subject, lengths)
         task = Task(
@@ -100,8 +100,8 @@ class TSDF(Mesher):
         (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(
-                f"no surface: with {words(lengths, subject)}, no voxel beside one was seen by {self.least_views:g} "
-                "views; lower --mesh.least-views, or train for more steps"
+                f"no surface: with {describe_lengths(lengths, subject)}, no voxel beside one was seen by "
+                f"{self.least_views:g} views; lower --mesh.least-views, or train for more steps"
             )
         return Mesh(vertices, faces, colors, facts(lengths, subject) | counts)
 
@@ -149,8 +149,8 @@ class TSDF(Mesher):
         return lengths, found
 
 
-def words(lengths: Lengths, subject: MeshInput) -> str:
-    """The lengths for a person."""
+def describe_lengths(lengths: Lengths, subject: MeshInput) -> str:
+    """The lengths as text."""
     voxel, cut, far = (with_unit(value, subject.frame) for value in (lengths.voxel, lengths.truncation, lengths.limit))
     return f"voxels of {voxel}, truncation {cut}, depth up to {far}"
 

@@ -79,19 +79,19 @@ class Tracks:
 def camera_of(where: str, model: str, size: tuple[int, int], params: Sequence[float]) -> Any:
     """A pycolmap camera, or BadInput that names `where` its numbers come from."""
     try:
-        return library().Camera(model=model, width=size[0], height=size[1], params=list(params))
+        return load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=list(params))
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         numbers = ", ".join(f"{value:g}" for value in params)
         raise BadInput(f"{where}: no {model} camera has size {size[0]} x {size[1]} and parameters {numbers}") from error
 
 
-def shortened(value: object) -> str:
+def shorten(value: object) -> str:
     """What a file has in the place of something else, in a few words."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def library() -> Any:
+def load_pycolmap() -> Any:
     """The module pycolmap, loaded after Pillow's PNG writer: the other way round, saving a PNG kills the process."""
     import PIL.PngImagePlugin  # noqa: F401
 

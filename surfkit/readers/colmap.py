@@ -13,10 +13,10 @@ import numpy as np
 from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
-from surfkit.readers.capture import Capture, Shot, Tracks, library
+from surfkit.readers.capture import Capture, Shot, Tracks, load_pycolmap
 from surfkit.readers.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.readers.data import Data, nearest
-from surfkit.scene.groups import connected
+from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
@@ -158,7 +158,7 @@ def _groups(model: Any, points: Sequence[Any]) -> list[list[str]]:
     place = {number: at for at, (number, _) in enumerate(observed)}
     shuffled = (points[at] for at in np.random.default_rng(0).permutation(len(points)))  # their order is that of images
     tracks = ([place[e.image_id] for e in point.track.elements if e.image_id in place] for point in shuffled)
-    return [[observed[at][1] for at in group] for group in connected(len(observed), tracks)]
+    return [[observed[at][1] for at in group] for group in connect_groups(len(observed), tracks)]
 
 
 def _reconstruction(folder: Path) -> Any:
@@ -166,7 +166,7 @@ def _reconstruction(folder: Path) -> Any:
     binary = not _lacking(folder, ".bin")
     if binary:  # of text files, pycolmap sees by itself that they are cut off
         refuse_cut_off(folder)
-    pycolmap = library()
+    pycolmap = load_pycolmap()
     try:
         model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():

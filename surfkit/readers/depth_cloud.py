@@ -19,7 +19,7 @@ POINTS = 200_000
 """All together; no pixel is taken twice."""
 
 
-def points_of_depth(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> tuple[np.ndarray, np.ndarray]:
+def sample_depth_maps(shots: Sequence[Shot], maps: Mapping[str, DepthFile]) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) float64 positions in the input frame and (P, 3) uint8 colours of random pixels, the same ones each time.
 
     Maps that cannot be read are passed over, with a note.

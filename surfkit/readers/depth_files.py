@@ -14,8 +14,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
-from surfkit.scene.arrays import mapped
-from surfkit.scene.photos import opened
+from surfkit.scene.arrays import map_array
+from surfkit.scene.photos import open_picture
 
 EXR = ".exr"
 NO_DEPTH = 65504.0
@@ -170,7 +170,7 @@ def _stored(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".npy":
         return _array(path)
     try:
-        return opened(path, np.array)
+        return open_picture(path, np.array)
     except BadInput as error:
         raise BadInput(f"cannot be read: {str(error).removeprefix(f'{path}: ')}") from error
 
@@ -178,7 +178,7 @@ def _stored(path: Path) -> np.ndarray:
 def _array(path: Path) -> np.ndarray:
     """The numbers in a .npy file, mapped from disk."""
     try:
-        stored = mapped(path)
+        stored = map_array(path)
     except Exception as error:
         raise BadInput(f"cannot be read: {' '.join(str(error).split())}") from error
     if stored.dtype.kind not in "fiub" or not stored.size:

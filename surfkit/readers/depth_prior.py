@@ -188,7 +188,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
     """
     maps = prior_files(data, scene)
     if not maps:
-        remedy = f"; {how_to_make(data, normals)}" if data.priors is None else ""
+        remedy = f"; {prepare_command(data, normals)}" if data.priors is None else ""
         emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)
@@ -200,20 +200,20 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
         reasons[scene.train[at].name] = "its scale is far from that of the other images"
         fits[at] = None
     if not any(fits):
-        emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {listed(reasons)}"))
+        emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {list_reasons(reasons)}"))
         return Alignment(0.0, {})
     if reasons:
-        emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {listed(reasons)}"))
+        emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {list_reasons(reasons)}"))
     _warn_of_leaks(data, scene)
-    if text := untrusted(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
+    if text := trust_warning(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
         emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
-    if normals and (text := lacking_normals(data, [maps[name] for name in found])):
+    if normals and (text := normals_warning(data, [maps[name] for name in found])):
         emit(Warned(text))
     return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
 
 
-def untrusted(share: float) -> str | None:
+def trust_warning(share: float) -> str | None:
     """A warning about depth maps with a low share of trusted pixels; None where it is high enough."""
     if share >= HARDLY:
         return None
@@ -245,7 +245,7 @@ def typical_inverse_depth(views: Sequence[View], observations: Observations, sce
     return float((1 / depths[depths > 0]).median())
 
 
-def listed(reasons: Mapping[str, str]) -> str:
+def list_reasons(reasons: Mapping[str, str]) -> str:
     """Names by reason, in one line."""
     groups: dict[str, list[str]] = {}
     for name, reason in reasons.items():
@@ -317,12 +317,12 @@ def _warn_of_leaks(data: Data, scene: Scene) -> None:
         text = (
             f"the depth priors were made with {len(seen)} of the {len(scene.held_out)} photographs held out, "
             f"{seen[0]} for one, so the quality will look better than it is; "
-            f"{how_to_make(data)} --again, with the same split"
+            f"{prepare_command(data)} --again, with the same split"
         )
         emit(Warned(text))
 
 
-def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
+def normals_warning(data: Data, files: Sequence[DepthFile]) -> str | None:
     """A warning about maps without normals, for a loss that needs them; None where all have normals.
 
     Not every estimator gives normals, and a loss that is always 0 is noticed nowhere else.
@@ -336,6 +336,6 @@ def lacking_normals(data: Data, files: Sequence[DepthFile]) -> str | None:
     return f"{what}, and the loss normal-prior learns nothing from those; {remedy}"
 
 
-def how_to_make(data: Data, normals: bool = False) -> str:
+def prepare_command(data: Data, normals: bool = False) -> str:
     """Which command makes depth priors, with normals if a loss needs them."""
     return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"

@@ -61,7 +61,7 @@ class Place:
     shift: tuple[float, float, float] | None = None
 
 
-def placed(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> Place | None:
+def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> Place | None:
     """Where a reconstruction of OpenSfM lies, in UTM if OpenDroneMap chose a zone; None if it has no GPS.
 
     Args:

@@ -14,7 +14,7 @@ from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot
 from surfkit.scene.cache import Cache
-from surfkit.scene.photos import opened, photo_size
+from surfkit.scene.photos import open_picture, photo_size
 from surfkit.scene.scene import View
 
 FOLDER = "masks"
@@ -69,7 +69,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Tensor:
         values = np.asarray(plain.resize(size, Image.Resampling.NEAREST))
         return values.max(-1) if values.ndim == 3 else values
 
-    values = opened(path, decode)
+    values = open_picture(path, decode)
     most = int(values.max(initial=0))
     half = 0 if most <= 1 else 127 if most <= 255 else 32767
     return torch.from_numpy(values > half)

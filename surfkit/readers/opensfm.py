@@ -15,7 +15,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot, camera_of
 from surfkit.readers.data import Data
-from surfkit.readers.georeference import placed
+from surfkit.readers.georeference import place_on_earth
 from surfkit.scene.names import find_files
 
 PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
@@ -68,7 +68,7 @@ class ODM(Reader):
 def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, Any]) -> Capture:
     """A topocentric capture where it lies on Earth; the same one if the photographs had no GPS."""
     height = float(np.median(capture.xyz[:, 2])) if len(capture.xyz) else 0.0
-    place = placed(root, folder, model, height)
+    place = place_on_earth(root, folder, model, height)
     if place is None:
         return capture
     capture = replace(capture, metres=1.0, crs=place.crs, shift=place.shift)

@@ -20,9 +20,9 @@ from surfkit.readers.colmap import COLMAP, MODELS
 from surfkit.readers.data import Data
 from surfkit.readers.masks import check_mask, find_masks
 from surfkit.readers.reduced import reduced
-from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistorted
+from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
-from surfkit.scene.groups import apart
+from surfkit.scene.groups import groups_warning
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
 from surfkit.scene.scene import Cloud, Frame, Scene, View
@@ -41,13 +41,13 @@ def read(data: Data) -> Scene:
     if data.layout is None and len(fitting := _fitting(data.path)) > 1:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as {name_of(reader)}; it could also be read with --layout {others}"))
-    capture = captured(data, reader)
-    if text := apart(capture.groups):
+    capture = read_capture(data, reader)
+    if text := groups_warning(capture.groups):
         emit(Warned(text))
-    return assembled(data, capture)
+    return build_scene(data, capture)
 
 
-def captured(data: Data, reader: Reader) -> Capture:
+def read_capture(data: Data, reader: Reader) -> Capture:
     """What a reader finds in a data set, and in the one that is for tests."""
     if data.model is not None and reader.model_folder(data) is None:
         raise BadInput(f"--model {data.model}: a data set of layout {name_of(reader)} has no such model; leave it out")
@@ -55,7 +55,7 @@ def captured(data: Data, reader: Reader) -> Capture:
     return capture if data.test_data is None else _with_tests(capture, reader, data)
 
 
-def assembled(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
+def build_scene(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
     """The scene of a capture.
 
     Args:
@@ -177,7 +177,7 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -
             Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
             for shot, size in zip(shots, sizes, strict=True)
         ]
-        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistorted(p, data.path, keep), given))
+        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistort(p, data.path, keep), given))
     if any(turned):
         first = shots[turned.index(True)].name
         emit(

@@ -14,9 +14,9 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.readers.base import Reader
-from surfkit.readers.capture import Capture, Shot, camera_of, shortened
+from surfkit.readers.capture import Capture, Shot, camera_of, shorten
 from surfkit.readers.data import Data
-from surfkit.readers.depth_cloud import points_of_depth
+from surfkit.readers.depth_cloud import sample_depth_maps
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_layouts import MatrixCityDepths
 from surfkit.readers.sparse_ply import read_points
@@ -82,7 +82,7 @@ class MatrixCity(Reader):
         metres, sparse = _metres(read[0][0]), points(data.path, {})
         if not len(sparse[0]):
             query = DepthQuery(data.path, [shot.name for shot in train], data.path, metres)
-            sparse = points_of_depth(train, find_maps(query, MatrixCityDepths()))
+            sparse = sample_depth_maps(train, find_maps(query, MatrixCityDepths()))
         return replace(_split(train, held, sparse), metres=metres)
 
 
@@ -172,7 +172,7 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
 def _number(where: str, values: Mapping[str, Any], name: str, default: float | None = None) -> float:
     value = values.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < MOST:
-        raise BadInput(f"{where}: {name} is {shortened(value)}, not a number")
+        raise BadInput(f"{where}: {name} is {shorten(value)}, not a number")
     return float(value)
 
 

@@ -15,7 +15,7 @@ from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
 from surfkit.export.ply import replacing
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.masks import read_mask
 from surfkit.scene.copies import digest, place
 from surfkit.scene.photos import read_photo
@@ -66,7 +66,7 @@ def check_camera(camera: Any, name: str) -> None:
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
 
 
-def undistorted(picture: Picture, root: Path, keep: Path | None = None) -> Picture:
+def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture:
     """The picture of a pinhole camera, from the cache of the data set or made now.
 
     Args:
@@ -101,14 +101,14 @@ class _Lens:
 
     @classmethod
     def of(cls, camera: Any, size: tuple[int, int]) -> _Lens:
-        scaled = library().Camera(
+        scaled = load_pycolmap().Camera(
             model=camera.model.name, width=camera.width, height=camera.height, params=list(camera.params)
         )
         scaled.rescale(*size)
         return cls(camera.model.name, tuple(scaled.params), *size)
 
     def camera(self) -> Any:
-        return library().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        return load_pycolmap().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
 
 @lru_cache(maxsize=8)
@@ -116,7 +116,7 @@ def _warp(lens: _Lens) -> tuple[Any, Tensor, Tensor]:
     """The pinhole camera, where its pixels lie in the photograph, (1, h, w, 2), and (h, w) which of them do."""
     source = lens.camera()
     try:
-        camera = library().undistort_camera(library().UndistortCameraOptions(), source)
+        camera = load_pycolmap().undistort_camera(load_pycolmap().UndistortCameraOptions(), source)
     except (ValueError, RuntimeError) as error:
         raise BadInput(f"a {lens.model} camera cannot be undistorted: {' '.join(str(error).split())}") from error
     x = (np.arange(camera.width) + 0.5 - camera.principal_point_x) / camera.focal_length_x

@@ -21,7 +21,7 @@ from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
-from surfkit.mesh.simplify import require, simplified
+from surfkit.mesh.simplify import require_open3d, simplify
 from surfkit.primitives.drawing import drawn_by
 from surfkit.raster.api import Rasterizer
 from surfkit.readers.depth_prior import read_priors
@@ -76,7 +76,7 @@ class MeshOutput:
         if self.crop is not None and self.crop_box is not None:
             raise BadInput("--crop and --crop-box: give one of the two")
         if self.lods:
-            require()
+            require_open3d()
 
     def volume(self) -> Crop | None:
         """The crop, in the frame of the input."""
@@ -185,7 +185,7 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
     """Write the mesh in all formats and levels, and give the paths."""
     meshes = [("mesh", mesh)]
     for at, share in enumerate(delivery.lods, 1):
-        meshes.append((f"mesh-lod{at}", simplified(mesh, share)))
+        meshes.append((f"mesh-lod{at}", simplify(mesh, share)))
         emit(Progress("simplifying", at, len(delivery.lods)))
     for name, each in meshes:
         for kind in dict.fromkeys(delivery.formats):

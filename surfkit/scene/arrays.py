@@ -11,7 +11,7 @@ _PARSING = Lock()
 """numpy reads headers with Python's own parser, which in Python 3.11 does not bear two threads at a time."""
 
 
-def mapped(path: Path) -> np.ndarray:
+def map_array(path: Path) -> np.ndarray:
     """The array, mapped from disk: memory is not taken because a header says so.
 
     Raises:

@@ -12,7 +12,7 @@ import numpy as np
 
 from surfkit.core.caches import cache_root
 from surfkit.core.files import replacing
-from surfkit.scene.arrays import mapped
+from surfkit.scene.arrays import map_array
 
 FOLDER = "resized"
 ENDS = 1 << 16
@@ -40,7 +40,7 @@ class Copies:
         """
         copy = place(self.root, FOLDER) / f"{path.stem}-{digest(self.root, key, [path])}.npy"
         try:
-            pixels = mapped(copy)
+            pixels = map_array(copy)
             if pixels.shape == shape and pixels.dtype == np.uint8:
                 return np.array(pixels)
         except Exception:  # it is not there, or damaged, of which numpy raises whatever comes

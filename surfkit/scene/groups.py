@@ -15,7 +15,7 @@ SHOWN = 4
 """Smaller groups that are listed, each with its size."""
 
 
-def connected(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarray]:
+def connect_groups(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarray]:
     """Positions of the photographs of each group that points connect, the largest group first.
 
     Photographs without a point are in none. No more tracks are taken than connect all photographs, so that those of a
@@ -38,7 +38,7 @@ def connected(count: int, tracks: Iterable[Sequence[int]]) -> list[np.ndarray]:
     return sorted(filter(len, groups), key=len, reverse=True)
 
 
-def apart(groups: Sequence[Sequence[str]]) -> str | None:
+def groups_warning(groups: Sequence[Sequence[str]]) -> str | None:
     """A warning about photographs that fall into several groups; None where there is one, or nothing is known.
 
     Args:

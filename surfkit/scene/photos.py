@@ -105,7 +105,7 @@ def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor
             plain = plain.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
         return np.array(plain)
 
-    return torch.from_numpy(opened(path, decode)).permute(2, 0, 1).contiguous()
+    return torch.from_numpy(open_picture(path, decode)).permute(2, 0, 1).contiguous()
 
 
 def read_draft(path: Path, longest: int) -> np.ndarray:
@@ -123,7 +123,7 @@ def read_draft(path: Path, longest: int) -> np.ndarray:
         by = max(1, max(plain.size) // longest)
         return np.array(plain.reduce(by) if by > 1 else plain)
 
-    return opened(path, decode)
+    return open_picture(path, decode)
 
 
 def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
@@ -152,7 +152,7 @@ def _as_stored(image: Image.Image) -> Image.Image:
     return image.transpose(UNDONE[turn]) if turn in UNDONE and ORIENTATION not in image.getexif() else image
 
 
-def opened(path: Path, use: Callable[[Image.Image], T]) -> T:
+def open_picture(path: Path, use: Callable[[Image.Image], T]) -> T:
     """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput."""
     with _picture(path) as image, GATE.taking(len(image.getbands()) * image.width * image.height):
         return use(image)

@@ -18,7 +18,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.scene.vectors import unit
 from surfkit.start.base import Start, StartInput
-from surfkit.start.voxels import Collected, Samples, Thinned, lonely, thinned_to
+from surfkit.start.voxels import Collected, Samples, Thinned, find_isolated, thin_to
 
 EDGE = 0.02
 """Three inverse depths in a row that are bent by a larger share of the middle one do not lie on one surface."""
@@ -85,7 +85,7 @@ class StereoStart(Start):
         if not len(stereo):
             emit(Warned("no pixel of a depth map is trusted, so the run starts from the sparse points alone"))
             return known.scene.cloud
-        return filled(stereo, known, self)
+        return fill_gaps(stereo, known, self)
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
@@ -111,9 +111,9 @@ class StereoStart(Start):
         if collected is None:
             return Thinned(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
         voxels = collected.settle()
-        rough = thinned_to(voxels, wanted)
-        noise = rough.take(lonely(rough))
-        return thinned_to(voxels.away_from(noise), wanted) if len(noise) else rough
+        rough = thin_to(voxels, wanted)
+        noise = rough.take(find_isolated(rough))
+        return thin_to(voxels.away_from(noise), wanted) if len(noise) else rough
 
     def trusted(self, known: StartInput, at: int, prior: DepthPrior) -> Tensor:
         """(H, W) which pixels of a depth map are used."""
@@ -185,7 +185,7 @@ def _slope(values: Tensor, dim: int) -> Tensor:
     return slope
 
 
-def filled(stereo: Thinned, known: StartInput, start: StereoStart) -> Cloud:
+def fill_gaps(stereo: Thinned, known: StartInput, start: StereoStart) -> Cloud:
     """Points of depth maps, and sparse points where there are none of those."""
     from scipy.spatial import cKDTree
 

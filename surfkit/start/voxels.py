@@ -151,7 +151,7 @@ class Collected:
         return self.voxels
 
 
-def thinned(voxels: Voxels, side: float) -> Thinned:
+def thin(voxels: Voxels, side: float) -> Thinned:
     """One point for each voxel of a size; where finer voxels have seen the same place, those alone count."""
     found = voxels if side == voxels.side else voxels.at(side)
     found = found.without(_seen_finer(found))
@@ -168,18 +168,18 @@ def thinned(voxels: Voxels, side: float) -> Thinned:
     return points.take(keep)
 
 
-def thinned_to(voxels: Voxels, most: int) -> Thinned:
+def thin_to(voxels: Voxels, most: int) -> Thinned:
     """As many points as there are, at most `most`, and not fewer by more than 2 % if there are more.
 
     The size of the voxels is found by steps that would be exact on a plane, kept within what was too much and too few.
     """
-    found = thinned(voxels, voxels.side)
+    found = thin(voxels, voxels.side)
     if len(found) <= most:
         return found
     best, low, high = None, voxels.side, np.inf
     side = low * max(1.01, np.sqrt(len(found) / most))
     for _ in range(24):
-        found = thinned(voxels, side)
+        found = thin(voxels, side)
         if len(found) <= most and (best is None or len(found) > len(best)):
             best = found
         if 0.98 * most <= len(found) <= most:
@@ -210,7 +210,7 @@ def apart(xyz: np.ndarray, weight: np.ndarray, radius: float) -> np.ndarray:
     return ~dropped
 
 
-def lonely(points: Thinned) -> np.ndarray:
+def find_isolated(points: Thinned) -> np.ndarray:
     """(P,) which points have too few others near them to be a surface."""
     from scipy.spatial import cKDTree
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, Frame, Scene, View
 
@@ -228,7 +228,7 @@ def write_colmap(folder: Path, synthetic: Synthetic, binary: bool = False, track
     for part, lines in {"cameras": [lens], "images": shots, "points3D": points}.items():
         (model / f"{part}.txt").write_text("".join(lines))
     if binary:
-        library().Reconstruction(str(model)).write_binary(str(model))
+        load_pycolmap().Reconstruction(str(model)).write_binary(str(model))
         for text in model.glob("*.txt"):
             text.unlink()
 

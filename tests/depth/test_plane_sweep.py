@@ -12,7 +12,7 @@ from surfkit.depth.consistency import Agreement, agreement, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.scanlines import best_planes, smoothed
+from surfkit.depth.scanlines import best_planes, smooth_costs
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
@@ -120,7 +120,7 @@ def test_scanlines_are_the_best_paths():
                 wanted[:, :, i] += path.T if axis == 0 else 0
                 if axis == 1:
                     wanted[:, i, :] += path.T
-    found = smoothed(torch.from_numpy(volume), torch.from_numpy(light), 0.1, 0.5)
+    found = smooth_costs(torch.from_numpy(volume), torch.from_numpy(light), 0.1, 0.5)
     # columns are lines of axis 0, rows those of axis 1
     np.testing.assert_allclose(found.numpy() * 4, wanted, rtol=1e-6)
 

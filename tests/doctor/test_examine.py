@@ -16,7 +16,7 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.doctor.examine import examine
 from surfkit.losses import NormalPrior
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import write_map
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -70,7 +70,7 @@ def not_finite(*names, camera=None):
 
     def change(folder):
         model = folder / "sparse" / "0"
-        library().Reconstruction(str(model)).write_binary(str(model))
+        load_pycolmap().Reconstruction(str(model)).write_binary(str(model))
         for path in [*model.glob("*.txt"), model / "rigs.bin", model / "frames.bin"]:
             path.unlink(missing_ok=True)
         raw = bytearray((model / "images.bin").read_bytes())

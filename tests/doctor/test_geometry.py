@@ -7,11 +7,13 @@ import pytest
 
 from surfkit.doctor.exposure import exposures, luminance
 from surfkit.doctor.geometry import places
-from surfkit.readers.capture import Shot, library
+from surfkit.readers.capture import Shot, load_pycolmap
 
 
 def shot(model, *params):
-    return Shot("a", np.eye(4), library().Camera(model=model, width=100, height=80, params=list(params)), Path("a"))
+    return Shot(
+        "a", np.eye(4), load_pycolmap().Camera(model=model, width=100, height=80, params=list(params)), Path("a")
+    )
 
 
 def test_places_are_shares_of_the_photograph_and_nothing_beyond_it():

@@ -8,7 +8,7 @@ import torch
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clusters
-from surfkit.mesh.floaters import without_floaters
+from surfkit.mesh.floaters import drop_floaters
 from surfkit.mesh.lattice import Picture
 from surfkit.mesh.tsdf import TSDF
 
@@ -33,11 +33,11 @@ def test_parts_in_the_open_go_and_parts_that_are_seen_stay():
     for camera in CAMERAS:
         depth = seen(camera, wall_and_mast)[0].astype(np.float32)
         pictures.append(Picture(depth, np.where(depth > 0, 32 << 24, 0).astype(np.uint32), camera))
-    kept, dropped = without_floaters(Mesh(vertices, faces), iter(pictures), 0.06, 1.0)
+    kept, dropped = drop_floaters(Mesh(vertices, faces), iter(pictures), 0.06, 1.0)
     assert dropped == 1 and set(np.unique(kept.faces // 4)) == {0, 2}
     blind = [replace(p, shade=p.shade & 0xFFFFFF) for p in pictures]
-    assert without_floaters(Mesh(vertices, faces), iter(blind), 0.06, 1.0)[1] == 0, "pixels without weight tell nothing"
-    assert without_floaters(Mesh(vertices, faces), iter(pictures), 0.06, 1000.0)[1] == 1, "nobody sees it"
+    assert drop_floaters(Mesh(vertices, faces), iter(blind), 0.06, 1.0)[1] == 0, "pixels without weight are ignored"
+    assert drop_floaters(Mesh(vertices, faces), iter(pictures), 0.06, 1000.0)[1] == 1, "nobody sees it"
 
 
 def test_a_mesh_without_what_one_view_alone_sees():

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from surfkit.scene.arrays import mapped
+from surfkit.scene.arrays import map_array
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def test_headers_are_read_by_many_threads(tmp_path, restless):
     np.save(tmp_path / "a.npy", values)
 
     def deeper(count):
-        return mapped(tmp_path / "a.npy") if count == 0 else deeper(count - 1)
+        return map_array(tmp_path / "a.npy") if count == 0 else deeper(count - 1)
 
     with ThreadPoolExecutor(4) as pool:  # threads must not be equally deep in calls, or Python notices nothing
         found = list(pool.map(lambda at: deeper(at % 4), range(800)))

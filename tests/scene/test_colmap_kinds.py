@@ -10,7 +10,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.readers import undistort
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.run.notes import noted
@@ -84,7 +84,7 @@ def test_exif_that_turns_photographs_is_ignored_and_said(farm):
     for path in (farm / "images").iterdir():
         Image.open(path).save(path.with_suffix(".jpg"), quality=95, exif=turn)
         path.unlink()
-    seen = np.asarray(library().Bitmap.read(str(farm / "images/view_001.jpg"), True).to_array())
+    seen = np.asarray(load_pycolmap().Bitmap.read(str(farm / "images/view_001.jpg"), True).to_array())
     scene, notes = noticed(Data(farm))
     assert "5 of 5 photographs have an EXIF tag that turns them, view_000.png for one: it is ignored" in notes[-1]
     photo = view_photo(scene.train[0]).permute(1, 2, 0).numpy()
@@ -119,7 +119,7 @@ def test_a_spelling_that_fits_two_files_is_none(farm):
 
 def test_rigs_and_frames(made, tmp_path):
     """A camera that is mounted on another stands where both transforms together put it."""
-    pycolmap = library()
+    pycolmap = load_pycolmap()
     folder, truth = made
     if not hasattr(pycolmap, "Rig"):
         pytest.skip("this pycolmap knows no rigs")
@@ -161,7 +161,7 @@ def distort(farm, lens):
     """Give the model another lens, and bend its photographs and observations as that lens would."""
     from scipy.ndimage import map_coordinates
 
-    pycolmap = library()
+    pycolmap = load_pycolmap()
     (farm / "sparse/0/cameras.txt").write_text(f"1 {lens} 64 48 {LENSES[lens]}\n")
     bent = pycolmap.Camera(model=lens, width=64, height=48, params=[float(v) for v in LENSES[lens].split()])
     xy = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), -1).reshape(-1, 2)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from surfkit.cli import main
 from surfkit.export.ply import read_splats
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.testing.synthetic import Flight, look, photograph, write_colmap
 
 from .folders import FLIGHT, blender, city, nerfstudio, odm, save, surveyed, views_of, with_tests_apart
@@ -26,7 +26,7 @@ def colmap(folder, truth, binary=False):
 
 def rigged(folder, truth):
     """A rig of two cameras that takes all the photographs in three frames, as the orbit is symmetric."""
-    pycolmap = library()
+    pycolmap = load_pycolmap()
     if not hasattr(pycolmap, "Rig"):
         pytest.skip("this pycolmap knows no rigs")
     source = pycolmap.Reconstruction(str(colmap(folder, truth) / "sparse/0"))
@@ -85,7 +85,7 @@ def bent(model, params):
     def build(folder, truth):
         colmap(folder, truth)
         (folder / "sparse/0/cameras.txt").write_text(f"1 {model} 40 30 {params}\n")
-        lens = library().Camera(model=model, width=40, height=30, params=[float(word) for word in params.split()])
+        lens = load_pycolmap().Camera(model=model, width=40, height=30, params=[float(word) for word in params.split()])
         return through(folder, truth, lens)
 
     return build
@@ -106,7 +106,9 @@ def bent_nerfstudio(folder, truth):
     lens = {"fl_x": 36, "fl_y": 36.4, "cx": 21.2, "cy": 14.4, "k1": -0.08, "k2": 0.02, "p1": 0.001, "p2": -0.002}
     folder.mkdir()
     nerfstudio(folder, truth, lambda contents: contents.update(lens))
-    return through(folder, truth, library().Camera(model="OPENCV", width=40, height=30, params=list(lens.values())))
+    return through(
+        folder, truth, load_pycolmap().Camera(model="OPENCV", width=40, height=30, params=list(lens.values()))
+    )
 
 
 def reduced(by):
@@ -268,7 +270,7 @@ def test_others_train_too(tmp_path, truth, layout):
 def test_a_distorted_copy_of_a_scene_is_as_good(tmp_path):
     """The same flight through a lens that bends, and through the pinhole camera that undistorting makes of it."""
     flight = Flight(views=8, width=96, height=72, points=2000, test_every=4)
-    truth, pycolmap = photograph(flight), library()
+    truth, pycolmap = photograph(flight), load_pycolmap()
     bent = pycolmap.Camera(model="OPENCV", width=96, height=72, params=[86, 87, 50, 35, -0.25, 0.05, 0.01, -0.02])
     straight = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), bent)
     scores = []

@@ -9,7 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_splats
 from surfkit.readers.data import Data
-from surfkit.readers.georeference import placed, utm
+from surfkit.readers.georeference import place_on_earth, utm
 from surfkit.readers.read import read
 from surfkit.run.notes import noted
 from surfkit.scene.scene import Frame
@@ -42,7 +42,7 @@ def project(folder, coords="WGS84 UTM 32N\n492000 5260000\n", reference=REFERENC
     (folder / "odm_georeferencing/coords.txt").write_text(coords)
     (folder / "opensfm").mkdir()
     (folder / "opensfm/reference_lla.json").write_text(json.dumps(reference))
-    return placed(folder, folder / "opensfm", {}, 0.0)
+    return place_on_earth(folder, folder / "opensfm", {}, 0.0)
 
 
 def test_a_topocentric_reconstruction_comes_where_proj_puts_it(tmp_path):

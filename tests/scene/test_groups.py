@@ -10,7 +10,7 @@ from surfkit.cli.recipes import recipes
 from surfkit.doctor.examine import examine
 from surfkit.readers.data import Data
 from surfkit.scene import groups
-from surfkit.scene.groups import apart, connected
+from surfkit.scene.groups import connect_groups, groups_warning
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(kind="grid", views=16, width=24, height=18, points=400)
@@ -31,7 +31,7 @@ def test_groups_are_those_of_sets_that_are_joined(monkeypatch, batch, seed):
     monkeypatch.setattr(groups, "BATCH", batch)
     draw = np.random.default_rng(seed)
     tracks = [draw.integers(0, 60, draw.integers(0, 4)).tolist() for _ in range(30)]
-    found = connected(60, tracks)
+    found = connect_groups(60, tracks)
     assert [len(group) for group in found] == sorted(map(len, found), reverse=True)
     assert {frozenset(group.tolist()) for group in found} == set(map(frozenset, joined(tracks)))
 
@@ -39,15 +39,17 @@ def test_groups_are_those_of_sets_that_are_joined(monkeypatch, batch, seed):
 def test_no_more_is_read_than_connects_all(monkeypatch):
     monkeypatch.setattr(groups, "BATCH", 10)
     chain = iter([[at, at + 1] for at in range(24)] + [[0, 0]] * 100)
-    assert [group.tolist() for group in connected(25, chain)] == [list(range(25))]
+    assert [group.tolist() for group in connect_groups(25, chain)] == [list(range(25))]
     assert len(list(chain)) == 94
-    assert connected(0, []) == connected(3, []) == connected(3, [[], []]) == []
+    assert connect_groups(0, []) == connect_groups(3, []) == connect_groups(3, [[], []]) == []
 
 
 def test_the_line_names_sizes_and_one_photograph_of_each_smaller_group():
-    assert apart([]) is apart([["a", "b"]]) is None
-    assert "into 2 groups without common sparse points, of 3 and 1 ('d' for one): " in apart([["a", "b", "c"], ["d"]])
-    many = apart([["a"] * 9, *([name] * (8 - at) for at, name in enumerate("bcdefg"))])
+    assert groups_warning([]) is groups_warning([["a", "b"]]) is None
+    assert "into 2 groups without common sparse points, of 3 and 1 ('d' for one): " in groups_warning(
+        [["a", "b", "c"], ["d"]]
+    )
+    many = groups_warning([["a"] * 9, *([name] * (8 - at) for at, name in enumerate("bcdefg"))])
     assert "7 groups" in many and many.count("for one") == 4
     assert "of 9, 8 ('b' for one), 7 ('c' for one), 6 ('d' for one), 5 ('e' for one) and 2 more of up to 4: " in many
     assert "\n" not in many

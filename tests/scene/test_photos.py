@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.readers.capture import library
+from surfkit.readers.capture import load_pycolmap
 from surfkit.scene import photos
 from surfkit.scene.camera import Camera
 from surfkit.scene.copies import Copies
@@ -83,7 +83,7 @@ def test_the_rotation_in_exif_is_not_applied(tmp_path, end, turn):
     path = save(tmp_path / f"a.{end}", pixels, exif=exif)
     assert photo_size(path) == (8, 6) and is_turned(path) == (turn > 1)
     assert np.array_equal(read_photo(path, (8, 6)).permute(1, 2, 0), pixels)
-    assert np.array_equal(library().Bitmap.read(str(path), True).to_array(), pixels)
+    assert np.array_equal(load_pycolmap().Bitmap.read(str(path), True).to_array(), pixels)
 
 
 def test_by_position_in_the_size_of_the_camera(tmp_path):

@@ -15,7 +15,7 @@ from surfkit.scene.scene import Cloud
 from surfkit.start.base import Start, StartInput
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.stereo import StereoStart, normals_of, pixel_size
-from surfkit.start.voxels import Collected, Samples, apart, thinned, thinned_to
+from surfkit.start.voxels import Collected, Samples, apart, thin, thin_to
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
 
@@ -194,7 +194,7 @@ def test_memory_is_bounded_and_nothing_is_lost_by_it():
     assert voxels.sums[:, 0].sum() == pytest.approx(weight.sum(), rel=1e-5)
     mean = (weight[:, None] * np.concatenate([part.xyz for part in parts])).sum(0) / weight.sum()
     np.testing.assert_allclose(voxels.sums[:, 1:4].sum(0) / voxels.sums[:, 0].sum(), mean, atol=1e-5)
-    assert 0.98 * 700 <= len(thinned_to(voxels, 700)) <= 700
+    assert 0.98 * 700 <= len(thin_to(voxels, 700)) <= 700
 
 
 def test_what_is_far_lies_in_larger_voxels_and_gives_way_to_what_was_seen_nearby():
@@ -205,7 +205,7 @@ def test_what_is_far_lies_in_larger_voxels_and_gives_way_to_what_was_seen_nearby
     kept = Collected(0.02, 1 << 20)
     kept.add(near)
     kept.add(far)
-    found = thinned(kept.settle(), 0.02)
+    found = thin(kept.settle(), 0.02)
     fine = found.size == 0.02
     assert set(np.unique(found.size)) == {0.02, 0.16}
     assert (found.xyz[fine, 0] < 0).all() and (found.xyz[~fine, 0] > -0.16).all()
