@@ -108,10 +108,10 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     rows += [
         ("points", f"{metrics['points']:,}"),
         ("steps", f"{metrics['steps']:,}"),
-        ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of processor time)"),
+        ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of CPU time)"),
     ]
     if metrics.get("prepare_cpu_seconds") is not None:
-        rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of processor time"))
+        rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of CPU time"))
     if metrics.get("peak_memory_bytes"):
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
     if metrics.get("fps"):

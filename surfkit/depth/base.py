@@ -1,4 +1,4 @@
-"""What an estimator of depth is."""
+"""The kind of component that estimates depth maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from surfkit.scene.scene import View
 
 @dataclass(frozen=True)
 class DepthInput:
-    """What there is to estimate depth from.
+    """The photographs and sparse points that depth is estimated from.
 
     Attributes:
         views: The photographs, with cameras in the local frame.

@@ -1,4 +1,4 @@
-"""Which photographs to compare, and which depths to try: what the sparse points tell."""
+"""Choice of source photographs and of the depth range, from the sparse points."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from surfkit.scene.observations import Observations
 from surfkit.scene.scene import View
 
 NARROW, WIDE = 1 / 3, 1.5
-"""How fast a pair loses worth below and above the best angle, as shares of it."""
+"""Width of the weight of a pair below and above the preferred angle, as shares of that angle."""
 SAME_SIDE = 0.8
-"""Share of its worth that a view loses when another stands in the same direction: both see the same occlusions."""
+"""Share of its weight that a view loses when another stands in the same direction: both see the same occlusions."""
 LEAST = 0.1
-"""A pair that is worth less than this many well placed points cannot be compared."""
+"""A pair with a weight of fewer than this many well placed points is not compared."""
 CANDIDATES = 40
-"""Of how many views with most shared points the angles are looked at."""
+"""Number of views, those with most shared points, whose angles are computed."""
 OUTLIERS = 0.01
-"""Share of the sparse points that may lie nearer, and further, than the depths that are tried."""
+"""Share of the sparse points that may lie closer than the depths tried, and farther away."""
 
 
 def neighbours(views: Sequence[View], observations: Observations, count: int, angle: float) -> list[list[int]]:
@@ -73,7 +73,7 @@ def depth_range(view: View, observations: Observations, margin: float) -> tuple[
 
 
 def _spread(worth: dict[int, float], baselines: dict[int, np.ndarray], count: int) -> list[int]:
-    """Up to `count` of the views, the best first, where one that stands in the direction of another is worth less."""
+    """Up to `count` of the views, best first; a view in the same direction as a chosen one weighs less."""
     left = {other: value for other, value in worth.items() if value > LEAST}
     chosen: list[int] = []
     while left and len(chosen) < count:

@@ -25,11 +25,11 @@ from surfkit.mesh.tiles import Box, join
 from surfkit.scene.camera import Camera
 
 TILES = ".tiles-*"
-"""Name of the folder for what the views see."""
+"""Pattern of the names of folders with the depth maps of the views."""
 PIXEL_BYTES = 8
-"""Of a view on disk."""
+"""Bytes per pixel of a view on disk."""
 Made = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Vertices, faces and colours."""
+"""Vertices, faces, colours."""
 
 
 @dataclass(frozen=True)

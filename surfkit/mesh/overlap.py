@@ -1,4 +1,4 @@
-"""Which views see what a view sees, from another direction: what its depth can be compared with."""
+"""Views that see the same surface from another direction, to compare depths with."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from torch import Tensor
 from surfkit.scene.camera import Camera
 
 PROBES = 12
-"""Pixels along each side of a view whose points are looked for in others."""
+"""Pixels along each side of a view whose points are projected into other views."""
 NARROW, WIDE = 1 / 3, 1.5
-"""How fast a view loses worth below and above the best angle, as shares of it."""
+"""Width of the weight of a view below and above the preferred angle, as shares of that angle."""
 WIDEST = 45.0
-"""Degrees between rays from which no view is asked."""
+"""Degrees between rays from which on a view is not compared."""
 CANDIDATES = 128
-"""Of how many views near by the probes are looked at."""
+"""Number of nearby views that the probes are projected into."""
 LEAST = 0.01
-"""A view that is worth less than this share of the probes is not asked."""
+"""A view with a weight below this share of the probes is not compared."""
 
 
 @dataclass(frozen=True)

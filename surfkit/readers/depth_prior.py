@@ -28,15 +28,15 @@ from surfkit.scene.vectors import unit
 UNITS = 1.25
 """A map in input units that is off by a larger factor from the sparse points is in other units."""
 EDGE = 0.05
-"""Neighbours whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
+"""Neighbouring pixels whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
 TRUSTED = 0.5
 """Pixels of a higher confidence count as trusted."""
 HARDLY = 0.02
-"""Where a smaller share of all pixels is trusted, something is wrong with what the maps were made from."""
+"""Below this share of trusted pixels, something is wrong with the input of the maps."""
 OFF = "everything that needs them is switched off, such as the losses depth and normal-prior"
-"""What becomes of a run without depth priors."""
+"""Consequence of missing depth priors."""
 WITH_NORMALS = "estimator:patch-match"
-"""Words that have normals estimated too."""
+"""Choice of an estimator that gives normals."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def prior_cache(
 
 
 def prior_bytes(normals: bool) -> int:
-    """What a prior takes for each pixel in a cache: float32 for depth and confidence, int8 for normals."""
+    """Bytes per pixel of a prior in a cache: float32 for depth and confidence, int8 for normals."""
     return 8 + 3 * normals
 
 

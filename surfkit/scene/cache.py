@@ -1,4 +1,4 @@
-"""What is read from disk for each view, kept in memory up to a number of bytes and read ahead by threads."""
+"""Values read from disk for each view, kept in memory up to a byte budget and prefetched by threads."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ class Cache(Sequence, Generic[T]):
         self._fetch()
 
     def close(self) -> None:
-        """Read nothing more."""
+        """Stop reading."""
         self._needed, self._next = {}, None
         self._stop()
 
     def resize(self, budget_bytes: int) -> None:
-        """Keep no more than so many bytes from now on, and let go of the rest; one value is still held at a time."""
+        """Keep at most so many bytes from now on, and drop the rest; one value is always held."""
         self._budget = budget_bytes
         self.lowered = True
         self._make_room(0, -1)
@@ -106,12 +106,12 @@ class Cache(Sequence, Generic[T]):
 
     @property
     def budget(self) -> int:
-        """Most bytes to keep."""
+        """Maximum number of bytes to keep."""
         return self._budget
 
     @property
     def bytes(self) -> int:
-        """What is kept or being read now."""
+        """Bytes kept or being read now."""
         return self._bytes
 
     def _value(self, at: int) -> T:

@@ -1,4 +1,4 @@
-"""Copies of photographs beside a data set, made once: as they are used, so that they need not be made again."""
+"""Decoded and resized copies of photographs, made once and kept on disk."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Gate:
-    """Lets threads take bytes up to a sum; one is let in whatever it takes, when no other is."""
+    """A semaphore over bytes: threads wait until there is room; a single one may exceed the limit."""
 
     def __init__(self, most: int) -> None:
         self.most, self.taken = most, 0

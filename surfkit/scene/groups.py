@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 BATCH = 20_000
-"""Points after which is looked whether all photographs are connected."""
+"""Points between two checks whether all photographs are connected."""
 SHOWN = 4
 """Smaller groups that are listed, each with its size."""
 

@@ -1,4 +1,4 @@
-"""Points of many views thinned to one a voxel, in memory that does not grow with the views.
+"""Points of many views thinned to one per voxel, in memory that does not grow with the views.
 
 Voxels have sizes of 1, 2, 4 and so on times the smallest: what is far from its camera is known less finely, and would
 stay a point for each pixel of each view in small ones. Those of all sizes share one grid.
@@ -13,15 +13,15 @@ import numpy as np
 from surfkit.scene.sets import is_among
 
 BITS = 19
-"""Of the index of a voxel along each axis."""
+"""Bits of the index of a voxel along each axis."""
 LEVELS = 31
-"""Sizes of voxels, at most."""
+"""Maximum number of voxel sizes."""
 BATCH = 1 << 19
-"""Voxels that wait, at least, before they are sorted in among the others."""
+"""Minimum number of buffered voxels before they are merged into the sorted ones."""
 APART = 0.5
-"""Points nearer to each other than this share of a voxel are one too many: of voxels whose corners cut a surface."""
+"""Points closer to each other than this share of a voxel are duplicates, from voxels whose corners cut a surface."""
 LONELY, NEIGHBOURS = 3.0, 3
-"""A point that has not so many others within so many times the size of its voxel is noise."""
+"""A point with fewer others within this many voxel sizes is noise."""
 WEIGHT, PLACE, COLOR, NORMAL = 0, slice(1, 4), slice(4, 7), slice(7, 10)
 """Columns of the sums."""
 
@@ -48,7 +48,7 @@ class Thinned:
         return len(self.xyz)
 
     def take(self, rows: np.ndarray) -> Thinned:
-        """Some of them."""
+        """A selection of the points."""
         return Thinned(*(value[rows] for value in vars(self).values()))
 
 
@@ -90,7 +90,7 @@ class Voxels:
 
     @classmethod
     def of(cls, side: float, samples: Samples) -> Voxels:
-        """Those of some points."""
+        """The voxels of samples, the smallest of this side."""
         level = np.round(np.log2(np.maximum(samples.grain / side, 1)))
         weight = samples.weight[:, None]
         sums = np.empty((len(weight), 10), np.float32)
@@ -114,11 +114,11 @@ class Voxels:
         return _summed(side, *_encoded(side, self.means(), wanted, self.sums))
 
     def without(self, rows: np.ndarray) -> Voxels:
-        """Without some."""
+        """The voxels without a selection."""
         return replace(self, keys=self.keys[~rows], sums=self.sums[~rows])
 
     def away_from(self, points: Thinned) -> Voxels:
-        """Without those that have gone into points to be dropped, none of which has many others near it."""
+        """Without the voxels that went into points to be dropped, none of which has many others near it."""
         from scipy.spatial import cKDTree
 
         diagonal = np.sqrt(3) * points.size
@@ -127,21 +127,21 @@ class Voxels:
 
 
 class Collected:
-    """Voxels of all views so far; when there are too many, they are made twice as large."""
+    """Voxels of all views so far; their size is doubled when there are too many."""
 
     def __init__(self, side: float, most: int) -> None:
-        """Begin with none; `side`: of the smallest voxels; `most`: how many are kept."""
+        """Empty; `side`: of the smallest voxels; `most`: how many are kept."""
         self.voxels = Voxels(side, np.zeros(0, np.int64), np.zeros((0, 10), np.float32))
         self.most, self.waiting = most, []
 
     def add(self, samples: Samples) -> None:
-        """Take in the points of a view."""
+        """Add the points of a view."""
         self.waiting.append(Voxels.of(self.voxels.side, samples))
         if sum(map(len, self.waiting)) > max(len(self.voxels), BATCH):
             self.settle()
 
     def settle(self) -> Voxels:
-        """Sort in what waits, and return all."""
+        """Merge the buffered voxels, and return all."""
         parts, side = [self.voxels, *self.waiting], self.voxels.side
         self.waiting = []
         keys, sums = np.concatenate([p.keys for p in parts]), np.concatenate([p.sums for p in parts])
