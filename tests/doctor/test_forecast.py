@@ -27,6 +27,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
+from surfkit.scene.scene import Cloud
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.stage import Trainer
 
@@ -234,8 +235,9 @@ def test_a_probe_that_is_killed_says_so(farm, tmp_path):
 
     found = probe(job, kill)
     assert found.written is None and "killed" in found.failure
-    broken = probe(replace(job, recipe=evolve(job.recipe, "pretrain.rates", {})))
-    assert "BadInput: rates has" in broken.failure and broken.taken == ()
+    empty = Cloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    broken = probe(replace(job, scene=replace(job.scene, cloud=empty)))
+    assert "BadInput: the scene has no sparse points" in broken.failure and broken.taken == ()
 
 
 @pytest.mark.parametrize(
