@@ -33,6 +33,8 @@ _HOME = {
     "surfkit.losses.base": ("Loss",),
     "surfkit.densify.base": ("Densify", "Filter", "Policy", "Prune", "Signal", "Step", "Views"),
     "surfkit.mesh.base": ("Mesh", "Mesher", "MeshInput"),
+    "surfkit.method.base": ("Method", "MethodInput", "Reconstruction", "SplatModel"),
+    "surfkit.train.interrupt": ("graceful",),
     "surfkit.train.stage": ("Stage",),
     "surfkit.recipe": ("Recipe",),
 }

@@ -59,7 +59,7 @@ def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray
     except (KeyError, TypeError, ValueError) as error:
         raise BadInput(f"{folder / journal.NAME}: a step without its {what}; the file is damaged") from error
     if not len(rows):
-        raise BadInput(f"{folder / journal.NAME}: no step is made yet")
+        raise BadInput(f"{folder / journal.NAME}: no step is made yet, or the method of the run makes none")
     pieces = np.array_split(rows, min(DOTS, len(rows)))
     steps, values = np.array([(piece[-1, 0], piece[:, 1].mean()) for piece in pieces]).T
     return steps, values
