@@ -48,9 +48,9 @@ from surfkit.run.folder import (
 from surfkit.run.journal import kept
 from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, subject
 from surfkit.run.method import (
-    draws_nothing,
     is_begun,
     method_input,
+    not_drawn,
     optimised,
     reconstruct,
     reopened,
@@ -314,11 +314,6 @@ def evaluate(
         **({"method": dict(made.facts)} if made.facts else {}),
     }
     return note_metrics(run.metrics, metrics)
-
-
-def not_drawn(run: Run) -> dict[str, Any]:
-    """What stands in the metrics in the place of measurements on photographs."""
-    return {"images": {"psnr": None, "ssim": None, "per_image": {}, "not_measured": draws_nothing(run)}, "fps": None}
 
 
 def opened(out: Path) -> Run:

@@ -87,7 +87,7 @@ class Evaluate:
 
     def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
         run, scene = ctx.run, ctx.scene
-        refuse_not_drawn(run, made)
+        refuse_not_drawn(run)
         zones.refuse_too_many(scene)
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)
@@ -104,6 +104,8 @@ class Evaluate:
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
         if run is not None:
             refuse_no_mesh(run)
+            if zones != Zones():
+                refuse_not_drawn(run)
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else run.out)
         scene = self._scene(run)
         if scene is not None:
@@ -132,7 +134,6 @@ class Evaluate:
         with held(self.target), full_disk_in_one_line(self.target):
             with loaded(self.target, self.device) as (ctx, made):
                 run, scene = ctx.run, ctx.scene
-                refuse_not_drawn(run, made)
                 depths = rendered_depths(made.draw) if truth is None else true_depths(truth, scene.frame, matrix)
                 seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
                 return measure_zones(scene, made.draw, zones, depths, seams)

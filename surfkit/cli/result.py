@@ -103,7 +103,7 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     rows += zone_rows(images)
     rows += [
         *([] if metrics["points"] is None else [("points", f"{metrics['points']:,}")]),
-        ("steps", f"{metrics['steps']:,}"),
+        *([("steps", f"{metrics['steps']:,}")] if metrics["steps"] else []),
         ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of processor time)"),
     ]
     if metrics.get("prepare_cpu_seconds") is not None:

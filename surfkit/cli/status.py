@@ -54,7 +54,7 @@ def rows(found: Status) -> list[tuple[str, str]]:
     if found.seconds_left is not None:
         minutes, seconds = divmod(round(found.seconds_left), 60)
         told.append(("time left", f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"))
-    if found.points is not None:
+    if found.points:
         told.append(("points", f"{found.points:,}"))
     if found.loss is not None:
         told.append(("loss", f"{found.loss:.4f}"))

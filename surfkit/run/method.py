@@ -38,6 +38,8 @@ from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
 from surfkit.train.stage import StageState
 
+RESULT = Path("result", "result.json")
+"""In the folder of a run, what its method has made; arrays lie beside it."""
 SHARE = 8
 """Photographs, masks and depth priors take at most one part each of so many parts of the memory."""
 
@@ -236,7 +238,7 @@ def keep(run: Run, made: Reconstruction) -> None:
 
 def result_path(run: Run) -> Path:
     """What tells that the method of a run has finished."""
-    return run.out / "result" / "result.json"
+    return run.out / RESULT
 
 
 def refuse_unsound(mesh: Mesh, name: str) -> None:
@@ -283,9 +285,11 @@ def splats_of(run: Run, made: Reconstruction) -> SplatModel:
     return made.splats
 
 
-def refuse_not_drawn(run: Run, made: Reconstruction) -> None:
-    """BadInput if a reconstruction cannot draw pictures."""
-    if made.draw is None:
+def refuse_not_drawn(run: Run) -> None:
+    """BadInput if what a run has made cannot draw pictures."""
+    path = result_path(run)
+    kept = read_json(path, Kept) if path.exists() else None
+    if kept is not None and kept.primitive is None and not kept.draws:
         raise BadInput(
             f"{run.out}: {draws_nothing(run)}, so photographs cannot be compared with any; to measure its mesh, name "
             "the truth with --gt, without --seen and --seams"
@@ -297,9 +301,14 @@ def draws_nothing(run: Run) -> str:
     return f"method:{name_of(run.recipe.method)} does not draw pictures"
 
 
+def not_drawn(run: Run) -> dict[str, Any]:
+    """What stands in the metrics in the place of measurements on photographs."""
+    return {"images": {"psnr": None, "ssim": None, "per_image": {}, "not_measured": draws_nothing(run)}, "fps": None}
+
+
 def refuse_mesher(out: Path) -> None:
-    """BadInput if the mesh of a run was made by its method, so that a mesher has nothing to do."""
-    path = out / "result" / "result.json"
+    """BadInput if the mesh of the run in a folder was made by its method, so that a mesher has nothing to do."""
+    path = out / RESULT
     if path.exists() and read_json(path, Kept).mesh is not None:
         raise BadInput(f"{out}: the method of the run made its mesh; leave out mesh:NAME and --mesh.*")
 

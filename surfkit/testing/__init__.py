@@ -8,12 +8,14 @@ from surfkit.testing.checks import (
     check_policy,
     check_refine,
 )
+from surfkit.testing.method import check_method
 from surfkit.testing.primitive import check_primitive
 
 __all__ = [
     "check_component",
     "check_loss",
     "check_mesher",
+    "check_method",
     "check_partition",
     "check_policy",
     "check_primitive",
