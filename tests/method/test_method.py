@@ -66,7 +66,8 @@ class Lower(Method):
         if done < self.steps:
             emit(StageBegan("lowering", self.steps, 0, first=done + 1))
         for index in range(done + 1, self.steps + 1):
-            height *= 0.5 + 0.01 * float(given.photo(index)[0, 0, 0] > 300)
+            height *= 0.5
+            assert given.photo(index).shape == (3, 36, 48) and given.mask(index) is None
             if self.wrong and index == 2:
                 raise BadInput("the plane does not fit this scene; choose another method")
             emit(StepDone(index, self.steps, {"height": height}, 0))
@@ -199,7 +200,10 @@ def test_a_mesh_method_from_the_command_line(data, tmp_path, capsys):
     assert main(["status", str(out)]) == 0
     assert main(words) == 0 and "is finished" in capsys.readouterr().err
     (out / "metrics.json").unlink()
-    assert main(words) == 0 and len(list((out / "mesh_pictures").glob("*.png"))) == 5
+    (out / "method" / "state.json").unlink()
+    lines = (out / "events.jsonl").read_text().count("StepDone")
+    assert main(words) == 0 and (out / "events.jsonl").read_text().count("StepDone") == lines, "its mesh is kept"
+    assert len(list((out / "mesh_pictures").glob("*.png"))) == 5
     capsys.readouterr()
     assert main([*words[:4], "6", *words[5:]]) == 2
     assert "holds a run with method.steps 5, and this one has 6" in capsys.readouterr().err
@@ -226,7 +230,7 @@ def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data,
     assert main(curve) == 0 and (tmp_path / "curves.png").exists()
     assert main(["mesh", str(out), "--formats", "ply", "obj"]) == 0 and (out / "mesh.obj").exists()
     assert main(["evaluate", str(out), "--gt", str(out / "mesh.ply"), "--tau", "0.5"]) == 0
-    assert json.loads((out / "metrics.json").read_text())["geometry"]["f1"] == 1.0
+    assert json.loads((out / "metrics.json").read_text())["geometry"]["f1"] > 0.99
     capsys.readouterr()
     assert main(["doctor", str(data.path), "recipe:2dgs", "method:lower", "--probe", "2"]) == 0
     told = capsys.readouterr().out
