@@ -235,7 +235,9 @@ def test_each_command_works_for_it_or_says_in_one_line_what_does_not_apply(data,
     assert main(["doctor", str(data.path), "recipe:2dgs", "method:lower", "--probe", "2"]) == 0
     told = capsys.readouterr().out
     assert (
-        "reconstruct with method:lower" in told and "no estimate for method:lower" in told and "start from" not in told
+        "reconstruct with method:lower" in told
+        and "no estimate for method:lower" in told
+        and "start from 300" not in told
     )
 
 
