@@ -41,6 +41,8 @@ _HOME = {
     "surfkit.depth.base": ("DepthEstimator", "DepthInput", "Estimate"),
     "surfkit.start.base": ("Start", "StartInput"),
     "surfkit.mesh.base": ("Mesh", "Mesher", "MeshInput"),
+    "surfkit.method.base": ("Method", "MethodInput", "Reconstruction", "SplatModel"),
+    "surfkit.train.interrupt": ("graceful",),
     "surfkit.train.stage": ("Stage",),
     "surfkit.recipe": ("Recipe",),
 }

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, nullcontext
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,13 @@ from surfkit.evaluate.metrics import read_metrics
 from surfkit.execute.base import Inline
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.method.base import Reconstruction, SplatModel
+from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
-from surfkit.recipe import Recipe, complete
+from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.context import RunContext
 from surfkit.run.folder import (
     Run,
@@ -45,10 +47,20 @@ from surfkit.run.folder import (
 )
 from surfkit.run.journal import kept
 from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, subject
+from surfkit.run.method import (
+    is_begun,
+    method_input,
+    not_drawn,
+    optimised,
+    reconstruct,
+    reopened,
+    result_path,
+    with_drawing,
+)
 from surfkit.run.notes import noted
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
 from surfkit.run.refine import refine_model, seen_by
-from surfkit.run.stage import Intervals, Job, drawer, drawing, load_state, optimise
+from surfkit.run.stage import Intervals, Job, drawer, load_state, optimise
 from surfkit.run.start import InitialPoints, priors_of
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
@@ -67,7 +79,15 @@ def with_steps(recipe: Recipe, steps: int) -> Recipe:
     """The recipe as a run of `steps` steps, every schedule scaled along."""
     if not 1 <= steps <= MOST_STEPS:
         raise BadInput(f"--steps {steps}: give 1 to {MOST_STEPS}")
-    return rescale(recipe, steps / recipe.pretrain.steps)
+    if recipe.has_stages:
+        return rescale(recipe, steps / recipe.pretrain.steps)
+    name = f"method:{name_of(recipe.method)}"
+    if recipe.length is None:
+        raise BadInput(f"--steps {steps}: {name} makes no optimisation steps; leave it out")
+    scaled = replace(recipe, method=rescale(recipe.method, steps / recipe.length))
+    if scaled.length != steps:
+        raise BadInput(f"--steps {steps}: {name} does not scale its steps; set them among its own settings, --method.*")
+    return scaled
 
 
 def run(
@@ -112,29 +132,62 @@ def run(
         scene = read(run.data)
         meter.scene_read()
         rasterizer, backend = drawer(compute.device)
-        state = load_state(run, scene, repair=True)
+        state = load_state(run, scene, repair=True) if recipe.has_stages else None
         prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         warn_of_no_edits(run)
         warn_of_idle(run, compute)
-        run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, state is not None))
-        start = beginning(run, scene, caches, state)
+        begun = state is not None or is_begun(run)
+        run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
+        ctx = RunContext(run, scene, rasterizer, intervals, caches)
+        stages = Stages(ctx, compute, meter, state)
+        given = use.enter_context(method_input(ctx, compute.device, stages))
+        recipe.method.refuse_unfit(given)
+        stages.begin()
         claim(run, backend, prints, notes, scene.frame)
         with kept(out):
-            if start is not None:
-                discard_results(run)
-                state = optimise(Job(run, scene, rasterizer, intervals, start.given, meter, cloud=start), state)
-                del start  # the memory of its photographs is free for what comes
-            if recipe.partition is not None:
-                state = None  # it is in the folder
-                run, state = tune_blocks(RunContext(run, scene, rasterizer, intervals, caches), compute)
-            run, state = refine_model(RunContext(run, scene, rasterizer, intervals, caches), state)
-            return results(RunContext(run, scene, rasterizer, intervals, caches), state, compute.device, meter)
+            return results(ctx, reconstruct(run, given), compute.device, meter)
+
+
+class Stages:
+    """The stages of a recipe, to be optimised one after the other.
+
+    Args:
+        ctx: The run, before its first stage.
+        compute: Who computes.
+        meter: Sees what memory is taken by.
+        state: Of the first stage, where it goes on.
+    """
+
+    def __init__(self, ctx: RunContext, compute: Compute, meter: Meter, state: StageState | None) -> None:
+        self.ctx, self.compute, self.meter, self.state = ctx, compute, meter, state
+        self.start: InitialPoints | None = None
+
+    def begin(self) -> None:
+        """Find where the first stage begins, or BadInput; nothing is written."""
+        if self.ctx.run.recipe.has_stages:
+            self.start = beginning(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
+
+    def __call__(self) -> Reconstruction:
+        """Optimise what is not finished yet."""
+        ctx, run, state, start = self.ctx, self.ctx.run, self.state, self.start
+        self.start = self.state = None
+        if start is not None:
+            discard_results(run)
+            job = Job(run, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, cloud=start)
+            state = optimise(job, state)
+            del start, job  # the memory of its photographs is free for what comes
+        if run.recipe.partition is not None:
+            state = None  # it is in the folder
+            run, state = tune_blocks(ctx, self.compute)
+        run, state = refine_model(replace(ctx, run=run), state)
+        return optimised(run, state)
 
 
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
     refuse_file(run.out)
+    refuse_unused(run.recipe)
     caches.bytes(), caches.maps_bytes()
     if run.recipe.partition is not None:
         compute.workers.ready()
@@ -150,87 +203,98 @@ def beginning(run: Run, scene: Scene, caches: CacheSettings, state: StageState |
     return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 
 
-def results(ctx: RunContext, state: StageState, device: Device, meter: Meter) -> dict[str, Any]:
+def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter) -> dict[str, Any]:
     """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
-    run, scene, rasterizer = ctx.run, ctx.scene, ctx.rasterizer
-    if run.metrics.exists() and has_cloud(run) and has_mesh(run, state.index):
+    run, scene = ctx.run, ctx.scene
+    meshed = has_mesh(run, made.last_steps, made.mesh is not None)
+    if run.metrics.exists() and has_cloud(run, made) and meshed:
         say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
         return read_metrics(run.out)
-    if not has_cloud(run):
-        export(run, state, scene)
-    if not has_mesh(run, state.index):
-        mesh(ctx, state, device)
-    return evaluate(run, state, scene, rasterizer, meter, lpips_weights="gpu")
+    if not has_cloud(run, made):
+        export(run, made.splats, scene)
+    if not meshed:
+        mesh(ctx, made, device)
+    return evaluate(run, made, scene, meter, lpips_weights="gpu")
 
 
-def has_cloud(run: Run) -> bool:
-    """Whether the points are written, if they can be."""
-    return run.cloud.exists() or (not run.primitive.in_ply and run.cameras.exists())
+def has_cloud(run: Run, made: Reconstruction) -> bool:
+    """Whether the points are written, if there are any and they can be."""
+    if made.splats is None:
+        return True
+    return run.cloud.exists() or (not made.splats.primitive.in_ply and run.cameras.exists())
 
 
-def export(run: Run, state: StageState, scene: Scene) -> None:
+def export(run: Run, splats: SplatModel, scene: Scene) -> None:
     """Write the points and the cameras in the frame of the input."""
-    params = run.stage.finished(state)
     write_cameras(run.cameras, scene)
     emit(FileWritten(run.cameras, "cameras"))
-    if not run.primitive.in_ply:
-        emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(run.primitive)}"))
+    if not splats.primitive.in_ply:
+        emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(splats.primitive)}"))
         return
-    write_splats(run.cloud, run.primitive.table(params).in_input_frame(scene.frame), frame=scene.frame)
+    table = splats.primitive.table(splats.params).in_input_frame(scene.frame)
+    write_splats(run.cloud, table, frame=scene.frame)
     emit(FileWritten(run.cloud, "points"))
 
 
-def mesh(ctx: RunContext, state: StageState, device: Device) -> None:
-    """Make the mesh that the recipe wants, with depth maps if it wants some, also for a run that was trained without.
+def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
+    """Write the mesh of the method, or make the one that the recipe wants, with depth maps if it wants some, also for a
+    run that was trained without.
 
     A surface that cannot be had is told, and costs no measurements.
     """
-    mesher, out = ctx.run.recipe.mesh, ctx.run.out
+    mesher, out, budget = ctx.run.recipe.mesh, ctx.run.out, cache_bytes("auto")
     try:
+        if made.mesh is not None:
+            what = subject(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
+            make_mesh(ctx.run, made.mesh, MeshOutput(), what, made.last_steps)
+            return
         with with_maps_to_mesh(ctx.run, mesher, ctx.scene, ctx.caches, device) as run:
-            what = subject(run, state, ctx.scene, ctx.rasterizer, cache_bytes("auto"), mesher)
-            make_mesh(run, mesher, MeshOutput(), what, state.index)
+            what = subject(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
+            make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
     except BadInput as error:
         emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
 
 
 def evaluate(
     run: Run,
-    state: StageState,
+    made: Reconstruction,
     scene: Scene,
-    rasterizer: Rasterizer,
     meter: Meter | None = None,
     lpips_weights: str = "auto",
 ) -> dict[str, Any]:
     """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.
 
+    Where nothing draws them, there is no PSNR, and the metrics say why.
+
     Args:
         run: The run.
-        state: Its splats.
+        made: What it has come to.
         scene: Its data.
-        rasterizer: What draws.
         meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
         lpips_weights: See `surfkit.evaluate.images.lpips.networks`.
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
-    perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)
-    draw, colors = (drawing(run, state, rasterizer, geometry) for geometry in (True, False))
+    perceptual, lacking = networks(lpips_weights, min(sides)) if sides and made.draw else ((), None)
+    colors = made.draw_color or made.draw
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
         write_picture(picture_path(run.pictures, view.name), panel(photo, maps))
 
     with meter.adding("pictures") if meter else nullcontext():
-        measured = evaluate_views(
-            scene.held_out,
-            photo_cache(scene.held_out, ahead),
-            draw,
-            timed=colors,
-            show=show,
-            correct_color=run.shown.appearance is not None,
-            masks=mask_cache(scene.held_out, ahead),
-            networks=perceptual,
-        )
+        if made.draw is None:
+            measured = not_drawn(run)
+        else:
+            measured = evaluate_views(
+                scene.held_out,
+                photo_cache(scene.held_out, ahead),
+                made.draw,
+                timed=colors,
+                show=show,
+                correct_color=made.correct_color,
+                masks=mask_cache(scene.held_out, ahead),
+                networks=perceptual,
+            )
     if lacking is not None:
         measured["images"]["lpips_not_measured"] = lacking
     if meter:
@@ -239,14 +303,15 @@ def evaluate(
     memory = record.get("memory_bytes") or {}
     metrics = {
         **measured,
-        "fps": measured["fps"] or frames_per_second(scene.train, colors),
-        "points": len(state.points),
-        "steps": sum(replace(run, part=part).stage.steps for part in run.parts[: run.parts.index(run.part) + 1]),
-        "seconds": state.seconds,
-        "cpu_seconds": state.cpu_seconds,
+        "fps": measured["fps"] or (frames_per_second(scene.train, colors) if colors else None),
+        "points": None if made.splats is None else len(made.splats),
+        "steps": made.steps,
+        "seconds": made.seconds,
+        "cpu_seconds": made.cpu_seconds,
         "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
-        "peak_memory_bytes": max(state.peak_memory_bytes, memory.get("peak", 0)) or None,
+        "peak_memory_bytes": max(made.peak_memory_bytes or 0, memory.get("peak", 0)) or None,
         "memory_bytes": memory,
+        **({"method": dict(made.facts)} if made.facts else {}),
     }
     return note_metrics(run.metrics, metrics)
 
@@ -261,13 +326,37 @@ def opened(out: Path) -> Run:
     return Run(out, read_json(out / "recipe.json", Recipe), read_data(out))
 
 
-def load_run(out: Path) -> tuple[Run, StageState, Scene]:
-    """A run folder, the state of its optimisation, and the scene that it was made from.
+@contextmanager
+def loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstruction]]:
+    """Within, what a finished run has come to, and what it was made from.
 
     Raises:
         BadInput: The folder holds no run, or one that is not finished.
     """
     run = opened(out)
+    if run.recipe.has_stages:
+        run, state, scene = load_run(out)
+        ctx = RunContext(run, scene, drawer(device)[0], Intervals(), CacheSettings())
+        yield ctx, with_drawing(optimised(run, state), ctx.rasterizer)
+        return
+    if not result_path(run).exists():
+        raise BadInput(
+            f"{out}: method:{name_of(run.recipe.method)} has not finished; give its surfkit train command again"
+        )
+    ctx = RunContext(run, read(run.data), drawer(device)[0], Intervals(), CacheSettings())
+    with method_input(ctx, device) as given:
+        yield ctx, reopened(run, given)
+
+
+def load_run(out: Path) -> tuple[Run, StageState, Scene]:
+    """The folder of a run in stages, the state of its optimisation, and the scene that it was made from.
+
+    Raises:
+        BadInput: The folder holds no run, or one that is not finished.
+    """
+    run = opened(out)
+    if not run.recipe.has_stages:
+        raise BadInput(f"{out}: method:{name_of(run.recipe.method)} has no stages, and so no state of an optimisation")
     scene = read(run.data)
     state, ahead = None, None
     for part in reversed(run.parts):

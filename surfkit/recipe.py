@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Literal
 
 import tyro
@@ -13,6 +13,8 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, components, name_of
 from surfkit.depth.base import DepthEstimator
 from surfkit.mesh.base import Mesher
+from surfkit.method.base import Method
+from surfkit.method.splats import SplatOptimisation
 from surfkit.partition.assign import Assign, SSIMDifference
 from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
@@ -33,6 +35,10 @@ class Recipe:
 
     about: Annotated[str, tyro.conf.Suppress] = ""
     """What the recipe is, in one line."""
+
+    method: Annotated[Method, choice(Method)] = SplatOptimisation()
+    """How the scene is reconstructed as a whole. Other methods than `splats` leave out most settings below: those that
+    they do not use are refused."""
 
     primitive: Annotated[Primitive, choice(Primitive)] = Surfel2D()
     """What the scene is made of."""
@@ -115,6 +121,22 @@ class Recipe:
             if stage.appearance is not None:
                 stage.appearance.refuse_unfit(primitive)
 
+    @property
+    def has_stages(self) -> bool:
+        """Whether splats are optimised in the stages of the recipe."""
+        return "pretrain" in self.method.uses
+
+    @property
+    def length(self) -> int | None:
+        """Optimisation steps of the first stage, or of the whole method; None if there are none."""
+        return self.pretrain.steps if self.has_stages else self.method.length()
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Names of the fields that the method does not use."""
+        used = {"about", "method", "seed", *self.method.uses, *["depth"] * self.method.needs_prior}
+        return tuple(each.name for each in fields(self) if each.name not in used)
+
 
 def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
     """The recipe with every learning rate written out: those of the primitive, unless a stage has others.
@@ -123,6 +145,9 @@ def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
         recipe: To complete.
         primitive: Name of the primitive that takes the place of its own, if another one does.
     """
+
+    if not recipe.has_stages:
+        return recipe
 
     def with_rates(stage: Stage, primitive: Primitive) -> Stage:
         known = {name: column.rate for name, column in primitive.columns().items()}
@@ -137,3 +162,22 @@ def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
         found = refine.primitive(found)
         refined.append(replace(refine, stage=with_rates(refine.stage, found)))
     return replace(recipe, pretrain=pretrain, tune=tune, refine=tuple(refined))
+
+
+def without_unused(recipe: Recipe) -> Recipe:
+    """The recipe with the fields that its method does not use at their defaults, as after a change of the method."""
+    plain = Recipe()
+    return replace(recipe, **{name: getattr(plain, name) for name in recipe.unused})
+
+
+def refuse_unused(recipe: Recipe) -> None:
+    """BadInput if a field is set that the method does not use."""
+    plain = Recipe()
+    for name in recipe.unused:
+        if getattr(recipe, name) != getattr(plain, name):
+            raise BadInput(unused(recipe, name))
+
+
+def unused(recipe: Recipe, setting: str) -> str:
+    """What is said of a setting that the method does not use."""
+    return f"{setting}: method:{name_of(recipe.method)} does not use it; leave it out, or choose method:splats"

@@ -14,14 +14,15 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from surfkit.cli.recipes import chosen_recipe
+from surfkit.cli.recipes import chosen_recipe, settled
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.memory import size
+from surfkit.core.registry import name_of
 from surfkit.doctor.estimate import Estimate, duration, likely_range
 from surfkit.doctor.examine import Diagnosis, Told, examine
-from surfkit.doctor.finding import LEVELS
+from surfkit.doctor.finding import LEVELS, Finding
 from surfkit.doctor.forecast import Plan, forecast
 from surfkit.pipeline import with_steps
 from surfkit.raster.select import Device
@@ -75,6 +76,7 @@ class Doctor:
     """Where to compute."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "recipe", settled(self.recipe))
         if not 0 <= self.probe <= MOST_PROBED:
             raise BadInput(f"--probe {self.probe}: give 0 (no estimate) to {MOST_PROBED} steps")
         if self.points is not None and not 1 <= self.points <= MOST_POINTS:
@@ -87,7 +89,10 @@ class Doctor:
         with watched() as told:
             examined = examine(data, recipe, self.quick, told)
             diagnosis = examined.diagnosis
-            if diagnosis.sound and self.probe:
+            if diagnosis.sound and self.probe and not recipe.has_stages:
+                text = f"there is no estimate for method:{name_of(recipe.method)}: it does not optimise splats"
+                diagnosis = replace(diagnosis, findings=(*diagnosis.findings, Finding("note", "forecast", text)))
+            elif diagnosis.sound and self.probe:
                 plan = Plan(self.probe, self.points, self.cache, self.device, self.out)
                 estimate, findings = forecast(data, recipe, examined, plan, told)
                 findings = tuple(sorted((*diagnosis.findings, *findings), key=lambda f: LEVELS.index(f.level)))

@@ -14,14 +14,16 @@ from surfkit.core.lock import held
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
-from surfkit.pipeline import drawer, evaluate, load_run, opened
+from surfkit.method.base import Reconstruction
+from surfkit.pipeline import evaluate, loaded, opened
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
+from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
+from surfkit.run.method import refuse_not_drawn
 from surfkit.run.notes import noted
-from surfkit.run.stage import drawing
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -80,16 +82,19 @@ class Evaluate:
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
             with held(self.target), full_disk_in_one_line(self.target):
-                run, state, scene = load_run(self.target)
-                zones.refuse_too_many(scene)
-                seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
-                rasterizer, _ = drawer(self.device)
-                metrics = evaluate(run, state, scene, rasterizer, lpips_weights=self.lpips_weights)
-                if zones != Zones():
-                    draw = drawing(run, state, rasterizer)
-                    found = measure_zones(scene, draw, zones, rendered_depths(draw), seams)
-                    metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
-                show(run, metrics)
+                with loaded(self.target, self.device) as (ctx, made):
+                    self._photographs(ctx, made, zones)
+
+    def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
+        run, scene = ctx.run, ctx.scene
+        refuse_not_drawn(run)
+        zones.refuse_too_many(scene)
+        seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
+        metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)
+        if zones != Zones():
+            found = measure_zones(scene, made.draw, zones, rendered_depths(made.draw), seams)
+            metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
+        show(run, metrics)
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):
@@ -99,6 +104,8 @@ class Evaluate:
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
         if run is not None:
             refuse_no_mesh(run)
+            if zones != Zones():
+                refuse_not_drawn(run)
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else run.out)
         scene = self._scene(run)
         if scene is not None:
@@ -125,11 +132,11 @@ class Evaluate:
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
         with held(self.target), full_disk_in_one_line(self.target):
-            run, state, scene = load_run(self.target)
-            draw = drawing(run, state, drawer(self.device)[0])
-            depths = rendered_depths(draw) if truth is None else true_depths(truth, scene.frame, matrix)
-            seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
-            return measure_zones(scene, draw, zones, depths, seams)
+            with loaded(self.target, self.device) as (ctx, made):
+                run, scene = ctx.run, ctx.scene
+                depths = rendered_depths(made.draw) if truth is None else true_depths(truth, scene.frame, matrix)
+                seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
+                return measure_zones(scene, made.draw, zones, depths, seams)
 
     def _scene(self, run: Run | None) -> Scene | None:
         """The scene whose views make the crop volume; None where nobody names one."""

@@ -12,8 +12,11 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.lock import held
 from surfkit.export.ply import write_splats
-from surfkit.pipeline import load_run
-from surfkit.run.folder import refuse_no_run
+from surfkit.method.base import SplatModel
+from surfkit.pipeline import loaded
+from surfkit.run.folder import Run, refuse_no_run
+from surfkit.run.method import splats_of
+from surfkit.scene.scene import Scene
 from surfkit.train.faults import full_disk_in_one_line
 
 
@@ -34,19 +37,19 @@ class Export:
         """Write the file."""
         refuse_no_run(self.run_folder)
         with held(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
-            self._write()
+            with loaded(self.run_folder, "cpu") as (ctx, made):
+                self._write(ctx.run, splats_of(ctx.run, made), ctx.scene)
 
-    def _write(self) -> None:
-        run, state, scene = load_run(self.run_folder)
+    def _write(self, run: Run, splats: SplatModel, scene: Scene) -> None:
         path = self.out or run.cloud
         if path.suffix.lower() != ".ply":
             raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
         if path.exists() and self.out is not None and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        table = run.primitive.table(run.stage.finished(state)).in_input_frame(scene.frame)
+        table = splats.primitive.table(splats.params).in_input_frame(scene.frame)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
-        print(f"wrote {len(state.points):,} points to {path}")
+        print(f"wrote {len(splats):,} points to {path}")
 
 
 COMMAND = Export

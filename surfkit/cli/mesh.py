@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,12 +18,13 @@ from surfkit.core.lock import held
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
-from surfkit.pipeline import drawer, load_run
+from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
 from surfkit.run.journal import kept
 from surfkit.run.mesh import MeshOutput, make_mesh, subject
+from surfkit.run.method import refuse_mesher
 from surfkit.run.notes import noted
 from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.scene.memory import cache_bytes
@@ -52,7 +54,7 @@ class MeshOf:
     """Folder that `surfkit train` made."""
 
     mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=named_mesher)
-    """How the splats become triangles."""
+    """How the splats become triangles; a mesh that the method of the run made itself is written again."""
 
     delivery: Annotated[MeshOutput, tyro.conf.arg(name="")] = MeshOutput()
     """What is written."""
@@ -77,25 +79,24 @@ class MeshOf:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
 
+        if any(word.startswith(("mesh:", "--mesh.")) for word in ARGV.get()):
+            refuse_mesher(self.run_folder)
+
     def run(self) -> None:
         """Mesh, and show what came out."""
         budget = cache_bytes(self.memory, "--memory")
         caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
         caches.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
-        with noted(), bars():
-            run, state, scene = load_run(self.run_folder)
+        with noted(), bars(), loaded(self.run_folder, self.device) as (ctx, made):
+            run, scene = ctx.run, ctx.scene
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
-            rasterizer, _ = drawer(self.device)
-            with (
-                held(run.out),
-                full_disk_in_one_line(run.out),
-                with_maps_to_mesh(run, self.mesh, scene, caches, self.device) as run,
-                kept(run.out),
-            ):
-                what = subject(run, state, scene, rasterizer, budget, self.mesh)
-                record = make_mesh(run, self.mesh, self.delivery, what, state.index)
+            mesher = None if made.mesh is not None else self.mesh
+            maps = nullcontext(run) if mesher is None else with_maps_to_mesh(run, mesher, scene, caches, self.device)
+            with held(run.out), full_disk_in_one_line(run.out), maps as run, kept(run.out):
+                what = subject(run, made, scene, ctx.rasterizer, budget, mesher)
+                record = make_mesh(run, mesher or made.mesh, self.delivery, what, made.last_steps)
         show(run, record)
 
 

@@ -10,6 +10,7 @@ leading "recipe.", and parts as `pretrain.densify:none`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -89,6 +90,26 @@ class Recipes:
 
 
 COMMAND = Recipes
+
+
+def settled(recipe: Any) -> Any:
+    """The chosen recipe; after a word has changed its method, without what the new one does not use.
+
+    Raises:
+        BadInput: Another word, or the recipe itself, sets something that the method does not use.
+    """
+    from surfkit.recipe import refuse_unused, unused, without_unused
+
+    words, names = ARGV.get(), [name.replace("_", "-") for name in recipe.unused]
+    for word in words:
+        setting = re.split("[=:]", word.removeprefix("--"))[0]
+        is_flag_or_choice = word.startswith("--") or ":" in word
+        if is_flag_or_choice and setting.partition(".")[0] in names:
+            raise BadInput(unused(recipe, word))
+    if any(word.startswith("method:") for word in words):
+        return without_unused(recipe)
+    refuse_unused(recipe)
+    return recipe
 
 
 def about(recipe: Any) -> str:

@@ -40,7 +40,7 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
         with sound(run.mesh_record, "damaged; delete it, and surfkit mesh makes the mesh again"):
             print_table(("mesh", "value"), mesh_rows(read_json(run.mesh_record, dict[str, Any])))
         print()
-    written = [("metrics", run.metrics), ("points", run.cloud)]
+    written = [("metrics", run.metrics), *[("points", run.cloud)] * run.cloud.exists()]
     if run.mesh_record.exists():  # without it, what is there is of an earlier model
         meshes = sorted(path for path in run.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
         written += [("mesh", path) for path in meshes]
@@ -98,16 +98,18 @@ def sound(path: Path, complaint: str) -> Iterator[None]:
 def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """What metrics.json says of a run, without the geometry."""
     images = metrics["images"]
-    rows = [("views held out", str(len(images["per_image"])))]
+    rows = [] if "not_measured" in images else [("views held out", str(len(images["per_image"])))]
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
         rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
+    if lacking := images.get("not_measured"):
+        rows.append(("photographs", f"not measured: {lacking}"))
     if lacking := images.get("lpips_not_measured"):
         rows.append(("LPIPS", f"not measured: {lacking}"))
     rows += zone_rows(images)
     rows += [
-        ("points", f"{metrics['points']:,}"),
-        ("steps", f"{metrics['steps']:,}"),
+        *([] if metrics["points"] is None else [("points", f"{metrics['points']:,}")]),
+        *([("steps", f"{metrics['steps']:,}")] if metrics["steps"] else []),
         ("training", f"{metrics['seconds']:.0f} s ({metrics['cpu_seconds']:.0f} s of CPU time)"),
     ]
     if metrics.get("prepare_cpu_seconds") is not None:

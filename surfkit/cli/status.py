@@ -45,7 +45,8 @@ class StatusOf:
 def rows(found: Status) -> list[tuple[str, str]]:
     """What a person is shown; what is not known is left out."""
     told: list[tuple[str, str]] = [("state", f"{found.state}{f', {found.process}' if found.process else ''}")]
-    told.append(("step", f"{found.step:,} of {found.steps:,}{f' of {found.stage}' if found.stage else ''}"))
+    if found.steps:
+        told.append(("step", f"{found.step:,} of {found.steps:,}{f' of {found.stage}' if found.stage else ''}"))
     if found.saved_step is not None:
         told.append(("last checkpoint", f"step {found.saved_step:,}"))
     if found.steps_per_second is not None:
@@ -53,7 +54,7 @@ def rows(found: Status) -> list[tuple[str, str]]:
     if found.seconds_left is not None:
         minutes, seconds = divmod(round(found.seconds_left), 60)
         told.append(("time left", f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"))
-    if found.points is not None:
+    if found.points:
         told.append(("points", f"{found.points:,}"))
     if found.loss is not None:
         told.append(("loss", f"{found.loss:.4f}"))

@@ -13,7 +13,7 @@ import tyro
 
 import surfkit
 from surfkit.blocks.schedule import Compute
-from surfkit.cli.recipes import ARGV, chosen_recipe
+from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
@@ -21,7 +21,7 @@ from surfkit.execute.base import Executor, Inline
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
-from surfkit.recipe import Recipe
+from surfkit.recipe import Recipe, unused
 from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
@@ -102,6 +102,9 @@ class Train:
     folder: tyro.conf.Suppress[str] = ""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "recipe", settled(self.recipe))
+        if self.pictures_every and not self.recipe.has_stages:
+            raise BadInput(unused(self.recipe, f"--pictures-every {self.pictures_every}"))
         if self.checkpoint_every < 1:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         if self.pictures_every is not None and self.pictures_every < 0:

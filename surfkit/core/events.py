@@ -21,7 +21,7 @@ class StageBegan:
     Attributes:
         stage: Its name in the recipe, such as "pretrain".
         steps: How many it will have made at its end.
-        points: At this moment.
+        points: At this moment; 0 for a method without points.
         first: Index of the first step to come; above 1 when the run goes on from a checkpoint.
         block: Number of the block that it is run on, if not on the whole scene.
     """
@@ -41,7 +41,7 @@ class StepDone:
         index: Counted from 1.
         steps: How many the stage has.
         losses: Weighted value of each loss, by its name in the recipe.
-        points: After the step.
+        points: After the step; 0 for a method without points.
         peak_memory_bytes: Most memory held so far; 0 where the system does not tell.
     """
 

@@ -237,7 +237,7 @@ def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) 
     if not np.isfinite(stops).any():
         return []
     low, high = np.nanpercentile(stops, [10, 90])
-    if high - low < UNEVEN_STOPS or recipe.pretrain.appearance is not None:
+    if high - low < UNEVEN_STOPS or not recipe.has_stages or recipe.pretrain.appearance is not None:
         return []
     order = np.argsort(np.nan_to_num(stops))
     text = (
@@ -250,7 +250,8 @@ def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) 
 
 def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     """Depth priors, where the recipe uses them."""
-    train, stereo, losses = gathered.train, recipe.start.needs_prior, recipe.pretrain.losses
+    train, losses = gathered.train, recipe.pretrain.losses
+    stereo = recipe.start.needs_prior or recipe.method.needs_prior
     if not train or not (stereo or needs_priors(losses)):
         return []
     normals = needs_normals(losses)
@@ -263,7 +264,8 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
         text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
         return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
     if not maps and stereo:
-        return [Finding("error", "depth-priors", f"the run begins at depth maps, and there are none; {make}")]
+        begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
+        return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
     if not maps:
         text = f"the recipe has a depth loss, and there are no depth priors, so it will be off; {make}"
         return [Finding("warning", "depth-priors", text)]
@@ -342,6 +344,8 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
     if gathered.masks:
         told.append(f"ignore what is black in the masks of {len(gathered.masks)} photographs")
+    if not recipe.has_stages:
+        return (*told, f"reconstruct with method:{name_of(recipe.method)}")
     sparse = len(gathered.capture.xyz)
     pixels = sum(math.prod(data.size(*look.size)) for look in known.values() if look.size)
     count = recipe.start.expected(sparse or RANDOM_POINTS, pixels)

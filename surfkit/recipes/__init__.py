@@ -15,7 +15,7 @@ from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.recipes import city
-from surfkit.recipes.surface import SURFACE, SURFACE_BLOCKS
+from surfkit.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS
 from surfkit.train.stage import Stage
 
 GAUSSIANS = Recipe(
@@ -88,6 +88,7 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "lightgaussian": LIGHT,
         "surface": SURFACE,
         "surface-blocks": SURFACE_BLOCKS,
+        "stereo": STEREO,
         "citygs": city.FIRST,
         "citygs2-coarse": city.COARSE,
         "citygs2": city.CITY,

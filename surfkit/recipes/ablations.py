@@ -17,10 +17,10 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
 from surfkit.losses.warped_patches import WarpedPatches
-from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
+from surfkit.recipes.surface import STEREO
 from surfkit.recipes.surface import SURFACE as BEST
 from surfkit.report.ablation import Row, Table
 from surfkit.train.stage import Stage
@@ -104,7 +104,7 @@ GRADIENT = Table(
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
-# way; as its splats are not looked at, they take one step, and their PSNR is that of the dense start.
+# way; it has no splats, and so no PSNR.
 SURFACE = Table(
     "surface",
     "What each part of recipe:surface brings, from 2DGS on sparse points to splats that stay with stereo depth",
@@ -121,7 +121,7 @@ SURFACE = Table(
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
-        Row("stereo alone (mesh:stereo)", {"mesh": Stereo(fusion=BEST.mesh), "pretrain.steps": 1}, kept=False),
+        Row("stereo alone (recipe:stereo)", {"method": STEREO.method}, kept=False),
     ),
 )
 

@@ -10,7 +10,9 @@ from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
+from surfkit.method.stereo import StereoFusion
 from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
@@ -36,6 +38,13 @@ SURFACE = Recipe(
     ),
     # Depth that other views confirm is averaged over less: neither side of a wall takes from the other.
     mesh=TSDF(truncation_voxels=2.5, least_views=0.1, trust=Agreement(alone=0.1)),
+)
+
+# The same depth, fused in the same way, without splats: what these bring is the difference.
+STEREO = Recipe(
+    about="Stereo depth maps alone, fused as recipe:surface fuses: no splats, the baseline of any surface",
+    method=StereoFusion(mesher=Stereo(fusion=SURFACE.mesh)),
+    depth=SURFACE.depth,
 )
 
 SURFACE_BLOCKS = replace(

@@ -11,7 +11,7 @@ from surfkit.core.registry import unknown
 from surfkit.core.tree import evolve
 from surfkit.densify.filters import CountCap
 from surfkit.pipeline import with_steps
-from surfkit.recipe import Recipe
+from surfkit.recipe import Recipe, unused, without_unused
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,22 @@ def build(table: Table) -> dict[str, Recipe]:
                 recipe = evolve(recipe, path, value)
             except BadInput as error:
                 raise BadInput(f"table:{table.name}, row {row.label!r}: {error}") from error
+        recipe = settled(recipe, row, table)
         recipes[row.label] = replace(recipe, about=f"{row.label}, a row of table:{table.name}")
         base = recipe if row.kept else base
     return recipes
+
+
+def settled(recipe: Recipe, row: Row, table: Table) -> Recipe:
+    """The recipe of a row without what its method does not use.
+
+    Raises:
+        BadInput: The row itself changes such a setting.
+    """
+    for path in row.change:
+        if path.partition(".")[0] in recipe.unused:
+            raise BadInput(f"table:{table.name}, row {row.label!r}: {unused(recipe, path)}")
+    return without_unused(recipe)
 
 
 def built_on(table: Table) -> dict[str, str | None]:
@@ -79,9 +92,9 @@ def built_on(table: Table) -> dict[str, str | None]:
 
 def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
     """A row's recipe when the table's base takes `steps`; a row with a longer or shorter run keeps its share."""
-    if steps is None:
+    if steps is None or recipe.length is None:
         return recipe
-    share = recipe.pretrain.steps / table.base.pretrain.steps
+    share = recipe.length / table.base.length if table.base.length else 1.0
     return with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
 
 

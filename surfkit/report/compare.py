@@ -11,7 +11,8 @@ from surfkit.core.codec import dump, load
 from surfkit.report.ablation import Row, Table, built_on
 
 MEASURED = ("psnr", "ssim", "points", "f1", "seconds", "cpu_seconds")
-"""What is taken from the metrics of a run; `f1` where its mesh was compared with the truth."""
+"""What is taken from the metrics of a run; `f1` where its mesh was compared with the truth, PSNR and SSIM where its
+method draws pictures, and points where it makes some."""
 
 Figures = Mapping[str, float]
 """Numbers of a run, by the names in `MEASURED`."""
@@ -25,7 +26,10 @@ def figures(metrics: Mapping[str, Any]) -> dict[str, float]:
     """
     images = load(dict[str, Any], metrics.get("images"), "images")
     known = {**load(dict[str, Any], metrics.get("geometry", {}), "geometry"), **metrics, **images}
-    wanted = [name for name in MEASURED if name != "f1" or name in known]
+    lacking = {"f1"} - known.keys() | ({"psnr", "ssim"} if "not_measured" in images else set())
+    if "points" in known and known["points"] is None:
+        lacking |= {"points"}
+    wanted = [name for name in MEASURED if name not in lacking]
     found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
     made = load(float, metrics.get("prepare_cpu_seconds") or 0.0, "prepare_cpu_seconds")
     return found | {"cpu_seconds": found["cpu_seconds"] + made}

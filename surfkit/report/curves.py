@@ -59,7 +59,9 @@ def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray
     except (KeyError, TypeError, ValueError) as error:
         raise BadInput(f"{folder / journal.NAME}: a step without its {what}; the file is damaged") from error
     if not len(rows):
-        raise BadInput(f"{folder / journal.NAME}: no step is made yet")
+        raise BadInput(f"{folder / journal.NAME}: no step is made yet, or the method of the run makes none")
+    if what == "points" and not rows[:, 1].any():
+        raise BadInput(f"{out}: the method of the run has no points; draw --of loss")
     pieces = np.array_split(rows, min(DOTS, len(rows)))
     steps, values = np.array([(piece[-1, 0], piece[:, 1].mean()) for piece in pieces]).T
     return steps, values

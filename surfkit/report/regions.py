@@ -104,6 +104,10 @@ def rendered_depths(draw: Draw) -> Depths:
 
     def of(view: View) -> Tensor:
         maps = draw(view)
+        if maps.median is None and maps.depth is None:
+            raise BadInput(
+                "the method of the run draws no depth: leave out --seen and --seams, or name a mesh with --gt"
+            )
         return depth_of(maps, "expected" if maps.median is None else "median").cpu()
 
     return Depths(of, "rendered depth", RENDERED, through=False)

@@ -18,6 +18,9 @@ from surfkit.report.study import Outcome, Trial
 from surfkit.report.table import drawing
 from surfkit.train.progress import outer
 
+TOLD = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "f1": "F1 {:.3f}", "points": "{:,} points"}
+"""What is told of a run that has ended, as far as it was measured."""
+
 
 class Screen:
     """A table that fills itself, with the progress of the run at hand below it; lines where there is no terminal."""
@@ -60,10 +63,9 @@ class Screen:
         if outcome.failed is not None:
             say(f"{self.heading}: failed: {outcome.failed}")
         elif self.live is None and outcome.figures is not None:
-            psnr, ssim, points, seconds = (outcome.figures[name] for name in ("psnr", "ssim", "points", "seconds"))
-            f1 = f", F1 {outcome.figures['f1']:.3f}" if "f1" in outcome.figures else ""
-            size = f"{points:,} points, {seconds / 60:.1f} minutes"
-            say(f"{self.heading}: PSNR {psnr:.2f} dB, SSIM {ssim:.3f}{f1}, {size}")
+            found = outcome.figures
+            told = [text.format(found[name]) for name, text in TOLD.items() if name in found]
+            say(f"{self.heading}: {', '.join(told)}, {found['seconds'] / 60:.1f} minutes")
 
     def draw(self, below: Any) -> None:
         """Show the table with something below it."""

@@ -17,6 +17,8 @@ from surfkit.run import journal
 
 NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
 """What lines of the journal may have, and of what kind it is."""
+STAGED = "splats"
+"""The method that optimises splats in the stages of a recipe, as recipe.json has it; others have none."""
 PACE_OVER = 100
 """Last steps that the speed is the mean of."""
 
@@ -110,7 +112,7 @@ def status(out: Path) -> Status:
     kept, lines = read_json(record, dict[str, Any]), _sound(journal.read(_latest(out)))
     last, metrics = _last(lines), _metrics(out, lines)
     steps, step = last["StageBegan"].get("steps", _steps(recipe)), last["StepDone"].get("index", 0)
-    finished = (out / "metrics.json").exists() and (out / "point_cloud.ply").exists()
+    finished = (out / "metrics.json").exists() and ((out / "point_cloud.ply").exists() or not _has_points(out))
     pace, blocks = _pace(lines), _blocks(out / "blocks")
     return Status(
         state="finished" if finished and not process else "running" if process else "stopped",
@@ -165,8 +167,11 @@ def _left(stage: float | None, blocks: tuple[Block, ...]) -> float | None:
 
 
 def _steps(recipe: Path) -> int:
-    """How many steps the stage of a recipe has."""
-    stage = read_json(recipe, dict[str, Any]).get("pretrain")
+    """How many steps the first stage of a recipe has; 0 where its method tells by itself how many it makes, if any."""
+    found = read_json(recipe, dict[str, Any])
+    if isinstance(method := found.get("method"), dict) and method.get("use") != STAGED:
+        return 0
+    stage = found.get("pretrain")
     if not isinstance(stage, dict) or not isinstance(stage.get("steps"), int):
         raise BadInput(f"{recipe}: no recipe: it lacks pretrain.steps")
     return stage["steps"]
@@ -213,6 +218,11 @@ def _saved(lines: list[dict[str, Any]]) -> int | None:
         elif line["event"] == "FileWritten" and line.get("what") == "checkpoint":
             saved = index
     return saved
+
+
+def _has_points(out: Path) -> bool:
+    """Whether the model of a run that was measured has points."""
+    return read_metrics(out)["points"] is not None
 
 
 def _metrics(out: Path, lines: list[dict[str, Any]]) -> dict[str, Any] | None:

@@ -129,9 +129,10 @@ def trials(plan: Plan) -> list[Trial]:
 
 def sized(recipe: Recipe, plan: Plan) -> Recipe:
     """A row's recipe at the length and with the limit of the plan, and with a mesh where F1 is wanted."""
-    if plan.truth is not None and recipe.mesh is None:
+    if plan.truth is not None and recipe.mesh is None and "mesh" not in recipe.unused:
         recipe = replace(recipe, mesh=TSDF())
-    return capped(scaled(recipe, plan.table, plan.steps), plan.max_points)
+    recipe = scaled(recipe, plan.table, plan.steps)
+    return capped(recipe, plan.max_points) if recipe.has_stages else recipe
 
 
 def unfinished(every: Sequence[Trial], labels: Collection[str], outcomes: Collection[Path]) -> list[Trial]:
@@ -229,7 +230,7 @@ def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) 
     return {
         "table": plan.table.name,
         "about": plan.table.about,
-        "steps": scaled(plan.table.base, plan.table, plan.steps).pretrain.steps,
+        "steps": scaled(plan.table.base, plan.table, plan.steps).length or 0,
         "max_points": plan.max_points,
         "truth": None if plan.truth is None else {"path": str(plan.truth.path), "tau": plan.truth.tau},
         "seeds": plan.seeds,

@@ -32,7 +32,7 @@ from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
-FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress")
+FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ class Run:
 
     @property
     def needs_priors(self) -> bool:
-        """Whether training looks at depth priors: a loss of the recipe, or its start."""
+        """Whether training looks at depth priors: the method, a loss of the recipe, or its start."""
+        if self.recipe.method.needs_prior:
+            return True
         stages = [replace(self, part=part).stage for part in self.parts]
         return self.recipe.start.needs_prior or any(
             loss.needs_prior for stage in stages for loss in stage.losses.values()

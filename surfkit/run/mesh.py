@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,16 @@ from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require_open3d, simplify
+from surfkit.mesh.stereo import points
+from surfkit.method.base import NEAR, Reconstruction
 from surfkit.primitives.drawing import drawn_by
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.api import Maps, Rasterizer
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
 from surfkit.run.folder import Run
 from surfkit.scene.crop import Crop, box, read_crop
 from surfkit.scene.photos import view_photo
-from surfkit.scene.scene import Scene
-from surfkit.train.stage import StageState
+from surfkit.scene.scene import Scene, View
 
 SHOWN = 4
 """Training views that pictures are made of."""
@@ -87,25 +88,30 @@ class MeshOutput:
 
 def subject(
     run: Run,
-    state: StageState,
+    made: Reconstruction,
     scene: Scene,
     rasterizer: Rasterizer,
     budget_bytes: int,
     mesher: Mesher | None = None,
 ) -> MeshInput:
-    """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
-    stage = run.stage
-    splats = run.primitive.activate(stage.finished(state), state.sh_degree)
-    draws = drawn_by(run.primitive, rasterizer)
+    """A reconstruction, to be meshed by `mesher`, or written if it is None and there is a mesh already.
+
+    With the depth priors if the mesher needs them and there are any. Where there are no splats, points of the depth
+    maps that can be drawn stand for them; where nothing can be drawn, the photographs stand for what is drawn.
+    """
+    draw = photographs if made.draw is None else made.draw
+    if mesher is not None and made.splats is None:
+        draw = with_depth(run, draw)
+    splats = made.splats.splats if made.splats else points(scene.train if mesher is not None else (), draw)
     masks = mask_cache(scene.train, budget_bytes // 4)
     wanted = mesher is not None and mesher.needs_prior
     priors = read_priors(run.data, scene, budget_bytes // 4) if wanted else None
     return MeshInput(
         splats=splats,
         views=scene.train,
-        draw=lambda view: draws.render(splats, view.camera, stage.near, distortion=False).maps,
-        rasterizer=draws,
-        near=stage.near,
+        draw=draw,
+        rasterizer=drawn_by(made.splats.primitive, rasterizer) if made.splats else rasterizer,
+        near=made.splats.near if made.splats else NEAR,
         frame=scene.frame,
         budget_bytes=budget_bytes,
         generator=torch.Generator().manual_seed(run.recipe.seed),
@@ -116,15 +122,34 @@ def subject(
     )
 
 
-def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput, steps: int) -> dict[str, Any]:
+def photographs(view: View) -> Maps:
+    """The photograph of a view, as if it were drawn."""
+    return Maps(color=view_photo(view).float() / 255)
+
+
+def with_depth(run: Run, draw: Callable[[View], Maps]) -> Callable[[View], Maps]:
+    """The same maps, or BadInput if they have no depth."""
+
+    def maps(view: View) -> Maps:
+        found = draw(view)
+        if found.alpha is None or found.depth is None or found.median is None:
+            raise BadInput(
+                f"{run.out}: what its method draws has no alpha, depth and median, so no mesh can be made of it"
+            )
+        return found
+
+    return maps
+
+
+def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: MeshInput, steps: int) -> dict[str, Any]:
     """Make the mesh of a run, write it into the run's folder, and return what mesh.json says.
 
     Args:
         run: The run.
-        mesher: How.
+        mesher: How; or the mesh, where the method of the run has made it.
         delivery: What to write.
         subject: What to mesh.
-        steps: That the splats were trained for.
+        steps: Optimisation steps that what is meshed was made with.
 
     Raises:
         BadInput: There is no surface, or nothing is left of it.
@@ -132,15 +157,15 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
     began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
     for left in run.out.glob(TILES):
         shutil.rmtree(left)  # of a process that was killed
-    raw = mesher.mesh(subject)
-    facts = plain_facts(mesher, raw)
+    raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
+    facts = plain_facts(maker_of(run, mesher), raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     del raw
     forget(run)
     written = list(write_files(run, mesh, delivery, subject))
     record = {
-        "mesher": mesher,
+        "mesher": None if isinstance(mesher, Mesh) else mesher,
         "delivery": delivery,
         "steps": steps,
         "facts": facts,
@@ -156,8 +181,13 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
     return dump(record)
 
 
-def plain_facts(mesher: Mesher, mesh: Mesh) -> dict[str, Any]:
-    """The facts that come with a mesh; BadInput, which names the mesher, if they cannot be written to JSON."""
+def maker_of(run: Run, mesher: Mesher | Mesh) -> str:
+    """What makes the mesh, as the command line has it: mesh:NAME or method:NAME."""
+    return f"method:{name_of(run.recipe.method)}" if isinstance(mesher, Mesh) else f"mesh:{name_of(mesher)}"
+
+
+def plain_facts(maker: str, mesh: Mesh) -> dict[str, Any]:
+    """The facts that come with a mesh; BadInput, which names what made it, if they cannot be written to JSON."""
     facts = {} if mesh.facts is None else mesh.facts
     facts = dict(facts) if isinstance(facts, Mapping) else facts
     try:
@@ -165,7 +195,7 @@ def plain_facts(mesher: Mesher, mesh: Mesh) -> dict[str, Any]:
             raise BadInput(f"facts is a {type(facts).__name__}, not a dict")
         require_plain(facts, "facts")
     except BadInput as error:
-        raise BadInput(f"mesh:{name_of(mesher)}: {error}") from error
+        raise BadInput(f"{maker}: {error}") from error
     return facts
 
 
@@ -213,9 +243,12 @@ def look(run: Run, mesh: Mesh, subject: MeshInput) -> None:
         emit(FileWritten(path, "picture"))
 
 
-def has_mesh(run: Run, steps: int) -> bool:
-    """Whether the mesh of a recipe is there, made from splats of so many steps; the recipe may want none."""
-    if run.recipe.mesh is None:
+def has_mesh(run: Run, steps: int, own: bool = False) -> bool:
+    """Whether the mesh of a recipe is there, made from splats of so many steps; the recipe may want none.
+
+    `own`: the method of the run has made one, whatever the recipe wants.
+    """
+    if run.recipe.mesh is None and not own:
         return True
     if not run.mesh_record.exists():
         return False

@@ -9,6 +9,7 @@ from surfkit.testing.checks import (
     check_refine,
 )
 from surfkit.testing.data_sets import check_depth_layout, check_split
+from surfkit.testing.method import check_method
 from surfkit.testing.primitive import check_primitive
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "check_depth_layout",
     "check_loss",
     "check_mesher",
+    "check_method",
     "check_partition",
     "check_policy",
     "check_primitive",

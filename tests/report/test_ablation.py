@@ -12,8 +12,9 @@ from surfkit.densify.filters import Elongation
 from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import with_steps
-from surfkit.recipe import Recipe
+from surfkit.recipe import Recipe, without_unused
 from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, SURFACE, TABLES
+from surfkit.recipes.surface import STEREO
 from surfkit.recipes.surface import SURFACE as BEST
 from surfkit.report.ablation import Row, Table, build, built_on, capped, pick, scaled
 
@@ -35,6 +36,8 @@ def test_every_row_is_a_recipe(name, label):
     table = TABLES[name]
     recipe = build(table)[label]
     assert load(Recipe, json.loads(json.dumps(dump(recipe), allow_nan=False))) == recipe
+    if recipe.length is None:
+        return
     short = with_steps(recipe, 600)
     assert short.pretrain.steps == 600
     if table is not SURFACE:
@@ -51,7 +54,7 @@ def test_every_row_changes_what_it_is_built_on(name, label):
     after = build(table)[label]
     for path, value in row.change.items():
         before = evolve(before, path, value)
-    assert before == replace(after, about=before.about)
+    assert without_unused(before) == replace(after, about=before.about)
     if table is SURFACE:
         assert (before == (build(table)[below] if below else table.base)) == (below is None), "a row changes something"
     else:
@@ -62,11 +65,10 @@ def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_w
     recipes = build(SURFACE)
     last = [row.label for row in SURFACE.rows if row.kept][-1]
     assert recipes[last] == replace(BEST, about=recipes[last].about)
-    first, *others = recipes.values()
+    first, *others, alone = recipes.values()
     assert first.depth is None and "depth" not in first.pretrain.losses and first.pretrain.densify is not None
     assert all(recipe.depth is not None and recipe.mesh is not None for recipe in others)
-    alone = recipes["stereo alone (mesh:stereo)"]
-    assert alone.mesh.needs_prior and scaled(alone, SURFACE, 2_000).pretrain.steps == 1
+    assert alone == replace(STEREO, about=alone.about) and scaled(alone, SURFACE, 2_000) == alone
     assert capped(recipes[last], 500).start.most == 500
 
 

@@ -1,0 +1,32 @@
+"""Gaussian splatting in the stages of the recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from surfkit.method.base import Method, MethodInput, Reconstruction
+
+
+@dataclass(frozen=True)
+class SplatOptimisation(Method):
+    """Optimise splats as the other fields of the recipe say: pretraining, blocks, refinement, mesh."""
+
+    uses: ClassVar[tuple[str, ...]] = (
+        "primitive",
+        "depth",
+        "start",
+        "pretrain",
+        "partition",
+        "assign",
+        "min_views",
+        "tune",
+        "context",
+        "refine",
+        "mesh",
+    )
+
+    def reconstruct(self, given: MethodInput) -> Reconstruction:
+        """See `Method.reconstruct`."""
+        assert given.optimise is not None, "the method uses pretrain"
+        return given.optimise()
