@@ -182,55 +182,12 @@ def own_cache(tmp_path_factory, monkeypatch):
     return folder
 
 
-class Crowded:
-    """Answers of twenty views about points of known contribution (`densify.base.Views`)."""
-
-    def __init__(self, contribution):
-        self.contribution = contribution
-
-    def __len__(self):
-        return 20
-
-    def contributions(self, alpha_power=0.5, transmittance_power=0.5):
-        from surfkit.densify.base import Contribution
-
-        seen = (self.contribution > 0).long()
-        return Contribution(self.contribution**alpha_power, self.contribution**alpha_power, 50 * seen, 10 * seen)
-
-    def each(self, alpha_power, transmittance_power):
-        for at in range(20):
-            yield 40 * self.contribution.roll(at) ** alpha_power, (50 * (self.contribution > 0)).long()
-
-
 @pytest.fixture
 def crowd():
     """200 random points and a step about them, at which policies with default settings act."""
-    import torch
+    from surfkit.testing import inputs
 
-    from surfkit.densify.base import Step
-    from surfkit.primitives.points import Points
-    from surfkit.primitives.surfel2d import Surfel2D
-    from surfkit.scene.scene import Cloud
-
-    draw = torch.Generator().manual_seed(0)
-    count = 200
-    cloud = Cloud(torch.rand(count, 3, generator=draw), torch.zeros(count, 3, dtype=torch.uint8))
-    params = Surfel2D().init(cloud, draw)
-    contribution = torch.rand(count, generator=draw)
-    step = Step(
-        index=1_000,
-        steps=30_000,
-        seen=torch.rand(count, generator=draw) > 0.3,
-        splats=Surfel2D().activate(params, 3),
-        grad_norm=4e-4 * torch.rand(count, generator=draw),
-        radii=50 * torch.rand(count, generator=draw),
-        image_px=800,
-        views=Crowded(contribution),
-        since_reset=1_000,
-        rates={"means": 1e-4},
-        seed=1,
-    )
-    return Points.fresh(params), step
+    return inputs.crowd()
 
 
 @pytest.fixture(scope="module")

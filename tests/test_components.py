@@ -10,13 +10,10 @@ from surfkit.cli import main
 from surfkit.cli.recipes import about, recipes
 from surfkit.core import registry
 from surfkit.core.codec import dump, load
-from surfkit.core.registry import components, kind_of, offered
+from surfkit.core.registry import kind_of, offered
 from surfkit.core.schedule import rescale
-from surfkit.densify.base import Policy
-from surfkit.losses.base import Loss
-from surfkit.primitives.base import Primitive
 from surfkit.recipe import Recipe
-from surfkit.testing import check_component, check_loss, check_policy, check_primitive
+from surfkit.testing import check_component
 
 OFFERED = sorted({(kind_of(cls).__name__, name): cls for _, name, cls in offered("surfkit_components")}.items())
 
@@ -24,22 +21,6 @@ OFFERED = sorted({(kind_of(cls).__name__, name): cls for _, name, cls in offered
 @pytest.mark.parametrize("cls", [cls for _, cls in OFFERED], ids=[f"{kind}-{name}" for (kind, name), _ in OFFERED])
 def test_components(cls):
     check_component(cls())
-
-
-@pytest.mark.parametrize("name", components(Policy))
-def test_policies(name, crowd):
-    check_policy(components(Policy)[name](), *crowd)
-
-
-@pytest.mark.parametrize("name", components(Loss))
-def test_losses(name):
-    check_loss(components(Loss)[name]())
-
-
-@pytest.mark.parametrize("name", components(Primitive))
-def test_primitives(name):
-    for degree in (0, 2):
-        check_primitive(components(Primitive)[name](sh_degree=degree), count=20)
 
 
 @pytest.mark.parametrize("name", recipes())

@@ -184,10 +184,9 @@ class TestCeiling:
         assert 0 < int(above.drop.sum()) < len(points)
         assert ceiling(every=7).edit(points, step) is None
 
-    def test_conforms(self, ceiling, crowd):
-        from surfkit.testing import check_component, check_policy
+    def test_conforms(self, ceiling):
+        from surfkit.testing import check
 
-        check_component(ceiling(height=0.25, axis="x", drop="below", every=50))
-        check_policy(ceiling(height=0.5), *crowd)
+        check(ceiling(height=0.25, axis="x", drop="below", every=50))
         with pytest.raises(BadInput, match="ceiling.every is 0"):
             ceiling(every=0)

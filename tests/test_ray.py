@@ -22,6 +22,7 @@ from surfkit.execute import Ray
 from surfkit.execute.base import LOG, Job
 from surfkit.execute.state import read_state
 from surfkit.pipeline import run
+from surfkit.testing import check_executor
 
 ray = needs("ray", "executor:ray")
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -233,3 +234,7 @@ def test_without_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(BadInput, match=r"pip install 'surfkit\[ray\]'"):
         Ray().ready()
+
+
+def test_contract(workers, tmp_path):
+    check_executor(workers, tmp_path)

@@ -18,9 +18,10 @@ class Plugins:
     def run(self) -> None:
         """Print one line per plugin."""
         offers: dict[str, list[str]] = {}
-        for hook in ("surfkit_components", "surfkit_recipes"):  # before `records`, which then knows what failed here
+        prefixes = {"surfkit_components": "", "surfkit_recipes": "recipe:", "surfkit_tables": "table:"}
+        for hook, prefix in prefixes.items():  # before `records`, which then knows what failed here
             for owner, name, _ in offered(hook):
-                offers.setdefault(owner, []).append("recipe:" * (hook == "surfkit_recipes") + name)
+                offers.setdefault(owner, []).append(prefix + name)
         known = records()
         rows = [(p.name, p.distribution, p.version, _shown(p, offers.get(p.name, []))) for p in known]
         failed = [i for i, plugin in enumerate(known) if plugin.error]

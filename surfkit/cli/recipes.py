@@ -23,7 +23,7 @@ from surfkit.cli.parts import with_parts
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.registry import offered
+from surfkit.core.registry import offered_once
 
 ARGV: ContextVar[tuple[str, ...]] = ContextVar("argv", default=())
 """The words being parsed. tyro builds unions without telling for which command line; `parse` sets this."""
@@ -34,15 +34,7 @@ def recipes(argv: Sequence[str] = ()) -> dict[str, Any]:
 
     The one that `argv` chooses has the parts that `argv` adds, and not those that it removes.
     """
-    found: dict[str, tuple[str, Any]] = {}
-    for owner, name, recipe in offered("surfkit_recipes"):
-        if name in found:
-            raise BadInput(
-                f"two packages offer a recipe named {name!r}: {found[name][0]} and {owner}; uninstall one, or leave it "
-                "out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
-            )
-        found[name] = (owner, recipe)
-    named = {name: recipe for name, (_, recipe) in found.items()}
+    named = offered_once("surfkit_recipes", "a recipe")
     named |= {file: _read(file) for file in _files(argv)}
     if (name := chosen_name(argv)) in named:
         named[name] = _complete(with_parts(named[name], argv)[0], argv)

@@ -6,12 +6,12 @@ from typing import Annotated, Any, Union
 
 import tyro
 
+from surfkit.core.registry import offered_once
+
 
 def tables() -> dict[str, Any]:
-    """The tables by name."""
-    from surfkit.recipes.ablations import TABLES
-
-    return dict(TABLES)
+    """The tables that are offered, by name."""
+    return offered_once("surfkit_tables", "an ablation table")
 
 
 def table_choice() -> Any:

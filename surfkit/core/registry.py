@@ -48,6 +48,10 @@ class Hooks:
         """Return the recipes this package offers, by the name users type."""
 
     @hookspec
+    def surfkit_tables(self) -> Mapping[str, Any]:
+        """Return the ablation tables this package offers, by the name users type."""
+
+    @hookspec
     def surfkit_event(self, event: Any) -> None:
         """See one event of a run: a stage began, a step ended, a file was written."""
 
@@ -134,7 +138,7 @@ def components(base: type[C]) -> dict[str, type[C]]:
 
 
 def offered(hook: str) -> Iterator[tuple[str, str, Any]]:
-    """Plugin, name and value of everything that plugins return from one of the two offering hooks."""
+    """Plugin, name and value of everything that plugins return from one of the offering hooks."""
     manager, known = _loaded()
     for impl in list(getattr(manager.hook, hook).get_hookimpls()):
         try:
@@ -151,6 +155,27 @@ def offered(hook: str) -> Iterator[tuple[str, str, Any]]:
             manager.unregister(name=impl.plugin_name)
             continue
         yield from ((impl.plugin_name, name, value) for name, value in offer.items())
+
+
+def offered_once(hook: str, what: str) -> dict[str, Any]:
+    """Everything that plugins return from an offering hook, by name.
+
+    Args:
+        hook: Its name.
+        what: Its values in words, such as "a recipe".
+
+    Raises:
+        BadInput: Two packages offer one under the same name.
+    """
+    found: dict[str, tuple[str, Any]] = {}
+    for owner, name, value in offered(hook):
+        if name in found:
+            raise BadInput(
+                f"two packages offer {what} named {name!r}: {found[name][0]} and {owner}; uninstall one, or leave it "
+                "out with SURFKIT_PLUGINS=none or SURFKIT_PLUGINS=NAME,NAME"
+            )
+        found[name] = (owner, value)
+    return {name: value for name, (_, value) in found.items()}
 
 
 def find(base: type[C], name: str) -> type[C]:

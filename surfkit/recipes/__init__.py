@@ -1,6 +1,7 @@
 """Recipes by name."""
 
 from collections.abc import Mapping
+from typing import Any
 
 from surfkit.core.registry import hookimpl
 from surfkit.densify.adc import ADC
@@ -98,3 +99,11 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "citygs2-aerial": city.AERIAL,
         "citygs2-street": city.STREET,
     }
+
+
+@hookimpl
+def surfkit_tables() -> Mapping[str, Any]:
+    """The ablation tables of surfkit."""
+    from surfkit.recipes.ablations import TABLES
+
+    return TABLES

@@ -1,26 +1,49 @@
-"""Checks that the parts of a plugin keep their contract, and small scenes to try them on."""
+"""Checks that the parts of a plugin keep their contract, and small scenes to try them on.
 
-from surfkit.testing.checks import (
-    check_component,
-    check_loss,
-    check_mesher,
-    check_partition,
-    check_policy,
-    check_refine,
-)
+`check(part)` is all that the tests of a plugin need: it looks at what every component must keep to, and at the contract
+of the part's kind. A part that breaks it raises AssertionError with a sentence that says what is wrong.
+"""
+
 from surfkit.testing.data_sets import check_depth_layout, check_split
+from surfkit.testing.executors import check_executor
 from surfkit.testing.method import check_method
+from surfkit.testing.parts import check, check_component
+from surfkit.testing.pictures import check_appearance, check_depth_estimator, check_loss, check_regularizer
+from surfkit.testing.points import (
+    check_densify,
+    check_filter,
+    check_policy,
+    check_prune,
+    check_signal,
+)
 from surfkit.testing.primitive import check_primitive
+from surfkit.testing.raster import check_rasterizer
+from surfkit.testing.scenes import check_assign, check_partition, check_reader, check_refine, check_start
+from surfkit.testing.surfaces import check_mesher, check_trust
 
 __all__ = [
+    "check",
+    "check_appearance",
+    "check_assign",
     "check_component",
+    "check_densify",
+    "check_depth_estimator",
     "check_depth_layout",
+    "check_executor",
+    "check_filter",
     "check_loss",
     "check_mesher",
     "check_method",
     "check_partition",
     "check_policy",
     "check_primitive",
+    "check_prune",
+    "check_rasterizer",
+    "check_reader",
     "check_refine",
+    "check_regularizer",
+    "check_signal",
     "check_split",
+    "check_start",
+    "check_trust",
 ]

@@ -13,7 +13,7 @@ from surfkit.core.codec import dump
 from surfkit.core.events import Progress, StepDone
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.core.schedule import rescale
-from surfkit.testing.checks import check_component
+from surfkit.testing.parts import check_component
 
 if TYPE_CHECKING:
     from surfkit.method.base import Method, Reconstruction

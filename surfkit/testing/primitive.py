@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import torch
+from torch import Tensor
 
-from surfkit.core.check import expect
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from surfkit.primitives.base import Primitive
-    from surfkit.primitives.points import Columns
-    from surfkit.raster.api import Splats
+from surfkit.core.check import BadInput, expect
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Splats
+from surfkit.testing.compare import unchanged
+from surfkit.testing.inputs import cloud
 
 
 def check_primitive(primitive: Primitive, count: int = 50) -> None:
@@ -22,28 +21,23 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
         primitive: To check.
         count: Points in the cloud that it starts from, 10 or more.
     """
-    import torch
-
-    from surfkit.scene.scene import Cloud
-
     name = type(primitive).__name__
-    seeded = torch.Generator().manual_seed(0)
-    xyz = torch.rand(count, 3, generator=seeded)
-    cloud = Cloud(xyz, torch.randint(0, 256, (count, 3), generator=seeded, dtype=torch.uint8))
-    params = primitive.init(cloud, torch.Generator().manual_seed(1))
-    _check_same(f"{name}.init", params, primitive.init(cloud, torch.Generator().manual_seed(1)))
+    given = cloud(count)
+    with unchanged(f"{name}.init", cloud=given):
+        params = primitive.init(given, torch.Generator().manual_seed(1))
+    _check_same(f"{name}.init", params, primitive.init(given, torch.Generator().manual_seed(1)))
     _check_columns(name, primitive, params, count)
     for degree in range(primitive.sh_degree + 1):
-        _check_splats(f"{name}.activate", primitive.activate(params, degree), degree)
-    assert torch.allclose(primitive.activate(params, 0).means, xyz, atol=1e-5), f"{name}: points begin elsewhere"
+        with unchanged(f"{name}.activate", params=params):
+            splats = primitive.activate(params, degree)
+        _check_splats(f"{name}.activate", splats, degree)
+    assert torch.allclose(primitive.activate(params, 0).means, given.xyz, atol=1e-5), f"{name}: points begin elsewhere"
     _check_edits(name, primitive, params)
     _check_split(name, primitive, params, count // 2)
 
 
 def _check_columns(name: str, primitive: Primitive, params: Columns, count: int) -> None:
     """What begins is what is declared, and every activation has its inverse."""
-    import torch
-
     columns = primitive.columns()
     assert "means" in columns and not columns["means"].shared, f"{name} needs a column 'means', (N, 3) positions"
     assert set(params) == set(columns), f"{name}.init gives {sorted(params)}, and columns() declares {sorted(columns)}"
@@ -60,14 +54,14 @@ def _check_columns(name: str, primitive: Primitive, params: Columns, count: int)
 
 
 def _check_splats(name: str, splats: Splats, degree: int) -> None:
-    import torch
-
     sizes = {"N": len(splats.means)}
-    expect(f"{name}: means", splats.means, ("N", 3), sizes)
-    expect(f"{name}: quats", splats.quats, ("N", 4), sizes)
-    expect(f"{name}: scales", splats.scales, ("N", 2 if splats.kind == "surfel" else 3), sizes)
-    expect(f"{name}: opacities", splats.opacities, ("N",), sizes)
-    expect(f"{name}: sh", splats.sh, ("N", (degree + 1) ** 2, 3), sizes)
+    shapes = {"means": ("N", 3), "quats": ("N", 4), "opacities": ("N",), "sh": ("N", (degree + 1) ** 2, 3)}
+    shapes["scales"] = ("N", 2 if splats.kind == "surfel" else 3)
+    for field, shape in shapes.items():
+        try:
+            expect(f"{name}: {field}", getattr(splats, field), shape, sizes)
+        except BadInput as error:
+            raise AssertionError(str(error)) from error
     assert (splats.scales > 0).all(), f"{name}: scales must be positive"
     assert ((splats.opacities >= 0) & (splats.opacities <= 1)).all(), f"{name}: opacities must lie in [0, 1]"
     assert torch.isfinite(splats.means).all() and torch.isfinite(splats.sh).all(), f"{name}: values are not finite"
@@ -76,8 +70,6 @@ def _check_splats(name: str, splats: Splats, degree: int) -> None:
 
 def _check_edits(name: str, primitive: Primitive, params: Columns) -> None:
     """Moved, scaled and dimmed points are so when they are drawn."""
-    import torch
-
     before, count = primitive.activate(params, 0), len(params["means"])
     moved = primitive.activate(primitive.moved(params, torch.full((count, 3), 0.25)), 0)
     assert torch.allclose(moved.means, before.means + 0.25, atol=1e-5), f"{name}.moved does not move as asked"
@@ -93,11 +85,10 @@ def _check_edits(name: str, primitive: Primitive, params: Columns) -> None:
 
 
 def _check_split(name: str, primitive: Primitive, params: Columns, count: int) -> None:
-    import torch
-
     shared = primitive.shared()
     rows = {key: value if key in shared else value[:count] for key, value in params.items()}
-    twins = primitive.split(rows, torch.Generator().manual_seed(2))
+    with unchanged(f"{name}.split", params=rows):
+        twins = primitive.split(rows, torch.Generator().manual_seed(2))
     _check_same(f"{name}.split", twins, primitive.split(rows, torch.Generator().manual_seed(2)))
     own = set(params) - shared
     assert set(twins) == own, f"{name}.split gives {sorted(twins)}, not {sorted(own)}"
@@ -109,8 +100,6 @@ def _check_split(name: str, primitive: Primitive, params: Columns, count: int) -
 
 
 def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
-    import torch
-
     assert first.keys() == second.keys(), f"{what} is not repeatable"
     for key, value in first.items():
         assert torch.equal(value, second[key]), f"{what}: {key!r} differs for the same seed; draw from the generator"

@@ -14,6 +14,7 @@ from surfkit.depth.depth_anything import DepthAnythingV2
 from surfkit.scene.camera import Camera
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import View
+from surfkit.testing import check_depth_estimator
 
 NOTHING = Observations(np.zeros((0, 3)), np.zeros(0), {})
 
@@ -55,6 +56,10 @@ def test_maps_have_the_shape_of_the_photograph_and_weights_come_from_the_folder(
     assert torch.isfinite(first.inverse).all() and (first.inverse >= 0).all() and first.inverse.std() > 0
     assert torch.equal(first.confidence, (first.inverse > 0).float())
     assert not DepthAnythingV2.aligned and not DepthAnythingV2.matched
+
+
+def test_contract(weights):
+    check_depth_estimator(DepthAnythingV2(weights=str(weights), shortest=56))
 
 
 def test_weights_that_cannot_be_had_are_one_line(tmp_path):

@@ -5,65 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import components
-from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.mesh.delaunay import crossing, split
 from surfkit.mesh.tetra import Tetra, triangles, used
-from surfkit.raster.api import Splats
-from surfkit.raster.select import select
-from surfkit.readers.depth_prior import DepthPrior
-from surfkit.scene.camera import Camera
-from surfkit.scene.scene import Frame, View
-from surfkit.testing import check_mesher
-
-RADIUS = 0.5
-
-
-def spread(count: int) -> torch.Tensor:
-    """(count, 3) unit vectors, evenly."""
-    at = torch.arange(count, dtype=torch.float64)
-    z = 1 - (2 * at + 1) / count
-    turn = at * np.pi * (3 - 5**0.5)
-    side = (1 - z * z).sqrt()
-    return torch.stack([side * turn.cos(), side * turn.sin(), z], 1)
-
-
-def towards(centre: torch.Tensor, size: int = 96) -> Camera:
-    """A camera that looks at the origin."""
-    z = -centre / centre.norm()
-    x = torch.linalg.cross(torch.tensor([0.31, 0.95, 0.05]).double(), z)
-    x = x / x.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([x, torch.linalg.cross(z, x), z])
-    pose[:3, 3] = -pose[:3, :3] @ centre
-    return Camera(pose, 1.2 * size, 1.2 * size, size / 2, size / 2, size, size)
-
-
-def facing(normals: torch.Tensor) -> torch.Tensor:
-    """(N, 4) quaternions that turn the z axis to unit vectors."""
-    w = 1 + normals[:, 2]
-    return torch.stack([w, -normals[:, 1], normals[:, 0], torch.zeros_like(w)], 1)
-
-
-def ball(kind: str = "surfel", count: int = 900, views: int = 14, **changes) -> MeshInput:
-    """Splats on a ball, opaque and red, and cameras all around it."""
-    normals = spread(count)
-    scales = torch.full((count, 2 if kind == "surfel" else 3), 0.03)
-    if kind == "gaussian":
-        scales[:, 2] = 0.002
-    sh = torch.tensor([1.0, -1.0, -1.0]).expand(count, 1, 3).contiguous() / 0.2821 / 2
-    splats = Splats(kind, (RADIUS * normals).float(), facing(normals).float(), scales, torch.full((count,), 0.95), sh)
-    rasterizer, _ = select("cpu")
-    seen = tuple(View(f"{i}", towards(2.0 * at), path=None) for i, at in enumerate(spread(views)))
-
-    def draw(view):
-        return rasterizer.render(splats, view.camera, 0.01, True, False).maps
-
-    given = MeshInput(splats, seen, draw, rasterizer, 0.01, Frame(np.zeros(3), 1.0), 1 << 30)
-    return replace(given, **changes)
+from surfkit.testing.inputs import BALL_RADIUS as RADIUS
+from surfkit.testing.inputs import mesh_input as ball
 
 
 def edges_of(faces):
@@ -178,20 +125,3 @@ def test_points_in_a_plane_enclose_nothing():
     points = np.random.default_rng(2).normal(size=(50, 3)) * [1, 1, 0]
     tets, doubtful = crossing(points, np.ones(50, bool), np.arange(50) % 2 == 0, 1 << 30)
     assert tets.shape == (0, 4) and doubtful == 0
-
-
-@pytest.mark.parametrize("name", components(Mesher))
-def test_every_mesher_keeps_the_contract(name):
-    mesher = components(Mesher)[name]()
-    if name == "poisson":
-        needs("open3d", "mesh:poisson")
-        mesher = replace(mesher, octree=5, points=5_000)
-    check_mesher(mesher, with_priors(ball()) if mesher.needs_prior else ball())
-
-
-def with_priors(given: MeshInput) -> MeshInput:
-    """Priors that say what the splats do."""
-    maps = [given.draw(view) for view in given.views]
-    inverses = [torch.where(m.median > 0, 1 / m.median.clamp_min(1e-9), 0.0) for m in maps]
-    priors = [DepthPrior(i, (i > 0).float(), 1.0, m.normal) for i, m in zip(inverses, maps, strict=True)]
-    return replace(given, priors=priors)

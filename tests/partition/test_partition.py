@@ -8,7 +8,6 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
-from surfkit.core.registry import components
 from surfkit.partition import (
     Airspace,
     Balanced,
@@ -286,11 +285,6 @@ def test_bad_settings_and_scenes():
         ContractedGrid((2, 2)).cells(in_line)
     away = replace(sight, views=tuple(replace(v, camera=below(50.0 + i, 60.0)) for i, v in enumerate(sight.views)))
     assert plan(away, QuantileGrid((1, 1)), PictureShare()).blocks[0].cameras == len(sight.views)
-
-
-@pytest.mark.parametrize("name", components(Partition))
-def test_every_partition_keeps_the_contract(name):
-    check_partition(components(Partition)[name](), city())
 
 
 def test_a_partition_with_a_gap_is_found():

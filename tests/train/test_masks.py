@@ -9,7 +9,7 @@ from surfkit.core.registry import components
 from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.losses.base import Loss, ignoring
 from surfkit.raster.api import Maps
-from surfkit.testing.checks import _maps, _target
+from surfkit.testing import inputs
 
 SIZE = (24, 32)
 
@@ -25,8 +25,8 @@ def covered(seed=0):
 def test_no_loss_learns_from_covered_pixels(name):
     mask, draw = covered()
     loss = components(Loss)[name]()
-    sample = replace(_target(SIZE, draw), mask=mask)
-    given = _maps(torch.rand(SIZE, generator=draw), loss.reads, draw)
+    sample = replace(inputs.target(SIZE, draw), mask=mask)
+    given = inputs.maps(torch.rand(SIZE, generator=draw), loss.reads, draw)
     given = replace(given, color=torch.rand(3, *SIZE, generator=draw))
     leaves = {name: value.requires_grad_() for name, value in given.present().items()}
     maps, held = ignoring(Maps(**leaves), sample)
@@ -39,7 +39,7 @@ def test_no_loss_learns_from_covered_pixels(name):
 @pytest.mark.parametrize("name", ["l1", "ssim"])
 def test_what_is_under_a_mask_makes_no_difference(name):
     mask, draw = covered()
-    loss, sample = components(Loss)[name](), replace(_target(SIZE, draw), mask=mask)
+    loss, sample = components(Loss)[name](), replace(inputs.target(SIZE, draw), mask=mask)
     color = torch.rand(3, *SIZE, generator=draw)
     other = replace(sample, photo=torch.where(mask, sample.photo, torch.rand(3, *SIZE, generator=draw)))
     values = [loss(*ignoring(Maps(color=color), given)) for given in (sample, other)]

@@ -20,7 +20,7 @@ from surfkit.primitives.edit import apply
 from surfkit.raster.select import select
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, View
-from surfkit.testing import check_component, check_policy
+from surfkit.testing import check, check_policy
 from surfkit.train.stage import Trainer
 
 N = 400
@@ -78,7 +78,7 @@ def test_draws_follow_the_weights():
 @pytest.mark.parametrize("primitive", [Gaussian3D(sh_degree=1), Surfel2D(sh_degree=1)])
 def test_it_keeps_to_the_contract(primitive):
     points, step = crowd(primitive)
-    check_component(Relocation(filters=(Elongation(),)))
+    check(Relocation(filters=(Elongation(),)))
     for policy in (Relocation(), Relocation(noise=0), Relocation(filters=(Elongation(0.5),))):
         check_policy(policy, points, step)
         check_policy(policy, points, replace(step, index=1_001))

@@ -1,0 +1,187 @@
+"""Checks of what decides about points: the policies, filters and signals of densification.
+
+Each check returns nothing and raises AssertionError with a sentence that says what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surfkit.densify.base import Densify, Filter, Policy, Prune, Signal, Step
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
+from surfkit.testing.compare import assert_same, unchanged
+from surfkit.testing.inputs import crowd, splats
+
+STEPS = 30_000
+"""Of the stage through which policies are taken."""
+
+
+def check_policy(policy: Policy, points: Points | None = None, step: Step | None = None) -> None:
+    """A policy asks for masks of the right shape, changes no parameter, keeps its statistics whole, keeps nothing in
+    itself that a resumed run would lose, and repeats itself.
+
+    Args:
+        policy: With settings that make it act on some of random points in the unit cube, at some of the steps 1 to
+            30,000; or at `step`, if one is given.
+        points: N points, to check one step only.
+        step: About those N points.
+    """
+    if points is not None and step is not None:
+        _edit(policy, points, step)
+        return
+    edits = [edit for _, edit in _taken_through(policy)]
+    assert any(edit is not None for edit in edits), _idle(policy, "asks for no change")
+
+
+def check_densify(densify: Densify) -> None:
+    """A densifier keeps to `check_policy`, adds points, and only at steps that it told before.
+
+    Args:
+        densify: With settings as for `check_policy`.
+    """
+    name, foretold = type(densify).__name__, densify.edit_steps(STEPS)
+    if foretold is not None:
+        steps = list(foretold)
+        assert steps == sorted(set(steps)), f"{name}.edit_steps: steps must be in order, each of them once"
+        assert not steps or 1 <= steps[0] <= steps[-1] <= STEPS, f"{name}.edit_steps: steps must lie in 1 to {STEPS}"
+    added = [index for index, edit in _taken_through(densify) if edit is not None and _adds(edit)]
+    assert added, _idle(densify, "neither clones nor splits a point")
+    late = [index for index in added if foretold is not None and index not in foretold]
+    assert not late, f"{name} adds points after step {late[0]}, which edit_steps({STEPS}) does not name"
+
+
+def check_prune(prune: Prune) -> None:
+    """A pruner keeps to `check_policy`, and adds no points.
+
+    Args:
+        prune: With settings as for `check_policy`.
+    """
+    edits = [(index, edit) for index, edit in _taken_through(prune) if edit is not None]
+    name, added = type(prune).__name__, [index for index, edit in edits if _adds(edit)]
+    assert not added, f"{name} adds points after step {added[0]}; make it a Densify"
+    assert any(edit.drop is not None for _, edit in edits), _idle(prune, "drops no point")
+
+
+def check_filter(filter: Filter) -> None:
+    """A filter gives one bool for each point, changes nothing and repeats itself, whoever wants to be densified.
+
+    Args:
+        filter: With any settings.
+    """
+    name, (_, step) = type(filter).__name__, crowd()
+    count, draw = len(step.splats), torch.Generator().manual_seed(0)
+    some = torch.rand(count, generator=draw) * (torch.rand(count, generator=draw) > 0.5)
+    steps = {"": step, " with ellipsoids": replace(step, splats=splats("gaussian", count))}
+    for what, about in steps.items():
+        for want in (some, torch.zeros(count), torch.ones(count)):
+            with unchanged(f"{name}.admits", step=about, want=want):
+                mask = filter.admits(about, want)
+            assert mask.dtype == torch.bool, f"{name}.admits{what} gives {mask.dtype}, not bool"
+            assert mask.shape == (count,), f"{name}.admits{what} has shape {tuple(mask.shape)}, not ({count},)"
+            again = replace(filter).admits(about, want)
+            assert_same(f"{name}.admits{what}", mask, again, "draw from a generator with `step.seed`")
+
+
+def check_signal(signal: Signal) -> None:
+    """A signal names its losses, or takes all, and gives finite (N, 2) gradients that are 0 for unseen points.
+
+    Args:
+        signal: With any settings.
+    """
+    name, terms, draw = type(signal).__name__, signal.terms, torch.Generator().manual_seed(0)
+    named = isinstance(terms, tuple) and len(terms) > 0 and all(isinstance(term, str) for term in terms)
+    assert terms is None or named, f"{name}.terms is {terms!r}; it must be None or a tuple of names of losses"
+    assert isinstance(signal.absolute, bool), f"{name}.absolute is {signal.absolute!r}; it must be True or False"
+    seen = (torch.rand(60, 1, generator=draw) > 0.3).float()
+    chosen, total = (1e-4 * torch.randn(60, 2, generator=draw) * seen for _ in range(2))
+    nothing = torch.zeros_like(total)
+    for what, a, b in (
+        ("", chosen, total),
+        (" of chosen losses without gradient", nothing, total),
+        (" of no seen point", nothing, nothing),
+    ):
+        with unchanged(f"{name}.combine", chosen=a, total=b):
+            found = signal.combine(a, b)
+        assert found.shape == (60, 2), f"{name}.combine{what} has shape {tuple(found.shape)}, not (60, 2)"
+        assert torch.isfinite(found).all(), f"{name}.combine{what} is not finite"
+        assert not (found * (1 - seen)).any(), f"{name}.combine{what} is not 0 for points that are not seen"
+        assert_same(f"{name}.combine{what}", found, replace(signal).combine(a, b), "it may depend on its inputs only")
+
+
+def _taken_through(policy: Policy) -> Iterator[tuple[int, Edit | None]]:
+    """Steps of a stage of 30,000, and what the policy asks for after each; the points stay as they are."""
+    points, step = crowd()
+    for index in [*range(1, 30), *range(100, STEPS + 1, 100)]:
+        yield index, _edit(policy, points, replace(step, index=index, since_reset=index, seed=index))
+
+
+def _idle(policy: Policy, does: str) -> str:
+    return (
+        f"{type(policy).__name__} {does} at any of the steps that were tried, of 1 to {STEPS}; give it settings with "
+        "which it acts on points in the unit cube, or the check says nothing"
+    )
+
+
+def _adds(edit: Edit) -> bool:
+    return any(mask is not None and bool(mask.any()) for mask in (edit.clone, edit.split))
+
+
+def _edit(policy: Policy, points: Points, step: Step) -> Edit | None:
+    """What a policy asks for after a step, which has been checked."""
+    name = type(policy).__name__
+    before = {key: value.clone() for key, value in points.params.items()}
+    with unchanged(name, step=step):
+        policy.watch(points, step)
+        stats = {key: value.clone() for key, value in points.stats.items()}
+        first = policy.edit(points, step)
+        second = replace(policy).edit(points, step)  # another instance, as in a run that is resumed
+        for key, value in points.params.items():
+            assert torch.equal(value, before[key]), f"{name} changed the parameter {key!r}; return an Edit instead"
+    for key, value in points.stats.items():
+        assert value.shape == (len(points),), f"{name}: the statistic {key!r} has shape {tuple(value.shape)}, not (N,)"
+        assert key not in stats or torch.equal(value, stats[key]), f"{name}.edit changed {key!r}; only watch may"
+    _check_repeated(name, first, second)
+    if first is not None:
+        _check_edit(name, first, points)
+    return first
+
+
+def _check_repeated(name: str, first: Edit | None, second: Edit | None) -> None:
+    """Both edits are the same, field by field."""
+    remedy = "draw from a generator with `step.seed`, and keep what must last in `points.stat(...)`"
+    assert (first is None) == (second is None), f"{name}.edit is not repeatable; {remedy}"
+    if first is None or second is None:
+        return
+    for field in fields(first):
+        one, two = getattr(first, field.name), getattr(second, field.name)
+        assert_same(f"{name}: {field.name}", one, two, remedy)
+
+
+def _check_edit(name: str, edit: Edit, points: Points) -> None:
+    for field in fields(edit):
+        value: Any = getattr(edit, field.name)
+        if field.name == "max_opacity":
+            assert value is None or 0 < value < 1, f"{name}: max_opacity must lie between 0 and 1"
+        elif value is not None:
+            _check_rows(f"{name}: {field.name}", value, field.name, len(points))
+
+
+def _check_rows(what: str, value: Tensor, field: str, count: int) -> None:
+    if field in ("drop", "clone", "split", "forget"):
+        counts = field == "clone"
+        allowed = (torch.bool, torch.int64) if counts else (torch.bool,)
+        assert value.dtype in allowed, f"{what} is {value.dtype}, not bool{' or int64' * counts}"
+        assert value.dtype == torch.bool or bool((value >= 0).all()), f"{what} is below 0 for some point"
+    wanted = (count, 3) if field == "move" else (count,)
+    assert value.shape == wanted, f"{what} has shape {tuple(value.shape)}, not {wanted}"
+    if field == "opacities":
+        value = value[~value.isnan()]
+        assert bool(((value > 0) & (value < 1)).all()), f"{what} must lie between 0 and 1, or be NaN"
+    assert torch.isfinite(value).all(), f"{what} is not finite"
+    assert field != "scale_by" or bool((value > 0).all()), f"{what} must be above 0"

@@ -1,0 +1,26 @@
+"""Parts of a package that surfkit knows nothing of: it imports `surfkit`, torch and numpy, and nothing else."""
+
+from acme_surfkit.cards import Cards
+from acme_surfkit.charbonnier import Charbonnier
+from acme_surfkit.far import Far
+from acme_surfkit.top_share import TopShare
+from surfkit import Recipe, Row, Stage, Table, hookimpl
+
+
+@hookimpl
+def surfkit_components():
+    """The parts, by the names that users type."""
+    return {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards}
+
+
+@hookimpl
+def surfkit_tables():
+    """What each of them brings, one after the other."""
+    rows = (
+        Row("baseline"),
+        Row("+ Charbonnier loss", {"pretrain.losses.l1": Charbonnier()}),
+        Row("+ top share", {"pretrain.densify": TopShare()}),
+        Row("+ far points dropped", {"pretrain.prune": (Far(),)}),
+        Row("+ cards", {"mesh": Cards()}),
+    )
+    return {"acme": Table("acme", "What each part of Acme brings.", Recipe(pretrain=Stage(steps=6)), rows)}

@@ -1,0 +1,50 @@
+"""Every part that is offered, built in or installed, passes the check of its kind from the day it arrives."""
+
+import pytest
+
+import surfkit.testing
+from surfkit.core.check import BadInput
+from surfkit.core.registry import kebab, kind_of, offered
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.execute.slurm import Slurm
+from surfkit.mesh.poisson import Poisson
+from surfkit.primitives.base import Primitive
+from surfkit.readers.base import Reader
+from surfkit.testing import check
+
+OFFERED = {f"{kebab(kind_of(cls).__name__)}:{name}": cls for _, name, cls in offered("surfkit_components")}
+QUICK = {
+    "mesher:poisson": Poisson(octree=5, points=5_000),
+    "executor:slurm": Slurm(cluster="debug"),
+    "depth-estimator:patch-match": PatchMatch(neighbours=6, passes=1),
+}
+"""Settings for parts whose defaults take long, or need a cluster."""
+CANNOT = ("needs the package", "surfkit was installed without")
+"""What errors say of parts that this machine cannot use."""
+ELSEWHERE = {
+    "executor:ray": "tests/test_ray.py has a cluster for it",
+    "depth-estimator:depth-anything-v2": "tests/depth/test_depth_anything.py has weights for it",
+}
+
+
+@pytest.mark.parametrize("name", [name for name, cls in sorted(OFFERED.items()) if not issubclass(cls, Reader)])
+def test_every_part(name):
+    if name in ELSEWHERE:
+        pytest.skip(ELSEWHERE[name])
+    try:
+        check(QUICK.get(name) or OFFERED[name]())
+    except BadInput as error:
+        if not any(reason in str(error) for reason in CANNOT):
+            raise
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("name", sorted(name for name, cls in OFFERED.items() if issubclass(cls, Primitive)))
+@pytest.mark.parametrize("degree", [0, 2])
+def test_primitives_of_other_degrees(name, degree):
+    check(OFFERED[name](sh_degree=degree), count=20)
+
+
+def test_every_kind_has_a_check():
+    kinds = {kebab(kind_of(cls).__name__).replace("-", "_") for cls in OFFERED.values()}
+    assert {f"check_{kind}" for kind in kinds} <= set(surfkit.testing.__all__)

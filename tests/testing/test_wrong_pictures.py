@@ -1,0 +1,247 @@
+"""Losses, regularizers, appearance models and estimators of depth that break their contract are named."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from surfkit.appearance import Exposure
+from surfkit.depth.base import DepthEstimator, Estimate
+from surfkit.losses.base import Loss, Regularizer
+from surfkit.testing import check_appearance, check_depth_estimator, check_loss, check_regularizer
+from surfkit.testing.inputs import survey
+
+
+@dataclass(frozen=True)
+class Bright(Loss):
+    """Colour against the photograph."""
+
+    reads = ("color",)
+
+    def weight_at(self, index, steps):
+        return 1.0
+
+    def __call__(self, maps, sample):
+        return (maps.color - sample.photo).abs().mean()
+
+
+class PerPixel(Bright):
+    def __call__(self, maps, sample):
+        return (maps.color - sample.photo).abs()
+
+
+class Divides(Bright):
+    def __call__(self, maps, sample):
+        return (sample.photo / maps.color).mean()
+
+
+class Infinite(Bright):
+    def __call__(self, maps, sample):
+        return maps.color.sqrt().sum()
+
+
+class Negative(Bright):
+    def weight_at(self, index, steps):
+        return 400.0 - index
+
+
+class Constant(Bright):
+    def __call__(self, maps, sample):
+        return sample.photo.mean()
+
+
+@pytest.mark.parametrize(
+    ("loss", "message"),
+    [
+        (PerPixel(), r"PerPixel gives shape \(3, 24, 32\), not one number"),
+        (Divides(), "Divides of an empty render is inf"),
+        (Infinite(), "Infinite of an empty render: the gradient of 'color' is not finite"),
+        (Negative(), "Negative: the weight at step 500 of 1000 is -100.0"),
+        (Constant(), "Constant does not depend on color"),
+    ],
+)
+def test_losses_that_do_not_conform(loss, message):
+    check_loss(Bright())
+    with pytest.raises(AssertionError, match=message):
+        check_loss(loss)
+
+
+class Covers(Bright):
+    def __call__(self, maps, sample):
+        sample.photo.clamp_(max=0.5)
+        return maps.color.mean()
+
+
+def test_a_loss_may_not_change_the_photograph():
+    with pytest.raises(AssertionError, match="Covers changed its input target.photo; work on a copy"):
+        check_loss(Covers())
+
+
+@dataclass(frozen=True)
+class Faint(Regularizer):
+    """Mean opacity."""
+
+    def weight_at(self, index, steps):
+        return 0.01
+
+    def __call__(self, splats):
+        return splats.opacities.mean()
+
+
+class Each(Faint):
+    def __call__(self, splats):
+        return splats.opacities
+
+
+class Logarithm(Faint):
+    def __call__(self, splats):
+        return (splats.opacities - 1).log().mean()
+
+
+class Cuts(Faint):
+    def __call__(self, splats):
+        return splats.opacities.detach().mean()
+
+
+class Thick(Faint):
+    def __call__(self, splats):
+        return (splats.scales[:, 0] * 0).sqrt().mean()
+
+
+class Grows(Faint):
+    def weight_at(self, index, steps):
+        return index / (index - 500) if index != 500 else float("inf")
+
+
+@pytest.mark.parametrize(
+    ("regularizer", "message"),
+    [
+        (Each(), r"Each gives shape \(60,\), not one number"),
+        (Logarithm(), "Logarithm of surfels is nan"),
+        (Cuts(), "Cuts of surfels does not depend on means, quats, scales, opacities, sh"),
+        (Thick(), "Thick of surfels: the gradient of 'scales' is not finite"),
+        (Grows(), "Grows: the weight at step 1 of 1000 is -0.002"),
+    ],
+)
+def test_regularizers_that_are_wrong(regularizer, message):
+    check_regularizer(Faint())
+    with pytest.raises(AssertionError, match=message):
+        check_regularizer(regularizer)
+
+
+class Darkens(Exposure):
+    def begin(self, count):
+        return 0.9 * Exposure.begin(self, count)
+
+
+class Unlearned(Exposure):
+    def __call__(self, numbers, color):
+        return Exposure.__call__(self, numbers.detach(), color)
+
+
+class Reverses(Exposure):
+    def rate_at(self, index, steps):
+        return -Exposure.rate_at(self, index, steps)
+
+
+class Spills(Exposure):
+    def folded(self, numbers, params):
+        params["sh0"] += 0.1
+        return params
+
+
+class Loses(Exposure):
+    def folded(self, numbers, params):
+        return {"sh0": params["sh0"]}
+
+
+@pytest.mark.parametrize(
+    ("appearance", "message"),
+    [
+        (Darkens(), "Darkens: the numbers that photograph 0 begins with change its colours"),
+        (Unlearned(), "Unlearned gives no gradient by the numbers"),
+        (Reverses(), "Reverses: the learning rate -0.00.* is not a number of 0 or more"),
+        (Spills(), r"Spills.folded changed its input params\['sh0'\]; work on a copy"),
+        (Loses(), "Loses.folded gives columns of shapes {'sh0'"),
+    ],
+)
+def test_appearance_models_that_are_wrong(appearance, message):
+    check_appearance(Exposure())
+    with pytest.raises(AssertionError, match=message):
+        check_appearance(appearance)
+
+
+@dataclass(frozen=True)
+class Knows(DepthEstimator):
+    """The true depth of the scene that the check shows."""
+
+    aligned = True
+    oriented = True
+    scale: float = 1.0
+
+    def estimate(self, given, wanted):
+        truth = survey(views=9, width=72, height=54, points=600)
+        for at in wanted:
+            exact = truth.exact[given.views[at].name]
+            inverse = torch.where(exact.depth > 0, self.scale / exact.depth, 0).float()
+            yield self.spoilt(Estimate(at, inverse, (inverse > 0).float(), exact.normal.float()))
+
+    def spoilt(self, estimate):
+        return estimate
+
+
+class Skips(Knows):
+    def estimate(self, given, wanted):
+        yield from Knows.estimate(self, given, wanted[1:])
+
+
+class Depth(Knows):
+    def spoilt(self, estimate):
+        return replace(estimate, inverse=1 / estimate.inverse)
+
+
+class Outwards(Knows):
+    def spoilt(self, estimate):
+        return replace(estimate, normal=-estimate.normal)
+
+
+class Percent(Knows):
+    def spoilt(self, estimate):
+        return replace(estimate, confidence=100 * estimate.confidence)
+
+
+class Bare(Knows):
+    def spoilt(self, estimate):
+        return replace(estimate, normal=None)
+
+
+class Forgets(Knows):
+    """Leaves a file in its work folder, and goes on from it with other depths."""
+
+    def estimate(self, given, wanted):
+        begun = given.work / "begun"
+        for estimate in Knows.estimate(self, given, wanted):
+            again = begun.exists() and len(wanted) == 1
+            begun.touch()
+            yield replace(estimate, inverse=1.01 * estimate.inverse) if again else estimate
+
+
+@pytest.mark.parametrize(
+    ("estimator", "message"),
+    [
+        (Skips(), r"Skips gives the photographs \[4\]; \[7, 4\] were wanted"),
+        (Depth(), "Depth is `aligned`, but its inverse depths are 1.68 times those of the scene"),
+        (Outwards(), "Outwards: a normal points away from the camera"),
+        (Percent(), r"Percent: confidence must lie in \[0, 1\]"),
+        (Bare(), "Bare: normals are given if and only if it is `oriented`"),
+        (Knows(scale=20.0), "Knows is `aligned`, but its inverse depths are 20 times those of the scene"),
+        (Forgets(), "Forgets.estimate of a photograph after an interruption is not repeatable: inverse differs"),
+    ],
+)
+def test_estimators_that_are_wrong(estimator, message):
+    with pytest.raises(AssertionError, match=message):
+        check_depth_estimator(estimator)
+
+
+def test_an_estimator_that_is_right():
+    check_depth_estimator(Knows())

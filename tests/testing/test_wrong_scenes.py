@@ -1,0 +1,211 @@
+"""Starts, partitions, assignments and refinements that break their contract are named, with what is wrong."""
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+
+from surfkit.partition.assign import Assign, PictureShare
+from surfkit.partition.base import Cells, Ground, Partition
+from surfkit.refine import PruneAndRecover
+from surfkit.refine.base import Refine
+from surfkit.start.base import Start
+from surfkit.start.plain import SparseStart
+from surfkit.testing import check_assign, check_partition, check_refine, check_start
+from surfkit.train.stage import Stage
+
+FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Sparse(Start):
+    """The sparse points."""
+
+    def cloud(self, known):
+        return self.spoilt(SparseStart().cloud(known), known)
+
+    def expected(self, sparse, pixels):
+        return sparse
+
+    def spoilt(self, cloud, known):
+        return cloud
+
+
+class Double(Sparse):
+    def spoilt(self, cloud, known):
+        return replace(cloud, xyz=cloud.xyz.double())
+
+
+class Shades(Sparse):
+    def spoilt(self, cloud, known):
+        return replace(cloud, rgb=cloud.rgb / 255)
+
+
+class Opaque(Sparse):
+    def spoilt(self, cloud, known):
+        return replace(cloud, opacity=torch.ones(len(cloud.xyz)))
+
+
+class Long(Sparse):
+    def spoilt(self, cloud, known):
+        return replace(cloud, normals=2 * torch.ones_like(cloud.xyz))
+
+
+class Tosses(Sparse):
+    def spoilt(self, cloud, known):
+        return replace(cloud, xyz=cloud.xyz + 0.01 * torch.randn(cloud.xyz.shape))
+
+
+class Shifts(Sparse):
+    def spoilt(self, cloud, known):
+        known.scene.cloud.xyz.add_(1)
+        return cloud
+
+
+class Guesses(Sparse):
+    def expected(self, sparse, pixels):
+        return 100 * sparse
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        (Double(), r"Double: xyz is torch.float64 of shape \(400, 3\), not torch.float32 of shape \(400, 3\)"),
+        (Shades(), "Shades: rgb is torch.float32 of shape"),
+        (Opaque(), "Opaque: opacity must lie between 0 and 1"),
+        (Long(), "Long: a normal is not of length 1"),
+        (Tosses(), "Tosses.cloud is not repeatable: xyz differs; draw from the generator"),
+        (Shifts(), "Shifts.cloud changed its input known.scene.cloud.xyz; work on a copy"),
+        (Guesses(), "Guesses.expected is 40000, and the start gives 400 points"),
+    ],
+)
+def test_starts_that_are_wrong(start, message):
+    check_start(Sparse())
+    with pytest.raises(AssertionError, match=message):
+        check_start(start)
+
+
+@dataclass(frozen=True)
+class Halves(Partition):
+    """Two blocks, to both sides of a line, with a gap between them."""
+
+    gap: float = 0.0
+
+    def cells(self, sight):
+        return Cells(FLAT, ((None, None, 0.0, None), (self.gap, None, None, None)), (0, 1))
+
+
+class Random(Halves):
+    def cells(self, sight):
+        at = torch.rand(()).item()
+        return Cells(FLAT, ((None, None, at, None), (at, None, None, None)), (0, 1))
+
+
+@pytest.mark.parametrize(
+    ("partition", "message"),
+    [
+        (Halves(gap=0.1), "Halves: a place has no owner"),
+        (Halves(gap=-0.1), "Halves: a place has two owners"),
+        (Random(), "Random: the same model gives other cells"),
+    ],
+)
+def test_partitions_that_are_wrong(partition, message):
+    check_partition(Halves())
+    with pytest.raises(AssertionError, match=message):
+        check_partition(partition)
+
+
+@dataclass(frozen=True)
+class Share(Assign):
+    """The share of the picture."""
+
+    threshold: float = 0.05
+
+    @property
+    def least(self):
+        return self.threshold
+
+    def measure(self, sight, owner, count):
+        return self.spoilt(PictureShare().measure(sight, owner, count))
+
+    def spoilt(self, share):
+        return share
+
+
+class Across(Share):
+    def spoilt(self, share):
+        return share.T
+
+
+class All(Share):
+    def spoilt(self, share):
+        return share + 1
+
+
+class Relative(Share):
+    def spoilt(self, share):
+        return share / share.amax(0)
+
+
+class Below(Share):
+    def spoilt(self, share):
+        return share - 1
+
+
+@pytest.mark.parametrize(
+    ("assign", "message"),
+    [
+        (Across(), r"Across.measure has shape \(3, 30\), not \(30, 3\)"),
+        (All(), "All: a view joins a block without points"),
+        (Relative(), "Relative.measure is not finite"),
+        (Below(), "Below.measure is below 0 for some view"),
+        (Share(threshold=0.999), "Share: no view joins block 0"),
+    ],
+)
+def test_assignments_that_are_wrong(assign, message):
+    check_assign(Share())
+    with pytest.raises(AssertionError, match=message):
+        check_assign(assign)
+
+
+@dataclass(frozen=True)
+class Same(Refine):
+    """Goes on as before."""
+
+    stage: Stage = field(default_factory=lambda: PruneAndRecover().stage)
+
+
+class Whitens(Same):
+    def params(self, params):
+        params["sh0"].zero_()
+        return params
+
+
+class Narrows(Same):
+    def params(self, params):
+        return params | {"sh_rest": params["sh_rest"][:, :3]}
+
+
+class Some(Same):
+    def views(self, views, seed):
+        return tuple(views[at] for at in torch.randperm(len(views)).tolist())
+
+
+class Few(Same):
+    def views(self, views, seed):
+        return tuple(views[:2])
+
+
+@pytest.mark.parametrize(
+    ("refine", "message"),
+    [
+        (Whitens(), r"Whitens.params changed its input params\['sh0'\]; work on a copy"),
+        (Narrows(), "Narrows: its points have the columns .* and what they are then has"),
+        (Some(), "Some: its views are not the same again; draw them from the seed"),
+        (Few(), "Few has photographs of the training views only"),
+    ],
+)
+def test_refinements_that_are_wrong(refine, message):
+    check_refine(Same())
+    with pytest.raises(AssertionError, match=message):
+        check_refine(refine)
