@@ -108,6 +108,9 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ([*OK, "--devic", "cpu"], "no option --devic; perhaps you meant --device"),
         ([*OK, "--pretrain.stepz", "3"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
         ([*OK, "--pretrain.stepz=3", "--dat", "x"], "no option --pretrain.stepz; perhaps you meant --pretrain.steps"),
+        ([*OK, "--stepz", "3"], "no option --stepz; perhaps you meant --pretrain.steps"),
+        (["doctor", "--quik"], "no option --quik; perhaps you meant --quick"),
+        (["prepare", "depth"], "PATH missing; see surfkit prepare depth --help"),
         ([*OK, "--zzzzzz"], "no option --zzzzzz; see surfkit train --help"),
         (
             [*OK, "--pretrain.grow.cap", "3"],
@@ -115,7 +118,10 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ),
         ([*OK, "--pretrain.steps", "many"], "--pretrain.steps: expected a whole number, got 'many'"),
         ([*OK, "--pretrain.losses.l1.weight", "x"], "--pretrain.losses.l1.weight: expected a number, got 'x'"),
-        ([*OK, "--pretrain.losses.depth.until", "x"], "--pretrain.losses.depth.until: expected {None}|INT, got 'x'"),
+        (
+            [*OK, "--pretrain.losses.depth.until", "x"],
+            "--pretrain.losses.depth.until: expected None or a whole number, got 'x'",
+        ),
         ([*OK, "--pretrain.steps"], "--pretrain.steps: a value must follow"),
         ([*OK, "--device", "tpu"], "--device: expected one of 'auto', 'cpu', got 'tpu'"),
         ([*OK, "--pretrain.losses.depth.start", "-1"], "pretrain.losses.depth: start is -1; it must be 0 or more"),
@@ -123,9 +129,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         (["components", "gorw"], "no kind of component named 'gorw'; did you mean 'grow'? known: grow, loss"),
     ],
 )
-@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])  # of stdout: tyro draws other boxes
-def test_what_users_get_wrong_is_one_line(world, capsys, monkeypatch, encoding, words, line):
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+def test_what_users_get_wrong_is_one_line(world, capsys, words, line):
     assert main(words) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"surfkit: {line}")
