@@ -64,12 +64,12 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
     try:
         with on_parse_error(refuse):
-            return _with_numbers(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
+            return _refuse_nan(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
     finally:
         ARGV.reset(token)
 
 
-def _with_numbers(settings: T, at: str = "") -> T:
+def _refuse_nan(settings: T, at: str = "") -> T:
     """The settings, or BadInput if one at any depth is nan, which passes most checks, or has no place in 64 bits."""
     inner: Iterable[tuple[Any, Any]] = ()
     if isinstance(settings, float) and math.isnan(settings):
@@ -83,7 +83,7 @@ def _with_numbers(settings: T, at: str = "") -> T:
     elif isinstance(settings, tuple):
         inner = enumerate(settings)
     for name, value in inner:
-        _with_numbers(value, f"{at}.{name}" if at else str(name))
+        _refuse_nan(value, f"{at}.{name}" if at else str(name))
     return settings
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.cli import COMMANDS, LIGHTER, main
+from surfkit.cli import COMMANDS, MEMORY_ADVICE, main
 from surfkit.cli.parse import parse
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
@@ -323,16 +323,16 @@ def qhull_error():
 def test_memory_that_gives_out_is_one_line(monkeypatch, capsys, fails, wanted):
     command(monkeypatch, fails)
     assert main(["export"]) == 1
-    pattern = rf"surfkit: export: out of memory with [\d.]+ GiB held{re.escape(wanted)}; there must be more\n"
+    pattern = rf"surfkit: export: out of memory with [\d.]+ GiB held{re.escape(wanted)}; more memory is needed\n"
     assert re.fullmatch(pattern, capsys.readouterr().err) and Big.alive == 0
 
 
-@pytest.mark.parametrize("name", LIGHTER)
+@pytest.mark.parametrize("name", MEMORY_ADVICE)
 def test_what_to_lower_when_memory_gives_out_exists(name):
     command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     command = command["depth"] if isinstance(command, dict) else command
-    flags = re.findall(r"--[\w.-]+", LIGHTER[name])
-    choices = re.findall(r"\w+:[\w-]+", LIGHTER[name])
+    flags = re.findall(r"--[\w.-]+", MEMORY_ADVICE[name])
+    choices = re.findall(r"\w+:[\w-]+", MEMORY_ADVICE[name])
     assert flags
     for words in [choices[at : at + 1] for at in range(max(1, len(choices)))]:
         helped = io.StringIO()
