@@ -19,7 +19,7 @@ import torch
 from machine import save
 from scipy.ndimage import gaussian_filter
 
-from surfkit.evaluate.geometry.comparison import Comparison, sided, truth_side, volume
+from surfkit.evaluate.geometry.comparison import Comparison, make_side, truth_side, volume
 from surfkit.evaluate.geometry.repetition import Measurement
 from surfkit.evaluate.geometry.scores import nearest, shares, tree
 from surfkit.evaluate.geometry.surface import read_surface
@@ -111,7 +111,9 @@ def score(mesh: Mesh, scene: Scene, pack: Path, tau: float, crop: object) -> dic
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mesh.ply"
         write_mesh(path, clean(mesh, 50, 50)[0], scene.frame)
-        measure = Measurement(sided(read_surface(path), None, None, tau), theirs, crop, tau, np.random.default_rng(0))
+        measure = Measurement(
+            make_side(read_surface(path), None, None, tau), theirs, crop, tau, np.random.default_rng(0)
+        )
         found = measure.draw(np.eye(4), "none")
     precision, recall, f1 = shares(found.distances, tau)
     row = {"precision": precision, "recall": recall, "f1": f1}

@@ -91,7 +91,7 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
 
 
 def test_merged_points_lie_in_their_block(undisturbed):
-    """Counted from the blocks' own results: what each owns of what it has come to, in their order."""
+    """ViewCounts from the blocks' own results: what each owns of what it has come to, in their order."""
     plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
     parts = []
     for index in range(2):
@@ -422,4 +422,4 @@ def test_an_inline_executor_is_the_default(recipe):
 def test_settings_of_blocks_where_there_are_none(data, tmp_path, capsys, word):
     words = ["train", "recipe:2dgs", *word, "--data", str(data.path), "--out", str(tmp_path / "run")]
     assert main(words) == 2 and not (tmp_path / "run").exists()
-    assert f"surfkit: {word[0]}: the recipe cuts the scene into no blocks" in capsys.readouterr().err
+    assert f"surfkit: {word[0]}: the recipe does not divide the scene into blocks" in capsys.readouterr().err

@@ -23,7 +23,7 @@ class Fallback:
     """One step down.
 
     Attributes:
-        number: Counted from 1.
+        number: ViewCounts from 1.
         text: What is done, as the end of a sentence.
     """
 

@@ -1,4 +1,4 @@
-"""The `surfkit` command: finds the subcommand, runs it, and turns what a user can put right into one line.
+"""The `surfkit` command: finds the subcommand, runs it, and prints an error that a user can correct as one line.
 
 Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
 and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
@@ -15,56 +15,56 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from surfkit.cli.streams import READER_LEFT, open_closed, silence_lost
+from surfkit.cli.streams import READER_LEFT, reopen_closed, silence_lost_streams
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
 
 COMMANDS = {
-    "train": "Reconstruct a surface from photographs with known cameras.",
-    "tune": "Tune one block of a run, in a process or on a machine of its own.",
+    "train": "Train a model, and make its mesh, from photographs with known cameras.",
+    "tune": "Train one block of a large scene, in its own process or on another machine.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
-    "evaluate": "Measure a finished run on photographs it has not seen, or its mesh against true geometry.",
-    "doctor": "Examine a data set before training: faults, and what a run takes.",
-    "status": "Tell where a run stands.",
-    "curves": "Draw how the points, the loss or the memory of runs went, step by step.",
-    "export": "Write the result of a run for other programs.",
-    "prepare": "Make what a data set may need before training: `prepare depth`.",
+    "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
+    "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
+    "status": "Show the progress of a run.",
+    "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
+    "export": "Write the points of a run as PLY, for other programs.",
+    "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
-    "components": "List the parts that recipes are made of, by kind.",
-    "plugins": "List the plugins: where each comes from, what it offers, why it failed.",
+    "components": "List the components that recipes are made of, by kind.",
+    "plugins": "List the plugins: package, components, and the error if one does not load.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
-LIGHTER = {
+MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",
     "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
     "prepare": "a lower --estimator.longest or smaller photographs (--longest, --scale) need less",
 }
-"""What a user can lower when memory gives out in a command."""
+"""What a user can lower when a command runs out of memory."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
-    2 is for words and data that the user can put right, 1 for a run that ran out of memory, disk or finite numbers, 3
-    for one with blocks that failed, 130 for one that was interrupted, and 141 for output that nobody reads any more.
+    2 is for arguments or data that the user can correct, 1 for a run that ran out of memory or disk or met NaN or Inf,
+    3 for one with blocks that failed, 130 for one that was interrupted, and 141 for output that nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    # Idle threads of torch would otherwise spin, and burn as much processor time as the work itself.
+    # Idle threads of torch would otherwise spin, and use as much CPU time as the work itself.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    open_closed()
+    reopen_closed()
     try:
         status = _guarded(words)
         sys.stdout.flush()
         return status
     except OSError as error:
-        lost = silence_lost()
+        lost = silence_lost_streams()
         if lost and isinstance(error, BrokenPipeError):
             return READER_LEFT
         if not lost and error.errno not in DISK_FULL:
@@ -94,7 +94,7 @@ def overview() -> str:
 
 
 def _guarded(words: list[str]) -> int:
-    """The exit status of a command line, with one line on stderr for what is not a mistake of ours."""
+    """The exit status of a command line, with one line on stderr for an error that is not a bug."""
     try:
         return _dispatch(words)
     except KeyboardInterrupt:
@@ -104,32 +104,32 @@ def _guarded(words: list[str]) -> int:
         if isinstance(stop.code, str):
             raise
         if stop.code == 1:
-            silence_lost()
+            silence_lost_streams()
             return READER_LEFT
         return stop.code or 0
     except Exception as error:
-        if (told := _told(error, words)) is None:
+        if (found := _error_line(error, words)) is None:
             raise
-        text, status = told
+        text, status = found
         print(f"surfkit: {text}", file=sys.stderr)
         return status
 
 
-def _told(error: Exception, words: list[str]) -> tuple[str, int] | None:
-    """One line for what a user can put right, and the exit status; None for what is a mistake of ours."""
+def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:
+    """One line for an error that a user can correct, and the exit status; None for a bug."""
     if isinstance(error, (BadInput, Fault)):
         return " ".join(str(error).split()), 2 if isinstance(error, BadInput) else error.status
     if is_out_of_memory(error):
         text = f"{' '.join(words[:1])}: {out_of_memory(error)}"
         _release(error)
-        return f"{text}; {LIGHTER.get(words[0], 'there must be more')}", 1
+        return f"{text}; {MEMORY_ADVICE.get(words[0], 'more memory is needed')}", 1
     if isinstance(error, OSError) and error.filename is not None:  # no permission, a folder in the place of a file
         return f"{os.fsdecode(error.filename)}: {error.strerror}", 2
     return None
 
 
 def _release(error: BaseException | None) -> None:
-    """Let go of all that the frames of an error hold, so that there is memory to tell of it."""
+    """Release all that the frames of an error hold, so that there is memory to report it."""
     while error is not None:
         error.__traceback__ = None
         error = error.__cause__ or error.__context__

@@ -25,53 +25,55 @@ from surfkit.report.truth import Truth
 class Ablate:
     """Train every row of an ablation table on the same data, and compare each row with the one it is built on.
 
-    Rows that come to the same recipe are trained once. An interrupted table goes on when the same command is given
-    again; with more seeds or rows, what is finished is kept. A row that fails does not stop the others.
+    Rows with the same recipe are trained once. An interrupted table continues when the same command is given again;
+    with more seeds or rows, finished runs are kept. A row that fails does not stop the others.
     """
 
     table: Annotated[Table, chosen_table]
-    """Which table."""
+    """Ablation table."""
 
     data: Annotated[Data, tyro.conf.arg(name="")]
-    """What to train on."""
+    """Data set."""
 
     steps: int | None = None
-    """Length of each run, schedules scaled along. In less than 1,000 steps points hardly multiply: rows look alike."""
+    """Optimisation steps of each run; schedules are scaled by the same factor. With fewer than 1,000 steps the model is
+    hardly densified, and rows differ little."""
 
     max_points: int | None = None
-    """No row grows beyond this number of points, so that rows are compared at equal size, and fit the machine."""
+    """Largest number of points of every row, so that rows are compared at equal size and fit into memory."""
 
     seeds: int = 1
-    """Runs of each row, with seeds 0, 1, 2 and so on; with several, differences get an error."""
+    """Number of runs of each row, with seeds 0, 1, 2 and so on; with several, differences have a standard error."""
 
     gt: Path | None = None
-    """True geometry, a mesh or a cloud of points: the mesh of every row is compared with it, for F1, in one crop volume
-    for all rows. Rows without a mesh get mesh:tsdf then."""
+    """Ground truth, a mesh or a point cloud: the mesh of every row is compared with it, for F1, in the same crop
+    volume. Rows without a mesher get mesh:tsdf then."""
 
     tau: float | None = None
-    """With --gt, distance below which a point counts as right, in units of the truth; a mesh needs it."""
+    """With --gt: distance threshold below which a point counts as correct, in units of the ground truth. Required when
+    the ground truth is a mesh."""
 
     rows: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
-    """Run only these rows, by number or label; what is known of the others is shown with them."""
+    """Run only these rows, by number or label; finished results of the other rows are shown, too."""
 
     out: Path | None = None
-    """Folder of the results; runs/DATA-ablate-TABLE by default."""
+    """Folder of the results. Default: runs/DATA-ablate-TABLE."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for training and rendering."""
 
     def run(self) -> int:
         """Run the table and show it; 1 if a row failed."""
         out = self.out or Path("runs") / f"{self.data.path.resolve().name}-ablate-{self.table.name}"
         if self.tau is not None and self.gt is None:
-            raise BadInput(f"--tau {self.tau:g}: it belongs to the truth; name that with --gt, or leave it out")
+            raise BadInput(f"--tau {self.tau:g}: it needs --gt; add --gt, or leave it out")
         truth = None if self.gt is None else Truth(self.gt, self.tau)
         plan = Plan(self.table, self.data, out, self.steps, self.seeds, self.rows, self.device, self.max_points, truth)
         try:
             with Screen() as screen:
                 report = ablate(plan, screen)
         except KeyboardInterrupt:
-            print(f"{out} keeps what is finished; the same command goes on from there", file=sys.stderr)
+            print(f"{out} keeps what is finished; give the same command again to continue", file=sys.stderr)
             raise
         show(report)
         print()

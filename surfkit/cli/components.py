@@ -17,10 +17,10 @@ Kinds = dict[str, dict[str, type[Component]]]
 
 @dataclass(frozen=True)
 class Components:
-    """List the parts that recipes are made of, by kind."""
+    """List the components that recipes are made of, by kind."""
 
     kind: Annotated[str | None, tyro.conf.Positional] = None
-    """Only this kind, such as "densify"; all kinds if left out."""
+    """Show only this kind, such as "densify". Default: all kinds."""
 
     markdown: bool = False
     """Write Markdown with every setting, its default and its help, as in docs/components.md."""

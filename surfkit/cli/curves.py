@@ -18,28 +18,28 @@ TITLES = {"points": "points", "loss": "sum of the weighted losses", "memory": "m
 
 @dataclass(frozen=True)
 class Curves:
-    """Draw how the points, the loss or the memory of runs went, step by step, into one chart.
+    """Draw a chart of the points, the loss or the memory of runs over the steps.
 
-    Such as the count of points while a block is tuned, with and without a filter (CityGaussianV2, figure 3).
+    Example: the number of points while a block is trained, with and without a filter (CityGaussianV2, figure 3).
     """
 
     run_folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folders that `surfkit train` made."""
 
     of: What = "points"
-    """What to draw."""
+    """Quantity to draw."""
 
     block: int | None = None
-    """Draw the tuning of this block, instead of the first stage of the run."""
+    """Draw the training of this block instead of the first stage of the run."""
 
     refinement: int | None = None
-    """Draw this refinement of the model, such as 0, instead."""
+    """Draw this refinement of the model, counted from 0, instead."""
 
     out: Path = Path("curves.png")
-    """The picture."""
+    """PNG file to write."""
 
     def run(self) -> None:
-        """Draw, and tell where each line began, was highest and ended."""
+        """Draw, and print the first, highest and last value of each line."""
         if self.block is not None and self.refinement is not None:
             raise BadInput("--block and --refinement: give one of them")
         place = None if self.block is None else Place("block", self.block)

@@ -35,9 +35,9 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 @dataclass(frozen=True)
 class Doctor:
-    """Examine a data set before training: what is there, all that is wrong, and what a run takes.
+    """Check a data set before training: its contents, all errors in it, and the memory, disk and time of a run.
 
-    Nothing is written. Exits 0 when nothing stops training, warnings allowed, and 2 when there are errors.
+    Nothing is written. Exit status: 0 when a run can start, also with warnings, and 2 when there are errors.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -46,34 +46,34 @@ class Doctor:
     default_recipe: ClassVar[str] = "2dgs"
 
     recipe: Annotated[Recipe, chosen_recipe]
-    """What it is to be used for; recipe:2dgs if none is named."""
+    """Recipe that the data set is checked for. Default: recipe:2dgs."""
 
     json: bool = False
-    """Print JSON instead."""
+    """Print JSON instead of tables."""
 
     quick: bool = False
-    """Look at the headers of photographs only, which does not find files that are cut off or blank, nor exposures."""
+    """Read only the headers of photographs: truncated or blank files and changing exposure are not found then."""
 
     probe: int = 50
-    """Steps to take for the estimate of memory, disk and time; 0 for no estimate."""
+    """Optimisation steps that are measured to estimate memory, disk and time; 0 for no estimate."""
 
     points: int | None = None
-    """Points at the end of the run, for the estimate; by default what the recipe allows and is likely."""
+    """Number of points at the end of the run, for the estimate. Default: estimated from the recipe and its limits."""
 
     steps: int | None = None
-    """Length of the run; every schedule of the recipe is scaled along."""
+    """Optimisation steps of the run; every schedule of the recipe is scaled by the same factor."""
 
     reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
     """How the data set is read."""
 
     cache: str = "auto"
-    """Memory for photographs, masks and depth priors in the run, such as 4GB; auto takes half of what is free."""
+    """Memory for photographs, masks and depth priors in the run, such as 4GB; auto is half of the free memory."""
 
     out: Path = Path("runs")
-    """Where the run folder will be: room is looked for there."""
+    """Folder of the run folders: free disk space is checked there."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for training and rendering."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "recipe", settled(self.recipe))
@@ -83,18 +83,18 @@ class Doctor:
             raise BadInput(f"--points {self.points}: give 1 to {MOST_POINTS}")
 
     def run(self) -> int:
-        """Examine, and tell."""
+        """Check, and print the findings."""
         data = self.reading.of(self.data)
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
-        with watched() as told:
-            examined = examine(data, recipe, self.quick, told)
+        with progress_bars() as report:
+            examined = examine(data, recipe, self.quick, report)
             diagnosis = examined.diagnosis
             if diagnosis.sound and self.probe and not recipe.has_stages:
                 text = f"there is no estimate for method:{name_of(recipe.method)}: it does not optimise splats"
                 diagnosis = replace(diagnosis, findings=(*diagnosis.findings, Finding("note", "forecast", text)))
             elif diagnosis.sound and self.probe:
                 plan = Plan(self.probe, self.points, self.cache, self.device, self.out)
-                estimate, findings = forecast(data, recipe, examined, plan, told)
+                estimate, findings = forecast(data, recipe, examined, plan, report)
                 findings = tuple(sorted((*diagnosis.findings, *findings), key=lambda f: LEVELS.index(f.level)))
                 diagnosis = replace(diagnosis, findings=findings, estimate=estimate)
         if self.json:
@@ -105,19 +105,19 @@ class Doctor:
 
 
 @contextmanager
-def watched() -> Iterator[Told]:
-    """Bars on the terminal for what takes its time; nothing where there is no terminal."""
+def progress_bars() -> Iterator[Told]:
+    """Progress bars on the terminal; nothing where there is no terminal."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     tasks: dict = {}
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
 
-        def told(what: str, done: int, total: int) -> None:
+        def report(what: str, done: int, total: int) -> None:
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=total)
             bar.update(tasks[what], completed=done, total=total)
 
-        yield told
+        yield report
 
 
 def as_json(diagnosis: Diagnosis) -> str:
@@ -125,12 +125,12 @@ def as_json(diagnosis: Diagnosis) -> str:
     return json.dumps({"sound": diagnosis.sound, **dump(diagnosis)}, indent=2, ensure_ascii=False)
 
 
-def show(diagnosis: Diagnosis, asked: bool) -> None:
+def show(diagnosis: Diagnosis, estimate_wanted: bool) -> None:
     """Print the diagnosis for a person.
 
     Args:
         diagnosis: What to print.
-        asked: Whether an estimate was wanted.
+        estimate_wanted: Whether an estimate was wanted.
     """
     console = Console(soft_wrap=not sys.stdout.isatty(), highlight=False)
     print_table((str(diagnosis.data), ""), list(diagnosis.found.items()))
@@ -145,14 +145,14 @@ def show(diagnosis: Diagnosis, asked: bool) -> None:
     for finding in diagnosis.findings:
         console.print(f"{finding.level}: ", style=COLOURS[finding.level], end="")
         console.print(finding.text, markup=False)
-    console.print(verdict(diagnosis, asked), style="bold")
+    console.print(verdict(diagnosis, estimate_wanted), style="bold")
 
 
 def rows(found: Estimate) -> list[tuple[str, str]]:
-    """The estimate in words."""
+    """The rows of the table of the estimate."""
     room = found.room
     steps = ", ".join(f"{1000 * seconds:.0f}" for seconds in found.step_seconds)
-    told = [
+    table = [
         ("points at the end", likely_range(found)),
         ("time", f"{duration(found.seconds)} ({steps} ms a step, from the beginning to the end)"),
         (
@@ -163,18 +163,22 @@ def rows(found: Estimate) -> list[tuple[str, str]]:
         ("disk", f"{size(found.run_bytes)} for the run folder; {size(room.run_bytes)} are free"),
     ]
     if found.data_bytes:
-        told.append(("", f"{size(found.data_bytes)} for undistorted photographs; {size(room.data_bytes)} are free"))
+        table.append(("", f"{size(found.data_bytes)} for undistorted photographs; {size(room.data_bytes)} are free"))
     if not found.points_known:
-        told.append(("", "how far points multiply is a rule of thumb; --points tries another number"))
-    return told
+        table.append(("", "how much the number of points grows is a rule of thumb; --points tries another number"))
+    return table
 
 
-def verdict(diagnosis: Diagnosis, asked: bool) -> str:
+def verdict(diagnosis: Diagnosis, estimate_wanted: bool) -> str:
     """The last line."""
     counts = [sum(finding.level == level for finding in diagnosis.findings) for level in LEVELS]
     words = [f"{count} {level}{'s' * (count != 1)}" for level, count in zip(LEVELS, counts, strict=True) if count]
     if not diagnosis.sound:
-        later = "; the estimate comes when the errors are put right" if asked and diagnosis.estimate is None else ""
+        later = (
+            "; the estimate comes when the errors are put right"
+            if estimate_wanted and diagnosis.estimate is None
+            else ""
+        )
         return f"{', '.join(words)}{later}"
     return f"ready to train{': ' if words else ''}{', '.join(words)}"
 

@@ -31,47 +31,49 @@ from surfkit.train.faults import full_disk_in_one_line
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a finished run again on the photographs it has not seen, or with --gt its mesh against the true geometry.
+    """Measure a finished run on its held-out photographs, or with --gt its mesh against ground truth.
 
-    Without --gt: PSNR, SSIM and LPIPS; writes metrics.json and the pictures anew. With --gt: precision, recall, F1 and
-    chamfer distances of RUN/mesh.ply, or of any mesh or cloud of points that is named instead of a run, into
-    metrics.json, in all and by classes of places; the crop volume, error clouds and pictures into the folder geometry/
-    beside it. --seen and --seams measure parts of the photographs, and --seams those of the geometry.
+    Without --gt: computes PSNR, SSIM and LPIPS, and writes metrics.json and the pictures again. With --gt: computes
+    precision, recall, F1 and chamfer distances of RUN/mesh.ply, or of any mesh or point cloud that is given instead of
+    a run, for the whole surface and for each class of places. They are written to metrics.json; the crop volume, the
+    points coloured by error and the pictures are written to the folder geometry/ beside it. --seen and --seams also
+    measure parts of the photographs; --seams also measures parts of the geometry.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
-    """Folder that `surfkit train` made, or a mesh or cloud of points to compare with --gt."""
+    """Run folder that `surfkit train` made, or a mesh or point cloud to compare with --gt."""
 
     gt: Path | None = None
-    """True geometry: a cloud of points or a mesh. PLY of any size; OBJ, STL, GLB and OFF through trimesh."""
+    """Ground truth: a point cloud or a mesh. PLY of any size; OBJ, STL, GLB and OFF are read by trimesh."""
 
     views: Path | None = None
-    """Run folder or data set whose training views make the crop volume, when a file is measured."""
+    """When a file is measured: run folder or data set whose training views define the crop volume."""
 
     out: Path | None = None
-    """Folder for metrics.json and geometry/; the run folder, or for a file FILE-geometry beside it."""
+    """Folder for metrics.json and geometry/. Default: the run folder, or for a file the folder FILE-geometry beside
+    it."""
 
     seen: tuple[int, ...] = ()
-    """Also PSNR and SSIM over the pixels whose place at least so many training views see, such as 3, or 3 5 10. With a
-    mesh as --gt, that is the place on it, and it alone hides; else the depth that the model renders, which must agree
-    in a training view within 1 %."""
+    """Also compute PSNR and SSIM over the pixels whose surface point at least this many training views see, such as 3,
+    or 3 5 10. With a mesh as --gt, the surface point is on that mesh, and only that mesh can hide it. Otherwise it
+    comes from the depth that the model renders, which must agree within 1 % in a training view."""
 
     seams: Distance | None = None
-    """Of a run in blocks: also PSNR, and with --gt precision, recall and F1, within so many metres of the borders of
-    blocks, and elsewhere. `auto` for 2 % of the width of the scene."""
+    """For a run with blocks: also compute PSNR, and with --gt precision, recall and F1, within this distance of the
+    block borders, in metres, and elsewhere. `auto` is 2 % of the width of the scene."""
 
     geometry: Annotated[Comparison, tyro.conf.arg(name="")] = Comparison()
     """How the geometry is compared."""
 
     lpips_weights: str = "auto"
-    """Weights of LPIPS: `auto` for what lies on this machine (`pip install 'surfkit[lpips]'`), `download` to fetch the
-    backbones into torch's cache (760 MB), a folder, or `none`. What is not measured is said in metrics.json."""
+    """Weights of LPIPS: `auto` for those on this machine (`pip install 'surfkit[lpips]'`), `download` to download the
+    backbones to torch's cache (760 MB), a folder, or `none`. metrics.json says what was not measured and why."""
 
     device: Device = "auto"
-    """Where to compute the pictures."""
+    """Device for rendering."""
 
     def run(self) -> None:
-        """Measure, and show what came out."""
+        """Measure, and print the results."""
         zones = Zones(self.seen, self.seams)
         with noted(), bars():
             if self.gt is not None:

@@ -34,7 +34,7 @@ from surfkit.train.material import CacheSettings
 
 
 def named_mesher() -> Mesher:
-    """That of the recipe of the run which is being named; the usual one if it has none."""
+    """The mesher of the recipe of the run on the command line; TSDF if the recipe has none."""
     for word in ARGV.get():
         path = Path(word) / "recipe.json"
         if not word.startswith("-") and path.is_file():
@@ -46,34 +46,35 @@ def named_mesher() -> Mesher:
 class MeshOf:
     """Make the mesh of a finished run, or make it again with other settings; writes mesh.ply, mesh.json and pictures.
 
-    Settings are those of the run's recipe where nothing else is said: `surfkit mesh RUN mesh:tsdf --mesh.voxel 0.5`.
-    Small loose clusters are dropped. Coordinates are those of the data set.
+    Settings that are not given are those of the run's recipe. Example: `surfkit mesh RUN mesh:tsdf --mesh.voxel 0.5`.
+    Small separate clusters of triangles are removed. Coordinates are those of the data set.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `surfkit train` made."""
 
     mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=named_mesher)
-    """How the splats become triangles; a mesh that the method of the run made itself is written again."""
+    """Method that makes triangles from splats; a mesh that the method of the run made itself is written again."""
 
     delivery: Annotated[MeshOutput, tyro.conf.arg(name="")] = MeshOutput()
     """What is written."""
 
     memory: str = "auto"
-    """Memory to use, such as 4GB; auto takes half of what is free. Work is done in tiles where it would take more."""
+    """Memory to use, such as 4GB; auto is half of the free memory. Larger meshes are made in tiles."""
 
     metres_per_unit: float | None = None
-    """Metres in a unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+    """Metres per unit of the data set's coordinates, if the data set does not state it. Settings in metres need it."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for rendering."""
 
     prepare: bool = True
-    """Make the depth maps that the mesher wants as the recipe of the run says, where there are none; they are kept in
-    $SURFKIT_CACHE, or ~/.cache/surfkit."""
+    """Estimate the depth maps that the mesher needs, with the settings of the run's recipe, if there are none. They are
+    kept in $SURFKIT_CACHE, or ~/.cache/surfkit."""
 
     prepare_cache: str = "20GB"
-    """Disk for such depth maps, of all data sets together; those longest unused are deleted when there are more."""
+    """Disk space for these depth maps, of all data sets together; when they take more, the least recently used are
+    deleted."""
 
     def __post_init__(self) -> None:
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
@@ -83,7 +84,7 @@ class MeshOf:
             refuse_mesher(self.run_folder)
 
     def run(self) -> None:
-        """Mesh, and show what came out."""
+        """Make the mesh, and print the results."""
         budget = cache_bytes(self.memory, "--memory")
         caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
         caches.maps_bytes()  # or BadInput, before anything is done

@@ -1,40 +1,46 @@
-"""From words to a command: tyro parses, and what it objects to becomes one line."""
+"""From the words of a command line to a command: tyro parses them, and its errors become one line each."""
 
 from __future__ import annotations
 
-import contextlib
-import difflib
-import io
 import math
-import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import tyro
 
+# Private to tyro, but its only errors that are not drawn as boxes: pyproject.toml limits the versions of tyro for it.
+from tyro._errors import (
+    BadValue,
+    InstantiationFailure,
+    InvalidChoice,
+    MissingArgs,
+    MissingSubcommand,
+    ParseErrorEvent,
+    UnrecognizedArgs,
+    on_parse_error,
+)
+
+from surfkit.cli.flags import explain_flag, flags
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, owners, slots
+from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
 from surfkit.core.check import BadInput
-from surfkit.core.registry import Component
-from surfkit.recipe import Recipe
+
+if TYPE_CHECKING:
+    from tyro._arguments import ArgumentDefinition
 
 T = TypeVar("T")
 
 _CONFIG = (tyro.conf.CascadeSubcommandArgs,)
-_FLAG = re.compile(r"--[\w.\-]+")
+_NO_TYPE = re.compile(r"no type matching (.*) could be instantiated from \[(.*?)\]\. Got errors:.*")
 _REWORDED = {
-    r"^Error parsing (recipe\.)?": "",
-    r"no type matching (.*) could be instantiated from \[(.*?)\]\. Got errors:.*": r"expected \1, got \2",
     r"invalid literal for int\(\) with base 10: (.*)": r"expected a whole number, got \1",
     r"could not convert string to float: (.*)": r"expected a number, got \1",
-    r"^invalid choice '(.*)' for argument '(.*)'\. Expected one of \((.*?),?\)\.$": r"\2: expected one of \3, got '\1'",
-    r"^Missing value for argument '(.*)'\. Expected 1 values\.$": r"\1: a value must follow",
-    r"^Missing value for argument '(.*)'\. Expected (\d+) values\.$": r"\1: \2 values must follow",
 }
-"""What Python and tyro say, and how a user would want it said."""
+"""What Python says, and how a user would want it said."""
+_TYPES = {"INT": "a whole number", "FLOAT": "a number", "{None}": "None", "|": " or "}
 
 
 def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
@@ -51,22 +57,19 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     """
     argv = flags_as_choices(command, [*argv, *_default(command, argv)])
     token = ARGV.set(tuple(argv))
-    said = io.StringIO()
+
+    def refuse(event: ParseErrorEvent) -> None:
+        if line := _explained(event, command, argv, prog):
+            raise BadInput(line)
+
     try:
-        with _wide_boxes(argv), contextlib.redirect_stderr(said):
-            return _with_numbers(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
-    except SystemExit as stop:
-        if stop.code != 2:
-            raise
-        box = said.getvalue()
-        said.truncate(0)
-        raise BadInput(_condensed(box, command, argv, prog)) from None
+        with on_parse_error(refuse):
+            return _refuse_nan(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
     finally:
         ARGV.reset(token)
-        sys.stderr.write(said.getvalue())  # what was not tyro's box: warnings
 
 
-def _with_numbers(settings: T, at: str = "") -> T:
+def _refuse_nan(settings: T, at: str = "") -> T:
     """The settings, or BadInput if one at any depth is nan, which passes most checks, or has no place in 64 bits."""
     inner: Iterable[tuple[Any, Any]] = ()
     if isinstance(settings, float) and math.isnan(settings):
@@ -80,7 +83,7 @@ def _with_numbers(settings: T, at: str = "") -> T:
     elif isinstance(settings, tuple):
         inner = enumerate(settings)
     for name, value in inner:
-        _with_numbers(value, f"{at}.{name}" if at else str(name))
+        _refuse_nan(value, f"{at}.{name}" if at else str(name))
     return settings
 
 
@@ -92,115 +95,77 @@ def _default(command: type, argv: Sequence[str]) -> list[str]:
     return [f"recipe:{name}"]
 
 
-def _condensed(text: str, command: type, argv: Sequence[str], prog: str) -> str:
-    """One line for the box that tyro prints: a title, then sections between rules."""
+def _explained(event: ParseErrorEvent, command: type, argv: Sequence[str], prog: str) -> str | None:
+    """One line for what tyro found wrong; None for a kind of error that this does not know."""
     known = slots(command, argv)
     for whole in WHOLE:
         slot = whole.rstrip(":")
         if slot in known and not any(word.startswith(whole) for word in argv):
             return f"no {slot} chosen: add one of {', '.join(whole + name for name in known[slot])}"
-    title, sections = _sections(text)
-    message = _reworded(" ".join(" ".join(sections[0]).split())) if sections else ""
-    if title == "Unrecognized options" and (found := _unrecognised(message, sections[1:], command, argv, prog)):
-        return found
-    if title == "Missing subcommand" and (names := re.search(r"\{(.*)\}", message)):
-        return f"nothing chosen: add one of {names[1]}"
-    if title == "Required options":
-        return f"{' and '.join(_outermost(sections[0]))} missing; see {prog} --help"
-    if title in ("Value error", "Invalid choice", "Missing argument"):
-        return message.removeprefix(f"{command.__name__}: ")  # of the whole command, not of one setting
-    return f"{': '.join(filter(None, [title, message])) or 'these words do not fit'}; see {prog} --help"
+    if isinstance(event, UnrecognizedArgs):
+        return _unrecognised(event.tokens[0], command, argv, prog)  # the next may be its value
+    if isinstance(event, MissingArgs):
+        if event.unrecognized_tokens:
+            return _unrecognised(event.unrecognized_tokens[0], command, argv, prog)
+        names = [_name(missing.arg, with_value=True) for missing in event.missing_arguments]
+        return f"{' and '.join(names)} missing; see {prog} --help"
+    if isinstance(event, InvalidChoice):
+        choices = ", ".join(map(repr, event.choices))
+        return f"{_name(event.argument)}: expected one of {choices}, got {event.value!r}"
+    if isinstance(event, BadValue):
+        if event.reason == "fixed":
+            return f"{_name(event.argument)} cannot be set here; leave it out"
+        return _without_value(event, command, argv, prog)
+    if isinstance(event, MissingSubcommand):
+        return f"nothing chosen: add one of {', '.join(event.subcommand_spec.parser_from_name)}"
+    if isinstance(event, InstantiationFailure):
+        return ": ".join(filter(None, [_place(event), _reworded(event.message)]))
+    return None
+
+
+def _without_value(event: BadValue, command: type, argv: Sequence[str], prog: str) -> str:
+    """An argument lacks its value: at the end of the words, or because an unknown flag stands in its place."""
+    name, count = _name(event.argument), event.argument.lowered.nargs
+    if not event.argument.is_positional():
+        return f"{name}: {f'{count} values' if isinstance(count, int) and count > 1 else 'a value'} must follow"
+    known = flags(command, argv)
+    wrong = [word for word in argv if word.startswith("--") and word.partition("=")[0] not in known]
+    return _unrecognised(wrong[0], command, argv, prog) if wrong else f"{name} missing; see {prog} --help"
+
+
+def _place(event: InstantiationFailure) -> str:
+    """The flag or the part whose value is wrong; "" for the command as a whole."""
+    if event.argument is not None:
+        return _name(event.argument)
+    error = sys.exc_info()[1]  # tyro calls while it handles this one, which knows the part
+    return str(getattr(error, "arg", "")).removeprefix("recipe.")
+
+
+def _name(argument: ArgumentDefinition, with_value: bool = False) -> str:
+    """What the help calls an argument."""
+    lowered = argument.lowered
+    if argument.is_positional():
+        return str(lowered.metavar)
+    return f"{lowered.name_or_flags[-1]} {lowered.metavar}" if with_value else lowered.name_or_flags[-1]
 
 
 def _reworded(message: str) -> str:
-    for said, meant in _REWORDED.items():
-        message = re.sub(said, meant, message)
+    message = " ".join(message.split())
+    if found := _NO_TYPE.match(message):
+        kinds = found[1]
+        for written, meant in _TYPES.items():
+            kinds = kinds.replace(written, meant)
+        return f"expected {kinds}, got {found[2]}"
+    for pattern, meant in _REWORDED.items():
+        message = re.sub(pattern, meant, message)
     return message
 
 
-def _unrecognised(message: str, more: list[list[str]], command: type, argv: Sequence[str], prog: str) -> str | None:
-    """What to do about words that have no place. Only the first is named; the next may be its value."""
-    message = re.sub(r"\(applied to [^)]*\)", "", message.partition("Arguments are applied")[0])
-    found = {word: re.search(rf"(?<!\S){re.escape(word)}(?=[\s,]|$)", message) for word in argv}
-    unplaced = {word: at.start() for word, at in found.items() if at}
-    if not unplaced:
-        return None
-    word = min(unplaced, key=unplaced.__getitem__)  # not by their order in argv: a value may stand there twice
+def _unrecognised(word: str, command: type, argv: Sequence[str], prog: str) -> str:
+    """What to do about a word that has no place."""
     if not word.startswith("-"):
         return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
     flag = word.partition("=")[0]
     if names := slots(command, argv).get(flag.removeprefix("--")):
         return f"{flag}: one of {', '.join(names)} must follow"
-    if plain := difflib.get_close_matches(flag, list(_plain_flags(command)), n=2, cutoff=0.75):
-        return f"no option {flag}; perhaps you meant {' or '.join(plain)}"
-    similar = [line.strip() for section in more if _about(flag, section[0].strip()) for line in section[1:]]
-    near = list(dict.fromkeys(found[0] for line in similar if (found := _FLAG.match(line))))
-    bringing = list(dict.fromkeys(re.findall(r"(\S+:\S+) --help", " ".join(_entry(flag, similar)))))
-    if bringing := bringing or owners(command, flag, argv):
-        return f"{flag} does not apply here; it belongs to {' or '.join(bringing[:3])}, which is not chosen"
-    return f"no option {flag}; " + (f"perhaps you meant {' or '.join(near[:3])}" if near else f"see {prog} --help")
-
-
-def _plain_flags(command: type) -> Iterator[str]:
-    """The flags of a command itself; tyro puts those of its parts first, as they stand in every recipe."""
-    for name, hint in get_type_hints(command, include_extras=True).items():
-        kind, marks = (get_args(hint)[0], get_args(hint)[1:]) if get_origin(hint) is Annotated else (hint, ())
-        if {tyro.conf.Positional, tyro.conf.Suppress} & set(marks):
-            continue  # no flag
-        if isinstance(kind, type) and issubclass(kind, (Component, Recipe)):
-            continue
-        if is_dataclass(kind):
-            yield from _plain_flags(kind)
-        else:
-            yield f"--{name.replace('_', '-')}"
-
-
-def _outermost(lines: list[str]) -> list[str]:
-    """The least indented of the indented lines: what is missing, without its help."""
-    depths = [len(line) - len(line.lstrip()) for line in lines]
-    least = min((depth for depth, line in zip(depths, lines, strict=True) if not line.endswith(":")), default=0)
-    return [line.strip() for depth, line in zip(depths, lines, strict=True) if depth == least]
-
-
-def _about(flag: str, head: str) -> bool:
-    """Whether a section lists flags similar to this one."""
-    return head.startswith(("Perhaps you meant", f"Arguments similar to {flag}"))
-
-
-def _entry(flag: str, lines: list[str]) -> list[str]:
-    """The lines about one flag in a list of similar ones."""
-    found, inside = [], False
-    for line in lines:
-        if name := _FLAG.match(line):
-            inside = name[0] == flag
-        if inside:
-            found.append(line)
-    return found
-
-
-def _sections(text: str) -> tuple[str, list[list[str]]]:
-    """Title of a box and the lines between its rules; drawn with lines, or with hyphens where UTF-8 is not at hand."""
-    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines() or [""]
-    sections: list[list[str]] = [[]]
-    for line in lines[1:]:
-        inside = re.sub(r"^│ ?|\s*│?\s*$", "", line)
-        if re.fullmatch(r"\W*[─-]{3,}\W*", inside):
-            sections.append([])
-        elif inside.strip():
-            sections[-1].append(inside)
-    return re.sub(r"^\W+|\W+$", "", lines[0]), [section for section in sections if section]
-
-
-@contextlib.contextmanager
-def _wide_boxes(argv: Sequence[str]) -> Iterator[None]:
-    """Let tyro write each sentence on one line; help keeps the width of the terminal."""
-    before = os.environ.get("COLUMNS")
-    if not {"-h", "--help"} & set(argv):
-        os.environ["COLUMNS"] = "10000"
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop("COLUMNS", None)
-        else:
-            os.environ["COLUMNS"] = before
+    return explain_flag(command, flag, argv) or f"no option {flag}; see {prog} --help"

@@ -10,9 +10,9 @@ from surfkit.core.registry import Plugin, offered, records
 
 @dataclass(frozen=True)
 class Plugins:
-    """List the plugins: where each comes from, what it offers, why it failed.
+    """List the plugins: package, components, and the error if one does not load.
 
-    The variable SURFKIT_PLUGINS narrows the installed ones: "none", or names with commas between them.
+    The environment variable SURFKIT_PLUGINS limits which are used: "none", or names separated by commas.
     """
 
     def run(self) -> None:
@@ -23,15 +23,15 @@ class Plugins:
             for owner, name, _ in offered(hook):
                 offers.setdefault(owner, []).append(prefix + name)
         known = records()
-        rows = [(p.name, p.distribution, p.version, _shown(p, offers.get(p.name, []))) for p in known]
+        rows = [(p.name, p.distribution, p.version, _offers_text(p, offers.get(p.name, []))) for p in known]
         failed = [i for i, plugin in enumerate(known) if plugin.error]
-        print_table(("plugin", "package", "version", "offers"), rows, alarming=failed)
+        print_table(("plugin", "package", "version", "offers"), rows, errors=failed)
 
 
 COMMAND = Plugins
 
 
-def _shown(plugin: Plugin, offers: list[str]) -> str:
+def _offers_text(plugin: Plugin, offers: list[str]) -> str:
     if plugin.error:
         return f"not in use: {plugin.error}"
     return ", ".join([*offers, *["listens to events"] * ("surfkit_event" in plugin.hooks)]) or "nothing"

@@ -30,36 +30,36 @@ from surfkit.readers.read import read
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
 
-SHOWN = 4
+OVERVIEW_VIEWS = 4
 """Views in the overview."""
 
 
 @dataclass(frozen=True)
 class Depth:
-    """Estimate the depth of the training photographs, for the depth loss; writes DATA/estimated_depths.
+    """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
-    An interrupted estimate goes on when the same command is given again. Choose how with `estimator:plane-sweep`
-    or `estimator:patch-match` (several photographs, no weights), or `estimator:depth-anything-v2` (one photograph, a
-    network).
+    An interrupted command continues when it is given again. Methods: `estimator:plane-sweep` and
+    `estimator:patch-match` (multi-view stereo, no network weights), and `estimator:depth-anything-v2` (a network, one
+    photograph at a time).
     """
 
     data: Annotated[Path, tyro.conf.Positional]
     """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
     estimator: Annotated[DepthEstimator, choice(DepthEstimator)] = PlaneSweep()
-    """How depth is estimated."""
+    """Method that estimates depth."""
 
     again: bool = False
-    """Estimate what is there already again, also with other settings."""
+    """Also estimate depth maps again that exist already, such as with other settings."""
 
     reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
     """How the data set is read."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for the estimate."""
 
     def run(self) -> None:
-        """Estimate, and show what came out."""
+        """Estimate, and print the results."""
         data = self.reading.of(self.data)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
@@ -71,15 +71,15 @@ class Depth:
             sweep(folder)
             wanted = preparation.begin(scene, self.again)
             if there := len(views) - len(wanted):
-                print(f"{there} of {len(views)} photographs have their depth already", file=sys.stderr)
-            done = watched(preparation.run(scene, given, wanted), len(wanted))
+                print(f"{there} of {len(views)} photographs have depth maps already", file=sys.stderr)
+            done = with_progress_bar(preparation.run(scene, given, wanted), len(wanted))
             refuse_none(self.data, views)
             write_overview(folder / "overview.png", self.data, views)
         show(done)
         print(f"depth maps in {folder}; look at {folder / 'overview.png'}")
 
 
-def watched(steps: Iterable[Prepared], total: int) -> list[Prepared]:
+def with_progress_bar(steps: Iterable[Prepared], total: int) -> list[Prepared]:
     """The results, with a bar on the terminal while they come; where there is no terminal, a line for each."""
     console, done = Console(stderr=True), []
     columns = (
@@ -125,7 +125,7 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
     """A picture of a few views: photograph, depth and confidence."""
     found = [view for view in views if map_path(root, view.name).exists()]
     rows = []
-    for view in found[:: max(1, len(found) // SHOWN)][:SHOWN]:
+    for view in found[:: max(1, len(found) // OVERVIEW_VIEWS)][:OVERVIEW_VIEWS]:
         file = DepthFile(map_path(root, view.name), aligned=True)
         inverse, confidence = torch.from_numpy(file.read()), file.read_confidence()
         height, width = inverse.shape

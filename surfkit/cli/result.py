@@ -28,16 +28,16 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     Raises:
         BadInput: An earlier process left the metrics, and they are damaged.
     """
-    with sound(run.metrics, "damaged; delete it, and the surfkit train command of the run measures again"):
+    with refuse_damaged(run.metrics, "damaged; delete it, and the surfkit train command of the run measures again"):
         rows = result_rows(metrics)
     if "geometry" in metrics:
         remedy = "delete that part of it, and measure again with surfkit evaluate --gt"
-        with sound(run.metrics, f"geometry is damaged; {remedy}"):
+        with refuse_damaged(run.metrics, f"geometry is damaged; {remedy}"):
             rows += geometry_rows(metrics["geometry"])
     print_table(("metric", "value"), rows)
     print()
     if run.mesh_record.exists():
-        with sound(run.mesh_record, "damaged; delete it, and surfkit mesh makes the mesh again"):
+        with refuse_damaged(run.mesh_record, "damaged; delete it, and surfkit mesh makes the mesh again"):
             print_table(("mesh", "value"), mesh_rows(read_json(run.mesh_record, dict[str, Any])))
         print()
     written = [("metrics", run.metrics), *[("points", run.cloud)] * run.cloud.exists()]
@@ -87,7 +87,7 @@ def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> N
 
 
 @contextmanager
-def sound(path: Path, complaint: str) -> Iterator[None]:
+def refuse_damaged(path: Path, complaint: str) -> Iterator[None]:
     """Within, values of a file that are not what they should be are BadInput, with a complaint."""
     try:
         yield

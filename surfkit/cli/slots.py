@@ -11,7 +11,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 from surfkit.cli.parts import open_places, with_parts
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
-from surfkit.core.registry import Component, components, kebab, offered, unknown
+from surfkit.core.registry import Component, components, kebab, unknown
 
 Slots = dict[str, tuple[str, ...]]
 WHOLE = ("recipe:", "table:")
@@ -89,20 +89,12 @@ def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
     return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
 
 
-def owners(command: type, flag: str, argv: Sequence[str]) -> list[str]:
-    """The choices `SLOT:NAME` that would bring a flag, at a slot of the recipe that `argv` chooses."""
-    slot, _, name = flag.removeprefix("--").rpartition(".")
-    names = slots(command, argv).get(slot, ())
-    parts = [(part, cls) for _, part, cls in offered("surfkit_components") if part in names]
-    return sorted(f"{slot}:{part}" for part, cls in parts if name in (_flag(field.name) for field in fields(cls)))
-
-
 def _below(hint: Any, value: Any, path: str) -> Slots:
     """Slots at and below a setting, given its type and its value."""
-    members = list(_members(hint))
-    classes = [m for m in members if isinstance(m, type) and get_origin(m) is None]  # tuple[int] is a type in 3.10
+    kinds = list(members(hint))
+    classes = [m for m in kinds if isinstance(m, type) and get_origin(m) is None]  # tuple[int] is a type in 3.10
     bases = [cls for cls in classes if issubclass(cls, Component)]
-    optional = type(None) in members
+    optional = type(None) in kinds
     found: Slots = {}
     if bases and path:
         found[path] = (*components(bases[0]), *["none"] * optional)
@@ -111,30 +103,31 @@ def _below(hint: Any, value: Any, path: str) -> Slots:
     if is_dataclass(value) and not isinstance(value, type):
         hints = get_type_hints(type(value), include_extras=True)
         for field in fields(value):
-            found |= _below(hints[field.name], getattr(value, field.name), _join(path, _flag(field.name)))
-    elif isinstance(value, tuple) and (inner := [get_args(m)[0] for m in members if get_origin(m) is tuple]):
+            found |= _below(hints[field.name], getattr(value, field.name), join(path, _flag(field.name)))
+    elif isinstance(value, tuple) and (inner := [get_args(m)[0] for m in kinds if get_origin(m) is tuple]):
         for at, item in enumerate(value):
-            found |= _below(inner[0], item, _join(path, str(at)))
-        if bases := [m for m in _members(inner[0]) if isinstance(m, type) and issubclass(m, Component)]:
-            found[_join(path, str(len(value)))] = tuple(components(bases[0]))  # one more
+            found |= _below(inner[0], item, join(path, str(at)))
+        if bases := [m for m in members(inner[0]) if isinstance(m, type) and issubclass(m, Component)]:
+            found[join(path, str(len(value)))] = tuple(components(bases[0]))  # one more
     elif isinstance(value, dict):  # an entry keeps its class, but there may be slots inside
         for key, item in value.items():
-            found |= _below(Any, item, _join(path, _flag(key)))
+            found |= _below(Any, item, join(path, _flag(key)))
     return found
 
 
-def _members(hint: Any) -> Iterator[Any]:
+def members(hint: Any) -> Iterator[Any]:
     """The types in a hint, marks and unions taken apart."""
     if get_origin(hint) is Annotated:
-        yield from _members(get_args(hint)[0])
+        yield from members(get_args(hint)[0])
     elif get_origin(hint) in (Union, types.UnionType):
         for arg in get_args(hint):
-            yield from _members(arg)
+            yield from members(arg)
     else:
         yield hint
 
 
-def _join(path: str, name: str) -> str:
+def join(path: str, name: str) -> str:
+    """The dotted path of a setting inside another."""
     return f"{path}.{name}" if path else name
 
 

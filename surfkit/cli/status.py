@@ -21,9 +21,9 @@ SILENT_S = 60.0
 
 @dataclass(frozen=True)
 class StatusOf:
-    """Tell where a run stands: step, speed, time left, memory, measurements, warnings, and who works on it.
+    """Show the progress of a run: step, speed, time left, memory, measurements, warnings, and its processes.
 
-    Exits 0 when the run is finished, 3 when it is not, 2 when there is no run.
+    Exit status: 0 when the run is finished, 3 when it is not, 2 when there is no run.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -33,7 +33,7 @@ class StatusOf:
     """Print JSON instead of a table."""
 
     def run(self) -> int:
-        """Tell."""
+        """Print the progress."""
         found = status(self.run_folder)
         if self.json:
             print(as_json(found))
@@ -43,32 +43,32 @@ class StatusOf:
 
 
 def rows(found: Status) -> list[tuple[str, str]]:
-    """What a person is shown; what is not known is left out."""
-    told: list[tuple[str, str]] = [("state", f"{found.state}{f', {found.process}' if found.process else ''}")]
+    """The rows of the table; what is not known is left out."""
+    table: list[tuple[str, str]] = [("state", f"{found.state}{f', {found.process}' if found.process else ''}")]
     if found.steps:
-        told.append(("step", f"{found.step:,} of {found.steps:,}{f' of {found.stage}' if found.stage else ''}"))
+        table.append(("step", f"{found.step:,} of {found.steps:,}{f' of {found.stage}' if found.stage else ''}"))
     if found.saved_step is not None:
-        told.append(("last checkpoint", f"step {found.saved_step:,}"))
+        table.append(("last checkpoint", f"step {found.saved_step:,}"))
     if found.steps_per_second is not None:
-        told.append(("speed", f"{found.steps_per_second:.1f} it/s"))
+        table.append(("speed", f"{found.steps_per_second:.1f} it/s"))
     if found.seconds_left is not None:
         minutes, seconds = divmod(round(found.seconds_left), 60)
-        told.append(("time left", f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"))
+        table.append(("time left", f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"))
     if found.points:
-        told.append(("points", f"{found.points:,}"))
+        table.append(("points", f"{found.points:,}"))
     if found.loss is not None:
-        told.append(("loss", f"{found.loss:.4f}"))
+        table.append(("loss", f"{found.loss:.4f}"))
     if found.peak_memory_bytes:
-        told.append(("peak memory", f"{found.peak_memory_bytes / 1e6:.0f} MB"))
+        table.append(("peak memory", f"{found.peak_memory_bytes / 1e6:.0f} MB"))
     if found.metrics and found.metrics["psnr"] is not None:
         when = f" after step {found.metrics['step']:,}" if "step" in found.metrics else ""
-        told.append(("PSNR", f"{found.metrics['psnr']:.2f} dB of {found.metrics['views']} views{when}"))
+        table.append(("PSNR", f"{found.metrics['psnr']:.2f} dB of {found.metrics['views']} views{when}"))
     if found.blocks:
         done = sum(block.status == "done" for block in found.blocks)
-        told.append(("blocks", f"{done} of {sum(block.views > 0 for block in found.blocks)} done"))
-        told += [(f"block {block.index}", _where(block)) for block in found.blocks]
-    told += [("skipped", name) for name in found.skipped]
-    return told + [("warning", text) for text in found.warnings]
+        table.append(("blocks", f"{done} of {sum(block.views > 0 for block in found.blocks)} done"))
+        table += [(f"block {block.index}", _where(block)) for block in found.blocks]
+    table += [("skipped", name) for name in found.skipped]
+    return table + [("warning", text) for text in found.warnings]
 
 
 def _where(block: Block) -> str:

@@ -12,7 +12,7 @@ READER_LEFT = 141
 STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
 
 
-def open_closed() -> None:
+def reopen_closed() -> None:
     """Give streams that were closed before the process began (`>&-`) to /dev/null.
 
     Without, printing to them would fail, and the next file that is opened would take their number: what a library
@@ -28,7 +28,7 @@ def open_closed() -> None:
         setattr(sys, name, open(os.devnull, mode))
 
 
-def silence_lost() -> list[str]:
+def silence_lost_streams() -> list[str]:
     """Give the output streams that take nothing any more to /dev/null, so that Python ends without a word of its own.
 
     Returns:

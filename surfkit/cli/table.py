@@ -6,13 +6,13 @@ import sys
 from collections.abc import Sequence
 
 
-def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], alarming: Sequence[int] = ()) -> None:
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], errors: Sequence[int] = ()) -> None:
     """Print rows under a head: coloured and fitted to a terminal, else aligned text with one line per row.
 
     Args:
         head: Names of the columns.
         rows: Texts, as many in each row as in the head.
-        alarming: Positions of the rows shown in red.
+        errors: Positions of the rows shown in red.
     """
     if sys.stdout.isatty():
         from rich.console import Console
@@ -21,7 +21,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], alarming: Se
 
         table = Table(*head, box=None, header_style="bold", padding=(0, 2, 0, 0))
         for i, row in enumerate(rows):
-            table.add_row(*map(Text, row), style="red" if i in alarming else None)
+            table.add_row(*map(Text, row), style="red" if i in errors else None)
         Console().print(table)
         return
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]

@@ -30,7 +30,7 @@ from surfkit.train.material import CacheSettings
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
 BLOCKS_ONLY = re.compile(r"--(tune\.|assign\.|min-views|context)|(tune\.|assign:)")
-"""Words that say something of blocks alone."""
+"""Arguments that apply to blocks only."""
 
 
 def named_recipe() -> str:
@@ -41,63 +41,64 @@ def named_recipe() -> str:
 
 @dataclass(frozen=True)
 class Train:
-    """Reconstruct a surface from photographs with known cameras.
+    """Train a model, and make its mesh, from photographs with known cameras.
 
-    An interrupted run goes on when the same command is given again, and a finished one when --steps is raised. Any part
-    of the recipe can be swapped with `field:NAME`, such as `primitive:gaussian3d` or `pretrain.densify:none`; `surfkit
-    components` lists the names. Exits 1 when memory, disk or finite numbers give out, 2 for words and data to put
-    right, 130 when interrupted.
+    An interrupted run continues when the same command is given again, and a finished run when --steps is raised. Any
+    component of the recipe can be replaced with `field:NAME`, such as `primitive:gaussian3d` or
+    `pretrain.densify:none`; `surfkit components` lists the names. Exit status: 1 when the run is out of memory or disk
+    or on NaN or Inf, 2 for wrong arguments or data, 130 when interrupted.
     """
 
     recipe: Annotated[Recipe, chosen_recipe]
-    """What to do."""
+    """What is trained and how: all settings, and the components."""
 
     data: Path | None = None
     """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another
-    layout. By default the bundled example, a farm photographed from a kite."""
+    layout. Default: the bundled example, a farm photographed from a kite."""
 
     out: Path | None = None
-    """Run folder; runs/DATA-RECIPE by default."""
+    """Run folder. Default: runs/DATA-RECIPE."""
 
     steps: int | None = None
-    """Length of the run. Every schedule of the recipe is scaled along, so that a short run is a small whole run. Raised
-    later, the run goes on under the schedules of the new length."""
+    """Optimisation steps. Every schedule of the recipe is scaled by the same factor, so that a short run goes through
+    all phases. When this is raised later, the run continues with the schedules of the new length."""
 
     reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
     """How the data set is read."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for training and rendering."""
 
     executor: Annotated[Executor, choice(Executor)] = Inline()
-    """Who tunes the blocks, where the recipe cuts the scene into some; `executor:pool` takes several at a time,
-    `executor:ray` and `executor:slurm` those of other machines."""
+    """Where the blocks are trained, if the recipe divides the scene into blocks: `executor:pool` trains several at the
+    same time on this machine, `executor:ray` and `executor:slurm` use other machines."""
 
     checkpoint_every: int = CHECKPOINT_EVERY
-    """Steps between checkpoints, of which the last two are kept; there is also one at an interruption."""
+    """Steps between checkpoints. The last two are kept; an interruption writes one, too."""
 
     pictures_every: int | None = None
-    """Steps between pictures of up to three held-out photographs, in progress/ of the run folder; a fifth of the run by
-    default, 0 for none."""
+    """Steps between renders of up to three held-out photographs, written to progress/ in the run folder. Default: a
+    fifth of the run; 0 for none."""
 
     tensorboard: bool = False
-    """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder;
-    every block and every refinement has a folder of its own there."""
+    """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder, with one
+    subfolder for each block and each refinement."""
 
     cache: str = "auto"
-    """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto takes half of what is free. The result
-    does not depend on it. When memory gives out, it is lowered by itself."""
+    """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto is half of the free memory. It does
+    not change the result. When the run is out of memory, it is lowered automatically."""
 
     resized_copies: bool = False
-    """Keep photographs that do not fit into the cache on disk too, decoded and reduced, in DATA/resized: worth its
-    space when large photographs are used much smaller. The result does not depend on it."""
+    """Also keep photographs that do not fit into the cache on disk, decoded and resized, in DATA/resized. It saves time
+    when large photographs are used at a much smaller size. It does not change the result."""
 
     prepare: bool = True
-    """Make depth maps by itself where the recipe wants some and the data set has none, once: they are kept in
-    $SURFKIT_CACHE, or ~/.cache/surfkit."""
+    """Estimate depth maps automatically if the recipe uses them and the data set has none. They are kept in
+    $SURFKIT_CACHE, or ~/.cache/surfkit, for later runs."""
 
     prepare_cache: str = "20GB"
-    """Disk for such depth maps, of all data sets together; those longest unused are deleted when there are more."""
+    """Disk space for these depth maps, of all data sets together; when they take more, the least recently used are
+    deleted."""
 
     folder: tyro.conf.Suppress[str] = ""
 
@@ -111,14 +112,14 @@ class Train:
             raise BadInput(f"--pictures-every {self.pictures_every}: give 0 (none) or more steps")
         if self.recipe.partition is None and (idle := [word for word in ARGV.get() if BLOCKS_ONLY.match(word)]):
             raise BadInput(
-                f"{idle[0]}: the recipe cuts the scene into no blocks, so this has nothing to do; add "
+                f"{idle[0]}: the recipe does not divide the scene into blocks, so this has no effect; add "
                 "partition:contracted-grid, or leave it out"
             )
         if not self.folder:  # the words of the command line are only known while it is parsed
             object.__setattr__(self, "folder", named_recipe())
 
     def run(self) -> None:
-        """Train, and show what came out."""
+        """Train, and print the results."""
         data = self.reading.of(self._data())
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)

@@ -27,47 +27,46 @@ from surfkit.train.material import CacheSettings
 
 @dataclass(frozen=True)
 class Tune:
-    """Tune one block of a run to its end, from where it stands.
+    """Train one block of a run to its end, from its last checkpoint.
 
-    `surfkit train` does this for all blocks, several at a time with another executor than `inline`. By hand it serves
-    to share the work among machines that see the same folder: then give the `surfkit train` command once more, to merge
-    them.
+    `surfkit train` does this for all blocks. Use this command to divide the blocks between machines that share the run
+    folder; then give the `surfkit train` command again to merge the blocks.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder of the run, with its blocks planned."""
+    """Run folder whose coarse model is finished and whose blocks are planned."""
 
     block: Annotated[int, tyro.conf.Positional, tyro.conf.arg(metavar="BLOCK")]
     """Number of the block, counted from 0."""
 
     device: Device = "auto"
-    """Where to compute."""
+    """Device for training and rendering."""
 
     cache: str = "auto"
-    """Memory for photographs, masks and depth priors, such as 4GB; auto takes half of what is free."""
+    """Memory for photographs, masks and depth priors, such as 4GB; auto is half of the free memory."""
 
     resized_copies: bool = False
-    """Keep photographs that do not fit into the cache on disk too, at the size they are used."""
+    """Also keep photographs that do not fit into the cache on disk, at the size at which they are used."""
 
     checkpoint_every: int = CHECKPOINT_EVERY
     """Steps between checkpoints."""
 
     patience: float = 0.0
-    """Seconds to wait for another process that works on the block, before this one gives up."""
+    """Seconds to wait while another process trains the block, before this one stops with an error."""
 
     tensorboard: bool = False
     """Also write losses, points and memory for TensorBoard, to tensorboard/block-NNN in the run folder."""
 
     def run(self) -> int:
-        """Tune; the exit status is that of `surfkit train`."""
+        """Train the block; the exit status is that of `surfkit train`."""
         run, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
         if not path.exists():
             raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
         record = read_json(path, Record)
         plan, steps = record.plan, run.recipe.pretrain.steps
         if record.coarse_steps != steps:
-            told = f"{path} is for a coarse model of {record.coarse_steps} steps, not {steps}"
-            raise BadInput(f"{told}; give the surfkit train command again")
+            message = f"{path} is for a coarse model of {record.coarse_steps} steps, not {steps}"
+            raise BadInput(f"{message}; give the surfkit train command again")
         if not 0 <= self.block < len(plan.blocks):
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:

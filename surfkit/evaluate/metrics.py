@@ -18,12 +18,14 @@ def read_metrics(out: Path) -> dict[str, Any]:
     path = out / "metrics.json"
     found = read_json(path, dict[str, Any])
     images = found.get("images")
-    sound = isinstance(images, dict) and isinstance(images.get("per_image"), dict)
-    sound = sound and all(_is_number(found.get(name)) for name in ("steps", "seconds", "cpu_seconds"))
-    sound = sound and "points" in found and (found["points"] is None or _is_number(found["points"]))
-    sound = sound and all(images.get(name, "") is None or _is_number(images.get(name)) for name in ("psnr", "ssim"))
-    sound = sound and all(not found.get(name) or _is_number(found[name]) for name in ("peak_memory_bytes", "fps"))
-    if not sound:
+    is_valid = isinstance(images, dict) and isinstance(images.get("per_image"), dict)
+    is_valid = is_valid and all(_is_number(found.get(name)) for name in ("steps", "seconds", "cpu_seconds"))
+    is_valid = is_valid and "points" in found and (found["points"] is None or _is_number(found["points"]))
+    is_valid = is_valid and all(
+        images.get(name, "") is None or _is_number(images.get(name)) for name in ("psnr", "ssim")
+    )
+    is_valid = is_valid and all(not found.get(name) or _is_number(found[name]) for name in ("peak_memory_bytes", "fps"))
+    if not is_valid:
         raise BadInput(f"{path}: damaged; delete it, and the surfkit train command of the run measures again")
     return found
 

@@ -1,4 +1,8 @@
-"""Pictures of a mesh, without a graphics card: a z-buffer, and light from beside the eye."""
+"""Pictures of a mesh without a GPU: a z-buffer, and light from above the left shoulder.
+
+Our own and not Open3D's ray casting: `surfkit train` draws these pictures, also where Open3D is not installed or does
+not load (it needs libusb-1.0).
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ class Block:
     """One block.
 
     Attributes:
-        index: Counted from 0.
+        index: ViewCounts from 0.
         views: Names of the views it is tuned on; empty if it stays as it is in the coarse model.
         cameras: How many of them stand inside.
         points: Of the coarse model that it owns.

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.chart import COLORS, Line
+from surfkit.evaluate.geometry.chart import Line
 from surfkit.run import journal
 
 What = Literal["points", "loss", "memory"]
@@ -72,9 +72,9 @@ def lines(outs: tuple[Path, ...], what: What, place: Place | None = None) -> lis
     if not outs:
         raise BadInput("curves: name one or more run folders")
     found = []
-    for at, out in enumerate(outs):
+    for out in outs:
         steps, values = curve(out, what, place)
-        found.append(Line(out.resolve().name, steps, values, COLORS[at % len(COLORS)]))
+        found.append(Line(out.resolve().name, steps, values))
     return found
 
 

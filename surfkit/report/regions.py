@@ -18,7 +18,7 @@ from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.parts import by_seams, by_views, measure_parts
 from surfkit.evaluate.images.seams import Seams
-from surfkit.evaluate.images.seen import Counted, Depths, count_views
+from surfkit.evaluate.images.view_counts import Depths, ViewCounts, count_views
 from surfkit.mesh.depths import mesh_depth
 from surfkit.mesh.picture import depth_of
 from surfkit.partition.borders import border_places
@@ -141,14 +141,14 @@ def measure_zones(scene: Scene, draw: Draw, zones: Zones, depths: Depths, seams:
     zones.refuse_too_many(scene)
     wanted = tuple(sorted(set(zones.seen)))
 
-    def near(sight: Counted) -> Tensor:
+    def near(sight: ViewCounts) -> Tensor:
         flat = sight.places.reshape(-1, 3)
         known = torch.isfinite(flat[:, 0])
         found = torch.zeros(len(flat), dtype=torch.bool)
         found[known] = torch.from_numpy(seams.near(flat[known].numpy()))
         return found.reshape(sight.counts.shape)
 
-    def parts(sight: Counted) -> dict[str, Tensor]:
+    def parts(sight: ViewCounts) -> dict[str, Tensor]:
         return by_views(wanted)(sight) | ({} if seams is None else by_seams(near)(sight))
 
     found = measure_parts(

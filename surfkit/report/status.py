@@ -28,7 +28,7 @@ class Block:
     """Where one block stands.
 
     Attributes:
-        index: Counted from 0.
+        index: ViewCounts from 0.
         views: It is tuned on; 0 for one that stays as it is.
         status: planned, running, done or failed, as last heard of.
         step: Done.

@@ -13,8 +13,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.memory import peak_memory_bytes
-from surfkit.evaluate.images.along import Along
 from surfkit.evaluate.images.measure import Draw
+from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
@@ -125,7 +125,11 @@ def optimise(job: Job, state: StageState | None) -> StageState:
     stage, primitive = run.stage, run.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
-    along = Along(run.out / "progress", job.scene.held_out) if job.intervals.pictures and job.scene.held_out else None
+    along = (
+        ProgressPictures(run.out / "progress", job.scene.held_out)
+        if job.intervals.pictures and job.scene.held_out
+        else None
+    )
 
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(run.recipe.seed)
@@ -160,7 +164,7 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         state = state or last_good(run, begin)
 
 
-def take_steps(job: Job, trainer: Trainer, state: StageState, along: Along | None) -> StageState:
+def take_steps(job: Job, trainer: Trainer, state: StageState, along: ProgressPictures | None) -> StageState:
     """Take the steps that are left, and write checkpoints and pictures on the way."""
     run, intervals, meter = job.run, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields
@@ -21,16 +22,20 @@ if TYPE_CHECKING:
     from surfkit.scene.scene import View
 
 
-def check_method(method: Method, data: Data, folder: Path) -> None:
+def check_method(method: Method, data: Data | None = None, folder: Path | None = None) -> None:
     """A method returns a sound mesh, sound splats or maps of the right shapes; the same from the same seed, also when
     it is interrupted after its second step or piece of progress and called again; and, called again when it has
     finished, at once. Its `uses` are fields of recipes, and its `length` follows a change of scale.
 
     Args:
         method: To check.
-        data: A small data set, such as `surfkit.testing.synthetic.write_colmap` makes.
-        folder: Empty; gets what the method writes.
+        data: A small data set; a synthetic one if None.
+        folder: Empty; gets what the method writes. A temporary one if None.
     """
+    if data is None or folder is None:
+        with tempfile.TemporaryDirectory() as temporary:
+            check_method(method, data or _small_data(Path(temporary, "data")), folder or Path(temporary, "runs"))
+        return
     from surfkit.recipe import Recipe
 
     name, known = type(method).__name__, [field.name for field in fields(Recipe)]
@@ -53,6 +58,15 @@ def check_method(method: Method, data: Data, folder: Path) -> None:
         again = _made(method, data, folder / "second")
     assert not seen.steps, f"{name} made {seen.steps} steps when it was called again after it had finished"
     _check_same(f"{name} gives another result when it is called again after it has finished", first, again, data)
+
+
+def _small_data(folder: Path) -> Data:
+    from surfkit.readers.data import Data
+    from surfkit.testing.synthetic import Flight, photograph, write_colmap
+
+    folder.mkdir(parents=True)
+    write_colmap(folder, photograph(Flight(views=8, width=40, height=30, points=150)))
+    return Data(folder)
 
 
 class _Listener:

@@ -39,8 +39,11 @@ def scene(tmp_path_factory):
         ),
         (["table:model", "--data", "d", "--seeds", "0"], "--seeds 0: give 1 or more"),
         (["table:model", "--data", "d", "--steps", "0"], "--steps 0: give 1 to 100000000"),
-        (["table:model", "--data", "d", "--tau", "1"], "--tau 1: it belongs to the truth; name that with --gt"),
-        (["table:model", "--data", "d", "--gt", "t", "--tau", "0"], "--tau 0: it is a length, so it must be above 0"),
+        (["table:model", "--data", "d", "--tau", "1"], "--tau 1: it needs --gt; add --gt, or leave it out"),
+        (
+            ["table:model", "--data", "d", "--gt", "t", "--tau", "0"],
+            "--tau 0: it is a length, so it must be more than 0",
+        ),
         (["table:model", "--data", "d"], "d: no such folder; "),
         (["table:model", "--data", "d", "--scale", "0.5"], "--scale 0.5: it divides the size"),
     ],
@@ -76,7 +79,7 @@ def test_a_real_table_interrupted_and_continued(scene, monkeypatch, tmp_path, ca
         patch.setattr(optimise, "Display", Interrupting)
         assert main([*command, *stop]) == 130
     said = capsys.readouterr().err
-    assert "stopped after step 2 of 4" in said and "stopped keeps what is finished; the same command goes on" in said
+    assert "stopped after step 2 of 4" in said and "stopped keeps what is finished; give the same command again" in said
     assert main([*command, *stop]) == 0
     assert "going on after step 2 of 4" in capsys.readouterr().err
     assert main(command) == 0

@@ -92,7 +92,7 @@ def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, monkeypatch, cap
     assert len(maps(farm)) == 4 and all(".png." in name for name in maps(farm))
     capsys.readouterr()
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0
-    assert "2 of 6 photographs have their depth already" in capsys.readouterr().err
+    assert "2 of 6 photographs have depth maps already" in capsys.readouterr().err
     assert maps(farm) == whole
 
 

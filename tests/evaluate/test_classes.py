@@ -18,7 +18,7 @@ from surfkit.evaluate.geometry.sightings import near_edges, sightings
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.evaluate.geometry.terrain import terrain
 from surfkit.evaluate.geometry.transform import apply
-from surfkit.evaluate.geometry.upright import upward
+from surfkit.evaluate.geometry.up_direction import up_direction
 from surfkit.evaluate.images.seams import Seams
 from surfkit.export.ply import read_vertices
 from surfkit.scene.camera import Camera
@@ -168,11 +168,13 @@ def test_up_of_flights_and_walks():
         np.column_stack([np.arange(9.0), np.zeros((9, 2))]),
     )
     for views in (one_way, walk):
-        found = upward(None, views, FRAME, np.eye(4))
+        found = up_direction(None, views, FRAME, np.eye(4))
         assert np.allclose(found.direction, [0, 0, 1]) and found.source == "cameras"
     line = looking([(down, east)] * 9, np.column_stack([np.arange(9.0), np.zeros((9, 2))]))
-    assert upward(None, line, FRAME, np.eye(4)).source == "z, as the cameras do not tell"
-    assert upward(None, line, Frame(np.zeros(3), 1.0, crs="EPSG:32632"), np.eye(4)).source == "georeferenced frame"
+    assert up_direction(None, line, FRAME, np.eye(4)).source == "z, as the cameras do not tell"
+    assert (
+        up_direction(None, line, Frame(np.zeros(3), 1.0, crs="EPSG:32632"), np.eye(4)).source == "georeferenced frame"
+    )
 
 
 def test_a_hill_is_ground_and_a_table_is_not():

@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
 from surfkit.evaluate.geometry.visibility import visible, visible_counts
-from surfkit.evaluate.geometry.volume import Enough, visible_crop
+from surfkit.evaluate.geometry.volume import CropSettings, visible_crop
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import Crop, read_crop, within, write_crop
 from surfkit.scene.scene import Frame, View
@@ -173,7 +173,7 @@ def test_the_volume_ends_where_the_views_do():
     cellar = ground[np.abs(ground).max(1) < 5] - [0, 0, 8]  # under the ground, where nothing sees it
     views = [overhead(x, 0, 10) for x in (-2, -1, 0, 1, 2)]
     crop, seen = visible_crop(
-        np.concatenate([ground, cellar]), views, Frame(np.zeros(3), 1.0), np.eye(4), Enough(1.0, "z", 2.0, 0.25)
+        np.concatenate([ground, cellar]), views, Frame(np.zeros(3), 1.0), np.eye(4), CropSettings(1.0, "z", 2.0, 0.25)
     )
     across, along = 2 * 10 * 160 / 200 - 4, 2 * 10 * 120 / 200  # what all five see
     assert crop.area == pytest.approx(across * along, rel=0.1)
@@ -182,7 +182,9 @@ def test_the_volume_ends_where_the_views_do():
     shift = np.eye(4)
     shift[:3, :3] *= 2
     shift[:3, 3] = [100, 0, 7]
-    moved, _ = visible_crop(ground * 2 + [100, 0, 7], views, Frame(np.zeros(3), 1.0), shift, Enough(1.0, "z", 4.0, 0.5))
+    moved, _ = visible_crop(
+        ground * 2 + [100, 0, 7], views, Frame(np.zeros(3), 1.0), shift, CropSettings(1.0, "z", 4.0, 0.5)
+    )
     assert np.abs(moved.polygon.mean(0) - [100, 0]).max() < 2 and moved.area == pytest.approx(4 * crop.area, rel=0.05)
     with pytest.raises(BadInput, match="seen by 5 or more of 5 views.*give --transform"):
-        visible_crop(ground + [500, 0, 0], views, Frame(np.zeros(3), 1.0), np.eye(4), Enough(1.0, "z", 2.0, 0.25))
+        visible_crop(ground + [500, 0, 0], views, Frame(np.zeros(3), 1.0), np.eye(4), CropSettings(1.0, "z", 2.0, 0.25))

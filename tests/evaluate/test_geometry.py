@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry import repetition as measurement
 from surfkit.evaluate.geometry.comparison import Comparison, compare
-from surfkit.evaluate.geometry.errors import coloured
+from surfkit.evaluate.geometry.errors import error_colors
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.repetition import cloud_side
 from surfkit.evaluate.geometry.scores import shares
@@ -184,7 +184,7 @@ def test_without_views_the_volume_must_be_given():
 
 
 def test_colours_tell_right_from_wrong():
-    colors = coloured(np.array([0, 0.999, 1.01, 9]), 1.0).astype(int)
+    colors = error_colors(np.array([0, 0.999, 1.01, 9]), 1.0).astype(int)
     assert colors[0, 2] > colors[0, 0] and colors[1, 2] > 2 * colors[1, 0]  # blue
     assert colors[2, 0] > 2 * colors[2, 2] and colors[3, 0] > colors[3, 1]  # orange, dark red
 

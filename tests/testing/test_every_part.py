@@ -23,6 +23,8 @@ CANNOT = ("needs the package", "surfkit was installed without")
 """What errors say of parts that this machine cannot use."""
 ELSEWHERE = {
     "executor:ray": "tests/test_ray.py has a cluster for it",
+    "method:splats": "tests/test_pipeline.py and most others train with it",
+    "method:stereo": "tests/method/test_method.py makes the depth maps for it",
     "depth-estimator:depth-anything-v2": "tests/depth/test_depth_anything.py has weights for it",
 }
 

@@ -17,7 +17,7 @@ class Ceiling(Prune):
     """Where the limit is, in the scene's local frame, whose extent is 1."""
 
     axis: Literal["x", "y", "z"] = "z"
-    """Along which axis heights are measured."""
+    """ProgressPictures which axis heights are measured."""
 
     drop: Literal["above", "below"] = "above"
     """Which side goes."""

@@ -10,18 +10,18 @@ import numpy as np
 from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.geometry.classes import Classes, Group
 from surfkit.evaluate.geometry.comparison import Outcome
-from surfkit.evaluate.geometry.errors import LONGEST_PX, coloured, seen_by, write_plan, write_row
+from surfkit.evaluate.geometry.errors import LONGEST_PX, draw_from_view, error_colors, write_plan, write_row
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.geometry.visibility import pictured
+from surfkit.evaluate.geometry.visibility import project
 from surfkit.scene.scene import Frame, View
 
 OTHERS = np.array([232, 232, 232], np.uint8)
 """Colour of points of other classes."""
-STANDING = {("surface", "facade"), ("edges", "near"), ("edges", "away")}
+DRAWN_FROM_VIEWS = {("surface", "facade"), ("edges", "near"), ("edges", "away")}
 """Classes that are drawn as a training view sees them: from above they are lines."""
-LOOKS = 8
+CANDIDATE_VIEWS = 8
 """Training views of which the one with the most points of a class is drawn."""
-FEW = 20_000
+CHOOSING_POINTS = 20_000
 """Points that decide which."""
 
 
@@ -38,24 +38,24 @@ def write_classes(
         frame: Of the views.
     """
     draw, tau = outcome.draws[0], outcome.tau
-    colors = [coloured(d, tau) for d in (draw.distances.to_truth, draw.distances.to_reconstruction)]
+    colors = [error_colors(d, tau) for d in (draw.distances.to_truth, draw.distances.to_reconstruction)]
     for group in classes.groups:
         for number, name in enumerate(group.classes):
             chosen = group.ours == number, group.truth == number
             if not (chosen[0].any() or chosen[1].any()):
                 continue
-            captions = [f"{what}: {_said(group, name)}" for what in ("reconstruction", "truth")]
+            captions = [f"{what}: {_caption(group, name)}" for what in ("reconstruction", "truth")]
             shown = [np.where(which[:, None], color, OTHERS) for which, color in zip(chosen, colors, strict=True)]
             path = out / f"class-{group.name}-{name.replace(' ', '-')}.png"
             parts = list(zip(captions, (draw.reconstruction, draw.truth), shown, strict=True))
-            if (group.name, name) in STANDING and views and frame is not None:
+            if (group.name, name) in DRAWN_FROM_VIEWS and views and frame is not None:
                 _write_view(path, parts, outcome, chosen, (views, frame))
             else:
                 write_plan(path, parts, outcome.crop, classes.up.axis, tau)
             emit(FileWritten(path, "geometry"))
 
 
-def _said(group: Group, name: str) -> str:
+def _caption(group: Group, name: str) -> str:
     """What a class is, under a picture."""
     texts = {
         "surface": name,
@@ -78,10 +78,10 @@ def _write_view(
     matrix = outcome.draws[0].alignment.matrix
     back, gap = np.linalg.inv(matrix), outcome.tau / scale_of(matrix)
     points = parts[1][1][chosen[1]] if chosen[1].any() else parts[0][1][chosen[0]]
-    few = apply(back, points[:: max(1, len(points) // FEW)])
-    count = min(LOOKS, len(views))
+    few = apply(back, points[:: max(1, len(points) // CHOOSING_POINTS)])
+    count = min(CANDIDATE_VIEWS, len(views))
     some = [views[(2 * i + 1) * len(views) // (2 * count)].camera.sized(LONGEST_PX) for i in range(count)]
-    camera = max(some, key=lambda one: len(pictured(few, one, frame.input_pose(one.world_to_camera))[0]))
+    camera = max(some, key=lambda one: len(project(few, one, frame.input_pose(one.world_to_camera))[0]))
     pose = frame.input_pose(camera.world_to_camera)
-    images = [seen_by(camera, pose, apply(back, cloud), colors, gap) for _, cloud, colors in parts]
+    images = [draw_from_view(camera, pose, apply(back, cloud), colors, gap) for _, cloud, colors in parts]
     write_row(path, [caption for caption, _, _ in parts], images)

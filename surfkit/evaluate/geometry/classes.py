@@ -16,7 +16,7 @@ from surfkit.evaluate.geometry.sightings import Sightings, sightings
 from surfkit.evaluate.geometry.terrain import Terrain, terrain
 from surfkit.evaluate.geometry.thinning import thin
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.geometry.upright import Up, upward
+from surfkit.evaluate.geometry.up_direction import Up, up_direction
 from surfkit.evaluate.images.seams import Seams
 from surfkit.scene.scene import Frame, View
 
@@ -24,7 +24,7 @@ REACH = 5.0
 """Multiples of tau within which a point of the reconstruction has the class of the nearest point of the truth."""
 FOR_VIEWS = 400_000
 """Points of the truth that views are counted for, about; larger clouds are thinned to that, and the nearest counts."""
-UPRIGHT = 0.5
+LEVEL_COSINE = 0.5
 """Cosine between up and a normal, above which a surface is a roof or ground: up to 60 degrees steep."""
 NONE = -1
 """Class of a point that belongs to none."""
@@ -103,7 +103,7 @@ def classify(
     partner = np.full(len(draw.reconstruction), NONE)
     partner[near] = nearest_rows(tree(draw.truth), draw.reconstruction[near])
     far = np.flatnonzero(~near)
-    up = upward(settings.up, views, frame, draw.alignment.matrix)
+    up = up_direction(settings.up, views, frame, draw.alignment.matrix)
     surface, ground = _surfaces(outcome, up, partner, far, np.random.default_rng(settings.seed))
     groups = [surface]
     if frame is not None and len(views):
@@ -113,7 +113,7 @@ def classify(
     return Classes(tuple(groups), up, ground, seams)
 
 
-def _handed_on(truth: np.ndarray, own: np.ndarray, partner: np.ndarray, far: np.ndarray) -> np.ndarray:
+def _reconstruction_classes(truth: np.ndarray, own: np.ndarray, partner: np.ndarray, far: np.ndarray) -> np.ndarray:
     """(n,) int8 classes of the reconstruction, from those of the truth, and its own where it is far from that."""
     found = truth[partner]  # of the last row where there is no partner; put right below
     found[far] = own
@@ -126,14 +126,14 @@ def _surfaces(
     draw = outcome.draws[0]
     ours, theirs = outcome.sides
     matrix = draw.alignment.matrix
-    level = np.abs(normals_at(theirs, draw.truth, draw.truth, random) @ up.direction) > UPRIGHT
+    level = np.abs(normals_at(theirs, draw.truth, draw.truth, random) @ up.direction) > LEVEL_COSINE
     ground = terrain(draw.truth[level], up.turn, outcome.tau) if level.any() else None
     places = draw.reconstruction[far]
     back = np.linalg.inv(matrix)
     normals = normals_at(ours, apply(back, places), apply(back, draw.reconstruction), random)
-    own_level = np.abs(normals @ (matrix[:3, :3] / scale_of(matrix)).T @ up.direction) > UPRIGHT
+    own_level = np.abs(normals @ (matrix[:3, :3] / scale_of(matrix)).T @ up.direction) > LEVEL_COSINE
     truth, own = _named(draw.truth, level, ground), _named(places, own_level, ground)
-    return Group("surface", SURFACES, _handed_on(truth, own, partner, far), truth), ground
+    return Group("surface", SURFACES, _reconstruction_classes(truth, own, partner, far), truth), ground
 
 
 def _named(points: np.ndarray, level: np.ndarray, ground: Terrain | None) -> np.ndarray:
@@ -166,9 +166,9 @@ def _by_views(
         return np.where(of.seen == 0, NONE, np.where(near, 0, 1)).astype(np.int8)
 
     groups = []
-    for name, classes, told in (("views", VIEWS, by_number), ("edges", EDGES, by_edge)):
-        truth, own = map(told, found)
-        groups.append(Group(name, classes, _handed_on(truth, own, partner, far), truth))
+    for name, classes, class_of in (("views", VIEWS, by_number), ("edges", EDGES, by_edge)):
+        truth, own = map(class_of, found)
+        groups.append(Group(name, classes, _reconstruction_classes(truth, own, partner, far), truth))
     return groups
 
 

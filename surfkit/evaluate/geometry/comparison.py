@@ -1,4 +1,4 @@
-"""A reconstruction against the truth: sampled, aligned, cropped, thinned and compared, several times over."""
+"""Comparison of a reconstruction with ground truth: sample, align, crop, thin and compare, several times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from surfkit.evaluate.geometry.repetition import LEAST, Draw, Measurement, Side,
 from surfkit.evaluate.geometry.scores import spacing, tree
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.transform import read_transform, scale_of
-from surfkit.evaluate.geometry.volume import Enough, said, visible_crop
+from surfkit.evaluate.geometry.volume import CropSettings, extent_text, visible_crop
 from surfkit.scene.crop import Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
@@ -24,7 +24,7 @@ AUTO_TAU = 1.5
 OFF, FAR_OFF = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
 RESIZED = 0.02
-"""Change of size by ICP above which it is told."""
+"""Change of scale by ICP above which a warning is printed."""
 SHORTEST, FURTHEST = 1e-7, 1e4
 """Lengths that can be meant, as shares of the diagonal of the truth."""
 MOST_DRAWS = 1000
@@ -36,59 +36,61 @@ WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
 
 @dataclass(frozen=True)
 class Comparison:
-    """How a reconstruction is compared with the truth."""
+    """How a reconstruction is compared with ground truth."""
 
     transform: Path | None = None
-    """File with the 4 x 4 matrix that takes the reconstruction's frame to the truth's: four rows of text as in Tanks
-    and Temples (SCENE_trans.txt), or JSON. ICP starts from it; the identity if left out."""
+    """File with the 4 x 4 matrix from the reconstruction's frame to the frame of the ground truth: four rows of text as
+    in Tanks and Temples (SCENE_trans.txt), or JSON. ICP starts from it. Default: the identity."""
 
     crop: str = "auto"
-    """Volume to compare in: a JSON file of Tanks and Temples, `auto` for where enough training views really see the
-    truth, or `none`."""
+    """Volume in which the two are compared: a JSON file in the format of Tanks and Temples, `auto` for the volume of
+    the ground truth that enough training views see (--visible), or `none`."""
 
     tau: float | None = None
-    """Distance below which a point counts as right, in units of the truth; 1.5 times the mean distance between
-    neighbouring points of a cloud if left out. A mesh as truth needs it."""
+    """Distance threshold: a nearer point counts as correct. In units of the ground truth. Default: 1.5 times the mean
+    distance between neighbouring points of the ground truth cloud; required when the ground truth is a mesh."""
 
     voxel: float | None = None
-    """Thin a cloud of truth to one point for each voxel of this edge first. Left out, clouds are taken as they are, and
-    those of more than 4 million points thinned to that."""
+    """Voxel size: first reduce a ground truth cloud to one point per voxel. Default: only clouds of more than 4 million
+    points are reduced, to about 4 million."""
 
     samples: int | None = None
-    """Points drawn from a mesh. Left out, as many as it has vertices and faces, and for a coarse one enough to lie no
-    further apart than 0.7 times tau."""
+    """Number of points sampled on a mesh. Default: the number of its vertices and faces, and for a coarse mesh enough
+    that neighbours are at most 0.7 times tau apart."""
 
     draws: int = 3
-    """Times that the whole measurement is repeated with other random points, for the error bars."""
+    """Number of repetitions of the whole measurement with other random points, for standard deviations."""
 
     align: Align = "similarity"
-    """What ICP may change for the figures that count: place and size, place, or nothing. All three are written."""
+    """What ICP may change for the reported values: rotation, translation and scale (similarity), rotation and
+    translation (rigid), or nothing (none). metrics.json has the values of all three."""
 
     visible: float = 0.05
-    """Share of the training views that must see a point for it to lie in the volume of `--crop auto`."""
+    """Share of the training views, 0 to 1, that must see a point for it to be in the volume of `--crop auto`."""
 
     radius: float | None = None
-    """Of the alpha shape around the visible ground, in units of the truth; 2 % of the diagonal if left out."""
+    """Radius of the alpha shape around the visible ground, in units of the ground truth. Default: 2 % of the
+    diagonal."""
 
     up: Axis | None = None
-    """Axis of the truth's frame that stands on the ground. Left out, z for the crop volume and the plan; for the
-    classes, z of a georeferenced frame, else the direction in which the cameras are held level."""
+    """Vertical axis of the frame of the ground truth. Default: z for the crop volume and the plan; for the classes, z
+    of a georeferenced frame, otherwise the vertical direction that the cameras suggest."""
 
     classes: bool = True
-    """Also tell precision, recall and F1 apart: roofs, facades, ground; places that 0-1, 2, 3-5, 6 or more training
-    views see; near edges of the depth and away from them; near borders of blocks (--seams)."""
+    """Also compute precision, recall and F1 for classes of points: roofs, facades, ground; seen by 0-1, 2, 3-5, 6 or
+    more training views; near depth edges and away from them; near block borders (--seams)."""
 
     far: float | None = None
-    """Distances above this do not count in the chamfer distance of DTU; 20 times --tau if left out."""
+    """Largest distance that counts in the chamfer distance of DTU. Default: 20 times --tau."""
 
     seed: int = 0
-    """Of all random draws."""
+    """Random seed."""
 
     def __post_init__(self) -> None:
         for name in ("tau", "voxel", "radius", "far"):
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
-                raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0")
+                raise BadInput(f"--{name} {value:g}: it is a length, so it must be more than 0")
         if self.seed < 0:
             raise BadInput(f"--seed {self.seed}: give 0 or more")
         if not 1 <= self.draws <= MOST_DRAWS:
@@ -96,7 +98,7 @@ class Comparison:
         if self.samples is not None and self.samples < LEAST:
             raise BadInput(f"--samples {self.samples}: give {LEAST} or more points")
         if not 0 < self.visible <= 1:
-            raise BadInput(f"--visible {self.visible:g}: it is a share of the views, above 0 and at most 1")
+            raise BadInput(f"--visible {self.visible:g}: it is a share of the views: more than 0, at most 1")
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Outcome:
         tau: Threshold.
         matrix: (4, 4) that alignment began with.
         crop: Volume, or None for all of space.
-        seen: Points of the truth that enough views see; None where the crop volume was given.
+        seen: Number of points of the ground truth that enough views see; None where the crop volume was given.
         voxel: By which the truth was thinned first, or None.
         sides: The reconstruction and the truth, which the points were drawn from.
     """
@@ -147,7 +149,7 @@ def compare(
     matrix = np.eye(4) if settings.transform is None else read_transform(settings.transform)
     refuse_sizes(settings, truth)
     theirs, tau = truth_side(truth, settings)
-    ours = sided(reconstruction, None, settings.samples, tau / scale_of(matrix))
+    ours = make_side(reconstruction, None, settings.samples, tau / scale_of(matrix))
     first = theirs.points(np.random.default_rng(settings.seed))
     refuse_few(first, truth.path)
     crop, seen = volume(first, settings, views, frame, (matrix, tau))
@@ -156,7 +158,7 @@ def compare(
     for number in range(settings.draws):
         measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
         if number == 0:
-            measure.refuse_strangers(matrix)
+            measure.refuse_other_frame(matrix)
         found = {way: measure.draw(matrix, way) for way in ((settings.align,) if number else WAYS)}
         others = others or found
         draws.append(usable(found[settings.align], tau, quiet=number > 0))
@@ -170,7 +172,7 @@ def refuse_sizes(settings: Comparison, truth: Surface) -> None:
     """BadInput for lengths that have nothing to do with the size of the truth."""
     ends = [(block.min(0), block.max(0)) for block in truth.blocks() if len(block)]
     if not ends:
-        return  # which is told later
+        return  # an error later reports it
     low, high = np.min([end[0] for end in ends], axis=0), np.max([end[1] for end in ends], axis=0)
     span = float(np.linalg.norm(high - low))
     for name in ("tau", "voxel", "radius", "far"):
@@ -187,18 +189,20 @@ def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
     if truth.faces is not None:
         if settings.tau is None:
             raise BadInput(f"{truth.path}: a mesh has no spacing of points to take the threshold from; give --tau")
-        return sided(truth, None, settings.samples, settings.tau), settings.tau
+        return make_side(truth, None, settings.samples, settings.tau), settings.tau
     found = cloud_side(truth, settings.voxel)
     if settings.tau is not None:
         return found, settings.tau
     refuse_few(found.cloud, truth.path)
     tau = AUTO_TAU * spacing(tree(found.cloud), found.cloud[:: max(1, len(found.cloud) // 1_000_000)])
     if not tau > 0:
-        raise BadInput(f"{truth.path}: all its points lie twice in one place, which gives no threshold; give --tau")
+        raise BadInput(
+            f"{truth.path}: the distance between its neighbouring points is 0, which gives no threshold; give --tau"
+        )
     return found, tau
 
 
-def sided(surface: Surface, voxel: float | None, samples: int | None, tau: float) -> Side:
+def make_side(surface: Surface, voxel: float | None, samples: int | None, tau: float) -> Side:
     """What points are drawn from, whichever the file holds."""
     return cloud_side(surface, voxel) if surface.faces is None else mesh_side(surface, samples, tau)
 
@@ -225,7 +229,7 @@ def volume(
             "--crop auto needs the photographs: name a run folder, give --views with a run folder or a data set, or "
             "give --crop a file of Tanks and Temples, or --crop none"
         )
-    wanted = Enough(settings.visible, settings.up or "z", settings.radius, tau)
+    wanted = CropSettings(settings.visible, settings.up or "z", settings.radius, tau)
     return visible_crop(truth, views, frame, matrix, wanted)
 
 
@@ -242,7 +246,7 @@ def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
     text = (
         f"after alignment half of all points are more than {apart:.3g} apart, {apart / tau:.1f} times tau ({tau:.3g}), "
         f"{left}, and {draw.alignment.matched:.0%} of the points have a partner; the reconstruction spans "
-        f"{said(draw.reconstruction)} then, and the truth {said(draw.truth)}"
+        f"{extent_text(draw.reconstruction)} then, and the truth {extent_text(draw.truth)}"
     )
     if apart > FAR_OFF * tau:
         raise BadInput(f"the truth is in another frame or unit: {text}; give --transform, or a larger --tau")
@@ -252,7 +256,7 @@ def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
 
 
 def warn_of_size(change: float) -> None:
-    """Say if alignment had to change the size by much."""
+    """Warn if alignment had to change the scale much."""
     if abs(change - 1) > RESIZED:
         emit(
             Warned(

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from surfkit.core.files import replacing
-from surfkit.evaluate.geometry.visibility import nearest_rows, pictured, sides
+from surfkit.evaluate.geometry.visibility import nearest_rows, project, sides
 from surfkit.export.ply import write_points
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import PLANES, Axis, Crop
@@ -25,7 +25,7 @@ SHADE, MOST_BEHIND = 0.04, 3.0
 """How dark a neighbour that lies one unit nearer makes a pixel, and the most units that count."""
 
 
-def coloured(distances: np.ndarray, tau: float) -> np.ndarray:
+def error_colors(distances: np.ndarray, tau: float) -> np.ndarray:
     """(n, 3) uint8 of (n,) distances."""
     share = (distances / tau).clip(max=STOPS[-1])
     return np.stack([np.interp(share, STOPS, COLORS[:, i]) for i in range(3)], axis=1).round().astype(np.uint8)
@@ -33,10 +33,12 @@ def coloured(distances: np.ndarray, tau: float) -> np.ndarray:
 
 def write_cloud(path: Path, points: np.ndarray, distances: np.ndarray, tau: float) -> None:
     """Save (n, 3) points coloured by their (n,) distances; positions in float64, as maps need them."""
-    write_points(path, np.asarray(points, np.float64), coloured(distances, tau))
+    write_points(path, np.asarray(points, np.float64), error_colors(distances, tau))
 
 
-def seen_by(camera: Camera, pose: np.ndarray, points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray:
+def draw_from_view(
+    camera: Camera, pose: np.ndarray, points: np.ndarray, colors: np.ndarray, spacing: float
+) -> np.ndarray:
     """(H, W, 3) uint8: points as a camera sees them, each a square as wide as they lie apart; white between them.
 
     Args:
@@ -46,7 +48,7 @@ def seen_by(camera: Camera, pose: np.ndarray, points: np.ndarray, colors: np.nda
         colors: (n, 3) uint8.
         spacing: Between neighbouring points.
     """
-    at, x, y, z = pictured(points, camera, pose)
+    at, x, y, z = project(points, camera, pose)
     focal = max(camera.fx, camera.fy)
     depth, rows = nearest_rows(x, y, z, sides(spacing * focal / z), (camera.height, camera.width))
     return shaded(np.concatenate([colors[at], [PAPER]])[rows], depth, np.maximum(depth / focal, spacing))

@@ -14,7 +14,14 @@ from surfkit.evaluate.geometry.chart import write_chart
 from surfkit.evaluate.geometry.class_pictures import write_classes
 from surfkit.evaluate.geometry.classes import class_figures, classify
 from surfkit.evaluate.geometry.comparison import Comparison, Outcome, compare
-from surfkit.evaluate.geometry.errors import LONGEST_PX, coloured, seen_by, write_cloud, write_plan, write_row
+from surfkit.evaluate.geometry.errors import (
+    LONGEST_PX,
+    draw_from_view,
+    error_colors,
+    write_cloud,
+    write_plan,
+    write_row,
+)
 from surfkit.evaluate.geometry.repetition import Draw
 from surfkit.evaluate.geometry.scores import chamfer, curve, shares
 from surfkit.evaluate.geometry.surface import read_surface
@@ -137,7 +144,7 @@ def _parts(draw: Draw, tau: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
     )
     clouds = (draw.reconstruction, draw.truth)
     distances = (draw.distances.to_truth, draw.distances.to_reconstruction)
-    return [(c, p, coloured(d, tau)) for c, p, d in zip(captions, clouds, distances, strict=True)]
+    return [(c, p, error_colors(d, tau)) for c, p, d in zip(captions, clouds, distances, strict=True)]
 
 
 def write_views(out: Path, outcome: Outcome, views: Sequence[View], frame: Frame) -> None:
@@ -150,7 +157,7 @@ def write_views(out: Path, outcome: Outcome, views: Sequence[View], frame: Frame
         pose = frame.input_pose(camera.world_to_camera)
         gap = tau / scale_of(draw.alignment.matrix)
         parts = _parts(draw, tau)
-        images = [seen_by(camera, pose, apply(back, points), colors, gap) for _, points, colors in parts]
+        images = [draw_from_view(camera, pose, apply(back, points), colors, gap) for _, points, colors in parts]
         path = out / f"view{i}.png"
         write_row(path, [caption for caption, _, _ in parts], images)
         emit(FileWritten(path, "geometry"))

@@ -17,7 +17,7 @@ from surfkit.evaluate.geometry.scores import Distances, nearest, tree
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply
-from surfkit.evaluate.geometry.volume import said
+from surfkit.evaluate.geometry.volume import extent_text
 from surfkit.scene.crop import Crop
 from surfkit.scene.memory import free_bytes
 
@@ -122,7 +122,7 @@ class Measurement:
         self.source = ours.points(draw)
         target = theirs.points(draw)
         self.target = self.cropped(target)
-        self.spans = said(self.source), said(target)
+        self.spans = extent_text(self.source), extent_text(target)
         self.offset = draw.random(3)
         self.targets = cache(self._target)
 
@@ -160,7 +160,7 @@ class Measurement:
             found = Alignment(start, len(near) / len(ours), residual)
         return Draw(ours, theirs, distances, found)
 
-    def refuse_strangers(self, matrix: np.ndarray) -> None:
+    def refuse_other_frame(self, matrix: np.ndarray) -> None:
         """BadInput if the two cannot lie in one frame."""
         moved = self.cropped(apply(matrix, self.source))
         places = f"the reconstruction spans {self.spans[0]}, the truth {self.spans[1]}"

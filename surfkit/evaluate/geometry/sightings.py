@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.evaluate.geometry.visibility import COVER, LONGEST_PX, cloud_depth, not_hidden, pictured
+from surfkit.evaluate.geometry.visibility import COVER, LONGEST_PX, cloud_depth, not_hidden, project
 from surfkit.scene.scene import Frame, View
 
 EDGE = 0.02
@@ -49,7 +49,7 @@ def sightings(
         pose = frame.input_pose(camera.world_to_camera)
         depth, spots = cloud_depth(clouds[0], camera, pose, gap)
         near = near_edges(depth, gap)
-        for of, (at, x, y, z) in zip(found, (spots, pictured(clouds[1], camera, pose)), strict=True):
+        for of, (at, x, y, z) in zip(found, (spots, project(clouds[1], camera, pose)), strict=True):
             seen = not_hidden(depth, (at, x, y, z), gap, camera)
             of.seen[at[seen]] += 1
             of.edges[at[seen & near[y, x]]] += 1

@@ -58,8 +58,8 @@ def visible(points: np.ndarray, camera: Camera, pose: np.ndarray, gap: float) ->
 def cloud_depth(
     points: np.ndarray, camera: Camera, pose: np.ndarray, gap: float
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """(H, W) depth of the nearest point at each pixel, inf where there is none, and what `pictured` says of them."""
-    spots = pictured(points, camera, pose)
+    """(H, W) depth of the nearest point at each pixel, inf where there is none, and what `project` says of them."""
+    spots = project(points, camera, pose)
     _, x, y, z = spots
     side = sides(COVER * gap * max(camera.fx, camera.fy) / z)
     return nearest_rows(x, y, z, side, (camera.height, camera.width))[0], spots
@@ -70,7 +70,7 @@ def not_hidden(depth: np.ndarray, spots: tuple[np.ndarray, ...], gap: float, cam
 
     Args:
         depth: (H, W) of `cloud_depth`, of these points or of others.
-        spots: Of `pictured`.
+        spots: Of `project`.
         gap: Between the points that the map was made of.
         camera: Of the map.
     """
@@ -83,7 +83,7 @@ def sides(cover_px: np.ndarray) -> np.ndarray:
     return SIDES[np.searchsorted(SIDES, cover_px).clip(max=len(SIDES) - 1)]
 
 
-def pictured(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, ...]:
+def project(points: np.ndarray, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, ...]:
     """Rows, columns, lines and depths of the points in the picture."""
     z = points @ pose[2, :3] + pose[2, 3]
     at = np.flatnonzero(z > 0)

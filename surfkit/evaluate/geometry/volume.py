@@ -22,7 +22,7 @@ as holes are filled here."""
 
 
 @dataclass(frozen=True)
-class Enough:
+class CropSettings:
     """What a point must be seen by to count, and what the volume around such points is.
 
     Attributes:
@@ -39,7 +39,7 @@ class Enough:
 
 
 def visible_crop(
-    truth: np.ndarray, views: Sequence[View], frame: Frame, matrix: np.ndarray, enough: Enough
+    truth: np.ndarray, views: Sequence[View], frame: Frame, matrix: np.ndarray, settings: CropSettings
 ) -> tuple[Crop, int]:
     """The volume around the points of the truth that enough views show, and how many points that are.
 
@@ -48,25 +48,25 @@ def visible_crop(
         views: Training views.
         frame: Of the views.
         matrix: (4, 4) from the input frame of the views to that of the truth.
-        enough: What is enough.
+        settings: What counts as visible.
     """
     here = apply(np.linalg.inv(matrix), truth)
     gap = surface_gap(tree(truth), truth[:: max(1, len(truth) // 100_000)]) / scale_of(matrix)
     counts = visible_counts(here, views, frame, gap)
-    least = max(1, math.ceil(enough.share * len(views)))
+    least = max(1, math.ceil(settings.share * len(views)))
     kept = truth[counts >= least]
     if len(kept) < 3:
         raise BadInput(
             f"--crop auto: {len(kept)} of {len(truth)} points of the truth are seen by {least} or more of {len(views)} "
-            f"views (the best one by {counts.max(initial=0)}); the truth spans {said(here)}, for the "
-            f"cameras, and these {said(centres(views, frame))}: lower --visible, or give --transform if "
+            f"views (the best one by {counts.max(initial=0)}); the truth spans {extent_text(here)}, for the "
+            f"cameras, and these {extent_text(centres(views, frame))}: lower --visible, or give --transform if "
             "the truth is in another frame or unit"
         )
-    along = kept[:, "xyz".index(enough.axis)]
-    ground = kept[:, list(PLANES[enough.axis])]
-    radius = enough.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
-    low, high = float(along.min()) - enough.margin, float(along.max()) + enough.margin
-    return Crop(outline(ground, radius), low, high, enough.axis), len(kept)
+    along = kept[:, "xyz".index(settings.axis)]
+    ground = kept[:, list(PLANES[settings.axis])]
+    radius = settings.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
+    low, high = float(along.min()) - settings.margin, float(along.max()) + settings.margin
+    return Crop(outline(ground, radius), low, high, settings.axis), len(kept)
 
 
 def centres(views: Sequence[View], frame: Frame) -> np.ndarray:
@@ -74,6 +74,6 @@ def centres(views: Sequence[View], frame: Frame) -> np.ndarray:
     return frame.to_input(np.stack([view.camera.centre.numpy() for view in views]))
 
 
-def said(points: np.ndarray) -> str:
+def extent_text(points: np.ndarray) -> str:
     """The box of (n, 3) points in a few words."""
     return " x ".join(f"[{low:.6g}, {high:.6g}]" for low, high in zip(points.min(0), points.max(0), strict=True))

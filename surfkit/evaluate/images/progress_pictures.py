@@ -18,7 +18,7 @@ MOST = 3
 """Views that are looked at."""
 
 
-class Along:
+class ProgressPictures:
     """Draws up to three views, evenly chosen, beside their photographs.
 
     Args:

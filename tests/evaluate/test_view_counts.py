@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from surfkit.evaluate.images import seen
+from surfkit.evaluate.images import view_counts
 from surfkit.evaluate.images.parts import by_views, measure_parts
-from surfkit.evaluate.images.seen import Depths, count_views
+from surfkit.evaluate.images.view_counts import Depths, count_views
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
@@ -76,7 +76,7 @@ def test_rendered_depth_that_disagrees_does_not_see():
 def test_batches_do_not_change_what_is_found(monkeypatch):
     depths = Depths(exact_depth, "exact", 0.01, False)
     whole = list(count_views(SCENE.held_out, SCENE.train, depths))
-    monkeypatch.setattr(seen, "BYTES", 1)
+    monkeypatch.setattr(view_counts, "BYTES", 1)
     asked = []
     parts = list(
         count_views(SCENE.held_out, SCENE.train, Depths(lambda v: asked.append(v) or exact_depth(v), "", 0.01, False))
