@@ -14,14 +14,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
 from surfkit.core.files import sweep
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import name_of
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.images.lpips import networks
 from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
 from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
 from surfkit.evaluate.metrics import read_metrics
-from surfkit.execute.base import Inline
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
 from surfkit.raster.api import Maps, Rasterizer
@@ -31,25 +30,15 @@ from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe, complete
 from surfkit.run.context import RunContext
-from surfkit.run.folder import (
-    Run,
-    claim,
-    discard_results,
-    note_metrics,
-    read_data,
-    read_record,
-    refuse_changed,
-    refuse_file,
-    refuse_no_run,
-    refuse_other,
-)
-from surfkit.run.journal import kept
-from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, subject
-from surfkit.run.notes import noted
+from surfkit.run.folder import Run, discard_results, note_metrics, read_data, read_record, refuse_file, refuse_no_run
+from surfkit.run.journal import record_events
+from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, mesh_input
+from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
-from surfkit.run.refine import refine_model, seen_by
-from surfkit.run.stage import Intervals, Job, drawer, drawing, load_state, optimise
-from surfkit.run.start import InitialPoints, priors_of
+from surfkit.run.refine import refine_model, stage_scene
+from surfkit.run.resume import refuse_changed, refuse_other_run, write_run_files
+from surfkit.run.stage import Intervals, StageJob, drawing, load_state, optimise, select_rasterizer
+from surfkit.run.start import InitialPoints, align_priors
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
@@ -105,31 +94,33 @@ def run(
     if intervals.pictures is None:
         intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_unready(run, compute, caches)
-    with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
+    with collect_notes() as notes, locked(out), in_one_line(out), bars(), ExitStack() as use:
         recipe.refuse_unfit()
         sweep(out, out / "blocks")
-        refuse_other(run)
+        refuse_other_run(run)
         scene = read(run.data)
         meter.scene_read()
-        rasterizer, backend = drawer(compute.device)
-        state = load_state(run, scene, repair=True)
+        rasterizer, backend = select_rasterizer(compute.device)
+        state = load_state(run, run.pretrain, scene, repair=True)
         prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         warn_of_no_edits(run)
         warn_of_idle(run, compute)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, state is not None))
-        start = beginning(run, scene, caches, state)
-        claim(run, backend, prints, notes, scene.frame)
-        with kept(out):
+        start = initial_points(run, scene, caches, state)
+        write_run_files(run, backend, prints, notes, scene.frame)
+        with record_events(out):
             if start is not None:
-                discard_results(run)
-                state = optimise(Job(run, scene, rasterizer, intervals, start.given, meter, cloud=start), state)
-                del start  # the memory of its photographs is free for what comes
+                discard_results(run, run.pretrain)
+                job = StageJob(run, run.pretrain, scene, rasterizer, intervals, start.given, meter, cloud=start)
+                state = optimise(job, state)
+                del start, job  # to free the memory of the photographs
+            ctx = RunContext(run, scene, rasterizer, intervals, caches)
             if recipe.partition is not None:
                 state = None  # it is in the folder
-                run, state = tune_blocks(RunContext(run, scene, rasterizer, intervals, caches), compute)
-            run, state = refine_model(RunContext(run, scene, rasterizer, intervals, caches), state)
-            return results(RunContext(run, scene, rasterizer, intervals, caches), state, compute.device, meter)
+                state = tune_blocks(ctx, compute)
+            state = refine_model(ctx, state)
+            return results(ctx, state, compute.device, meter)
 
 
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
@@ -142,11 +133,11 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
         run.recipe.mesh.ready()
 
 
-def beginning(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
-    """Where pretraining begins and what it looks at, also where it goes on; None where it has all its steps."""
+def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
+    """The initial points of pretraining and its photographs, also if it is resumed; None if it has all its steps."""
     if state is not None and state.index >= run.recipe.pretrain.steps:
         return None
-    known = priors_of(run, scene, begun=state is not None)
+    known = align_priors(run, scene, begun=state is not None)
     return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 
 
@@ -165,18 +156,19 @@ def results(ctx: RunContext, state: StageState, device: Device, meter: Meter) ->
 
 def has_cloud(run: Run) -> bool:
     """Whether the points are written, if they can be."""
-    return run.cloud.exists() or (not run.primitive.in_ply and run.cameras.exists())
+    return run.cloud.exists() or (not run.last.primitive.in_ply and run.cameras.exists())
 
 
 def export(run: Run, state: StageState, scene: Scene) -> None:
     """Write the points and the cameras in the frame of the input."""
-    params = run.stage.finished(state)
+    params = run.last.stage.finished(state)
     write_cameras(run.cameras, scene)
     emit(FileWritten(run.cameras, "cameras"))
-    if not run.primitive.in_ply:
-        emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(run.primitive)}"))
+    primitive = run.last.primitive
+    if not primitive.in_ply:
+        emit(Warned(f"no {run.cloud.name}: PLY files of splats have no place for {name_of(primitive)}"))
         return
-    write_splats(run.cloud, run.primitive.table(params).in_input_frame(scene.frame), frame=scene.frame)
+    write_splats(run.cloud, primitive.table(params).in_input_frame(scene.frame), frame=scene.frame)
     emit(FileWritten(run.cloud, "points"))
 
 
@@ -188,7 +180,7 @@ def mesh(ctx: RunContext, state: StageState, device: Device) -> None:
     mesher, out = ctx.run.recipe.mesh, ctx.run.out
     try:
         with with_maps_to_mesh(ctx.run, mesher, ctx.scene, ctx.caches, device) as run:
-            what = subject(run, state, ctx.scene, ctx.rasterizer, cache_bytes("auto"), mesher)
+            what = mesh_input(run, state, ctx.scene, ctx.rasterizer, cache_bytes("auto"), mesher)
             make_mesh(run, mesher, MeshOutput(), what, state.index)
     except BadInput as error:
         emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
@@ -214,7 +206,7 @@ def evaluate(
     """
     sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
     perceptual, lacking = networks(lpips_weights, min(sides)) if sides else ((), None)
-    draw, colors = (drawing(run, state, rasterizer, geometry) for geometry in (True, False))
+    draw, colors = (drawing(run.last, state, rasterizer, geometry) for geometry in (True, False))
     ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
 
     def show(view: View, photo: Tensor, maps: Maps) -> None:
@@ -227,7 +219,7 @@ def evaluate(
             draw,
             timed=colors,
             show=show,
-            correct_color=run.shown.appearance is not None,
+            correct_color=run.color_stage.stage.appearance is not None,
             masks=mask_cache(scene.held_out, ahead),
             networks=perceptual,
         )
@@ -241,7 +233,7 @@ def evaluate(
         **measured,
         "fps": measured["fps"] or frames_per_second(scene.train, colors),
         "points": len(state.points),
-        "steps": sum(replace(run, part=part).stage.steps for part in run.parts[: run.parts.index(run.part) + 1]),
+        "steps": sum(stage.stage.steps for stage in run.stages),
         "seconds": state.seconds,
         "cpu_seconds": state.cpu_seconds,
         "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
@@ -269,37 +261,37 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     """
     run = opened(out)
     scene = read(run.data)
-    state, ahead = None, None
-    for part in reversed(run.parts):
-        run = replace(run, part=part)
-        if (state := load_state(run, seen_by(run, scene))) is not None:
+    state, missing = None, None
+    for stage in reversed(run.stages):
+        if (state := load_state(run, stage, stage_scene(run, stage, scene))) is not None:
             break
-        ahead = part
+        missing = stage
     step, again = state.index if state else 0, "give its surfkit train command again to finish it"
-    if step < run.stage.steps:
-        raise BadInput(f"{out}: the run stopped after step {step} of {run.stage.steps}; {again}")
-    if ahead is not None:
-        raise BadInput(f"{out}: {'not all blocks are tuned' if ahead == 'tune' else f'{ahead} is not begun'}; {again}")
+    if step < stage.stage.steps:
+        raise BadInput(f"{out}: the run stopped after step {step} of {stage.stage.steps}; {again}")
+    if missing is not None:
+        what = "not all blocks are tuned" if missing.name == "tune" else f"{missing.name} is not begun"
+        raise BadInput(f"{out}: {what}; {again}")
     return run, state, scene
 
 
 def warn_of_no_edits(run: Run) -> None:
     """Say which stages cannot add a point, though they are to."""
-    for part in run.parts:
-        run = replace(run, part=part)
-        steps = run.stage.densify.edit_steps(run.stage.steps) if run.stage.densify is not None else None
-        if steps is not None and len(steps) == 0:
+    for at in run.stages:
+        stage = at.stage
+        edits = stage.densify.edits(stage.steps) if stage.densify is not None else None
+        if edits is not None and len(edits) == 0:
             emit(
                 Warned(
-                    f"{run.setting}: no point will be added, as no edit of densify falls within {run.stage.steps:,} "
-                    f"steps; more steps, or a lower {run.setting}.densify.start and every, change that"
+                    f"{at.setting}: no point will be added, as no edit of densify falls within {stage.steps:,} "
+                    f"steps; more steps, or a lower {at.setting}.densify.start and every, change that"
                 )
             )
 
 
 def warn_of_idle(run: Run, compute: Compute) -> None:
     """Say that an executor was chosen for nothing."""
-    if run.recipe.partition is None and compute.workers != Inline():
+    if run.recipe.partition is None and not compute.workers.in_process:
         emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
 
 

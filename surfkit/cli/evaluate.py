@@ -10,18 +10,18 @@ import tyro
 
 from surfkit.cli.result import show, show_geometry
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
-from surfkit.pipeline import drawer, evaluate, load_run, opened
+from surfkit.pipeline import evaluate, load_run, opened
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
-from surfkit.run.notes import noted
-from surfkit.run.stage import drawing
+from surfkit.run.notes import collect_notes
+from surfkit.run.stage import drawing, select_rasterizer
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -71,7 +71,7 @@ class Evaluate:
     def run(self) -> None:
         """Measure, and show what came out."""
         zones = Zones(self.seen, self.seams)
-        with noted(), bars():
+        with collect_notes(), bars():
             if self.gt is not None:
                 return self._geometry(self.gt, zones)
             if (self.views, self.out, self.geometry) != (None, None, Comparison()):
@@ -79,14 +79,14 @@ class Evaluate:
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
-            with held(self.target), full_disk_in_one_line(self.target):
+            with locked(self.target), full_disk_in_one_line(self.target):
                 run, state, scene = load_run(self.target)
                 zones.refuse_too_many(scene)
                 seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
-                rasterizer, _ = drawer(self.device)
+                rasterizer, _ = select_rasterizer(self.device)
                 metrics = evaluate(run, state, scene, rasterizer, lpips_weights=self.lpips_weights)
                 if zones != Zones():
-                    draw = drawing(run, state, rasterizer)
+                    draw = drawing(run.last, state, rasterizer)
                     found = measure_zones(scene, draw, zones, rendered_depths(draw), seams)
                     metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
                 show(run, metrics)
@@ -124,9 +124,9 @@ class Evaluate:
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
-        with held(self.target), full_disk_in_one_line(self.target):
+        with locked(self.target), full_disk_in_one_line(self.target):
             run, state, scene = load_run(self.target)
-            draw = drawing(run, state, drawer(self.device)[0])
+            draw = drawing(run.last, state, select_rasterizer(self.device)[0])
             depths = rendered_depths(draw) if truth is None else true_depths(truth, scene.frame, matrix)
             seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
             return measure_zones(scene, draw, zones, depths, seams)

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.export.ply import write_splats
 from surfkit.pipeline import load_run
 from surfkit.run.folder import refuse_no_run
@@ -33,7 +33,7 @@ class Export:
     def run(self) -> None:
         """Write the file."""
         refuse_no_run(self.run_folder)
-        with held(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
+        with locked(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
             self._write()
 
     def _write(self) -> None:
@@ -43,7 +43,7 @@ class Export:
             raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
         if path.exists() and self.out is not None and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        table = run.primitive.table(run.stage.finished(state)).in_input_frame(scene.frame)
+        table = run.last.primitive.table(run.last.stage.finished(state)).in_input_frame(scene.frame)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
         print(f"wrote {len(state.points):,} points to {path}")

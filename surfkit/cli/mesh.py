@@ -12,18 +12,19 @@ from surfkit.cli.recipes import ARGV
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
-from surfkit.pipeline import drawer, load_run
+from surfkit.pipeline import load_run
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
-from surfkit.run.journal import kept
-from surfkit.run.mesh import MeshOutput, make_mesh, subject
-from surfkit.run.notes import noted
+from surfkit.run.journal import record_events
+from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
+from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps_to_mesh
+from surfkit.run.stage import select_rasterizer
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -82,18 +83,18 @@ class MeshOf:
         caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
         caches.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
-        with noted(), bars():
+        with collect_notes(), bars():
             run, state, scene = load_run(self.run_folder)
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
-            rasterizer, _ = drawer(self.device)
+            rasterizer, _ = select_rasterizer(self.device)
             with (
-                held(run.out),
+                locked(run.out),
                 full_disk_in_one_line(run.out),
                 with_maps_to_mesh(run, self.mesh, scene, caches, self.device) as run,
-                kept(run.out),
+                record_events(run.out),
             ):
-                what = subject(run, state, scene, rasterizer, budget, self.mesh)
+                what = mesh_input(run, state, scene, rasterizer, budget, self.mesh)
                 record = make_mesh(run, self.mesh, self.delivery, what, state.index)
         show(run, record)
 

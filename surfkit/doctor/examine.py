@@ -30,7 +30,6 @@ from surfkit.readers.read import RANDOM_POINTS, check_size, model_folder
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.scene.groups import apart
-from surfkit.start.plain import SparseStart
 from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
@@ -343,9 +342,9 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
     if gathered.masks:
         told.append(f"ignore what is black in the masks of {len(gathered.masks)} photographs")
-    start = f"{len(gathered.capture.xyz):,} sparse" if len(gathered.capture.xyz) else f"{RANDOM_POINTS:,} random"
-    if not isinstance(recipe.start, SparseStart):
-        pixels = sum(math.prod(data.size(*look.size)) for look in known.values() if look.size)
-        count = recipe.start.expected(len(gathered.capture.xyz), pixels)
+    sparse = len(gathered.capture.xyz) or RANDOM_POINTS
+    count = recipe.start.expected(sparse, sum(math.prod(data.size(*look.size)) for look in known.values() if look.size))
+    start = f"{sparse:,} {'sparse' if len(gathered.capture.xyz) else 'random'}"
+    if count != sparse:
         start = f"about {count:,} ({name_of(recipe.start)})"
     return (*told, f"start from {start} points")

@@ -12,9 +12,9 @@ import numpy as np
 
 from surfkit.core.check import BadInput, collecting
 from surfkit.core.events import Warned
-from surfkit.core.registry import components, hookimpl, plugins
+from surfkit.core.registry import hookimpl, name_of, plugins
 from surfkit.doctor.finding import Finding, from_errors
-from surfkit.readers.capture import Capture, Reader, Shot
+from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.masks import FOLDER, MARKS, find_masks
 from surfkit.readers.read import captured, reader_of
@@ -100,7 +100,7 @@ def _read(data: Data, faults: list[BadInput]) -> tuple[str | None, Capture]:
     layout = None
     try:
         reader = reader_of(data)
-        layout = next((name for name, cls in components(Reader).items() if isinstance(reader, cls)), None)
+        layout = name_of(reader)
         capture = captured(data, reader)
     except BadInput as error:
         faults.append(error)

@@ -1,4 +1,4 @@
-"""From a trained run to its mesh: made, cleaned, written in the frame of the input, and looked at."""
+"""From a trained run to its mesh: made, cleaned, written in the frame of the input, and rendered."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class MeshOutput:
         return None if self.crop is None else read_crop(self.crop)
 
 
-def subject(
+def mesh_input(
     run: Run,
     state: StageState,
     scene: Scene,
@@ -92,10 +92,10 @@ def subject(
     budget_bytes: int,
     mesher: Mesher | None = None,
 ) -> MeshInput:
-    """The splats of a state, to be meshed; with the depth priors if `mesher` needs them and there are any."""
-    stage = run.stage
-    splats = run.primitive.activate(stage.finished(state), state.sh_degree)
-    draws = drawn_by(run.primitive, rasterizer)
+    """What a mesher is given: the splats of the final state; depth priors if it needs them and there are any."""
+    stage = run.last.stage
+    splats = run.last.primitive.activate(stage.finished(state), state.sh_degree)
+    draws = drawn_by(run.last.primitive, rasterizer)
     masks = mask_cache(scene.train, budget_bytes // 4)
     wanted = mesher is not None and mesher.needs_prior
     priors = read_priors(run.data, scene, budget_bytes // 4) if wanted else None
@@ -136,7 +136,7 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     facts = dict(raw.facts)
     del raw
-    forget(run)
+    delete_meshes(run)
     written = list(write_files(run, mesh, delivery, subject))
     record = {
         "mesher": mesher,
@@ -149,7 +149,7 @@ def make_mesh(run: Run, mesher: Mesher, delivery: MeshOutput, subject: MeshInput
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }
-    look(run, mesh, subject)
+    write_pictures(run, mesh, subject)
     write_json(run.mesh_record, record)
     emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
@@ -160,8 +160,8 @@ def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
     return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
 
 
-def forget(run: Run) -> None:
-    """Delete what an earlier mesh left; its record goes first."""
+def delete_meshes(run: Run) -> None:
+    """Delete the files of an earlier mesh; its record first."""
     run.mesh_record.unlink(missing_ok=True)
     for path in (*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*"), *run.mesh_pictures.rglob("*.png")):
         path.unlink(missing_ok=True)
@@ -180,8 +180,8 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
                 yield path
 
 
-def look(run: Run, mesh: Mesh, subject: MeshInput) -> None:
-    """Write pictures of the mesh: beside the renders of a few training views, and from above."""
+def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
+    """Write pictures of the mesh: from above, and beside the renders of a few training views."""
     count = min(SHOWN, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]

@@ -47,6 +47,10 @@ class Start(Component):
             BadInput: There is nothing to begin from.
         """
 
+    def limited(self, points: int) -> Start:
+        """The same start with at most so many points, where it decides how many there are; else the start itself."""
+        return self
+
     @abstractmethod
     def expected(self, sparse: int, pixels: int) -> int:
         """About how many points there will be, for a forecast.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -49,6 +49,10 @@ class RandomStart(Start):
         low, high = corners.amin(0), corners.amax(0)
         drawn = torch.rand(self.points, 3, generator=known.generator)
         return Cloud(low + (high - low) * drawn, torch.full((self.points, 3), GREY, dtype=torch.uint8))
+
+    def limited(self, points: int) -> RandomStart:
+        """See `Start.limited`."""
+        return replace(self, points=min(self.points, points))
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""

@@ -78,6 +78,11 @@ class StereoStart(Start):
             return known.scene.cloud
         return filled(stereo, known, self)
 
+    def limited(self, points: int) -> StereoStart:
+        """See `Start.limited`."""
+        count = self.points if self.points == "auto" else min(self.points, points)
+        return replace(self, points=count, most=min(self.most, points))
+
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
         if self.points != "auto":
