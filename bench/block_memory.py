@@ -32,72 +32,70 @@ MAKE = """
 import sys, torch
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks.schedule import Record, extract_views
+from surfkit.blocks.block import Record, load_blocks
+from surfkit.blocks.schedule import extract_views
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.run.folder import Run
-from surfkit.run.stage import Every
-from surfkit.partition import QuantileGrid, Sight
+from surfkit.run.stage import Intervals
+from surfkit.partition import CoarseModel, QuantileGrid
 from surfkit.partition.plan import Plan, blocks_of
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Stage, StageState
 from surfkit.train.views import Order
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 
 out, across, steps = Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 data = Data(Path(sys.argv[1]), test_every=0)
 stage = Stage(steps=steps, densify=None, sh_every=1)
 recipe = replace(recipes()["2dgs"], pretrain=stage, tune=stage, partition=QuantileGrid((across, across)), mesh=None)
-this, scene = Run(out, recipe, data, "pretrain"), read(data)
+this, scene = Run(out, recipe, data), read(data)
 params = recipe.primitive.init(scene.cloud, torch.Generator().manual_seed(0))
 state = StageState(Points.fresh(params), Order(len(scene.train)), torch.Generator(), index=steps, sh_degree=3)
-checkpoint.save(this.checkpoint, state)
-sight = Sight(recipe.primitive.activate(params, 0), scene.train, select("cpu")[0], stage.near)
+checkpoint.save(this.pretrain.checkpoint, state)
+sight = CoarseModel(recipe.primitive.activate(params, 0), scene.train, select("cpu")[0], stage.near)
 cells = recipe.partition.cells(sight)
 inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
 write_json(out / "recipe.json", recipe)
 write_json(out / "run.json", {"data": data})
 plan = Plan(cells, blocks_of(sight, cells, inside, inside))
 write_json(out / "blocks" / "plan.json", Record(steps, plan))
-extract_views(Site(this, scene, sight.rasterizer, Every(), Store()), plan)
+extract_views(RunContext(this, scene, sight.rasterizer, Intervals(), CacheSettings()), load_blocks(this, plan))
 """
 
 FINISH = """
 import sys
 from dataclasses import replace
 from pathlib import Path
-from surfkit.blocks.schedule import Record
-from surfkit.core.codec import read_json
-from surfkit.execute.state import write_state
+from surfkit.blocks.block import load_blocks, read_plan
 from surfkit.pipeline import opened
 from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.read import read
 from surfkit.train import checkpoint
-from surfkit.train.material import Store
+from surfkit.train.material import CacheSettings
 from surfkit.train.stage import StageState
 from surfkit.train.views import Order
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 from surfkit.blocks.worker import Start
-from surfkit.run.context import Site
+from surfkit.run.context import RunContext
 import torch
 
 this = opened(Path(sys.argv[1]))
-plan = read_json(this.out / "blocks" / "plan.json", Record).plan
-site = Site(this, read(this.data), select("cpu")[0], Every(pictures=0), Store("100MB"))
-for block in plan.blocks:
-    views = tuple(view for view in site.scene.train if view.name in set(block.views))
-    begun = Start(site, plan, block.index, views)()
+ctx = RunContext(this, read(this.data), select("cpu")[0], Intervals(pictures=0), CacheSettings("100MB"))
+for block in load_blocks(this, read_plan(this).plan):
+    views = tuple(view for view in ctx.scene.train if view.name in set(block.planned.views))
+    begun = Start(ctx, block, views)()
     steps = this.recipe.tune.steps
     points, degree = Points.fresh(begun.params), begun.sh_degree
     state = StageState(points, Order(len(views)), torch.Generator(), index=steps, sh_degree=degree)
-    checkpoint.save(site.block(block.index).checkpoint, state)
-    write_state(site.place(block.index), status="done", step=steps, steps=steps)
+    checkpoint.save(block.stage.checkpoint, state)
+    block.write(status="done", step=steps, steps=steps)
 """
 
 
@@ -157,21 +155,21 @@ def measured(tiles: int, points: int, steps: int) -> dict[str, float]:
 
 def merge(out: Path) -> None:
     """Put the blocks of a run together, as its driver does."""
-    from surfkit.blocks.schedule import Record, put_together
-    from surfkit.blocks.worker import coarse_model
-    from surfkit.core.codec import read_json
+    from surfkit.blocks.block import load_blocks, read_plan
+    from surfkit.blocks.merge import merge_blocks
+    from surfkit.blocks.worker import open_coarse_model
     from surfkit.pipeline import opened
     from surfkit.raster.select import select
     from surfkit.readers import extract
-    from surfkit.run.context import RunContext, views_file
+    from surfkit.run.context import RunContext
     from surfkit.run.stage import Intervals
     from surfkit.train.material import CacheSettings
 
     run = opened(out)
-    scene = extract.load(views_file(out, 0)).scene  # the driver has read the data set for other reasons
+    blocks = load_blocks(run, read_plan(run).plan)
+    scene = extract.load(blocks[0].views_file).scene  # the driver has read the data set for other reasons
     ctx = RunContext(run, scene, select("cpu")[0], Intervals(pictures=0), CacheSettings("100MB"))
-    plan = read_json(out / "blocks" / "plan.json", Record).plan
-    assert put_together(ctx, plan, coarse_model(run))
+    assert merge_blocks(ctx, blocks, open_coarse_model(run))
 
 
 def main() -> None:

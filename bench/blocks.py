@@ -18,8 +18,9 @@ import torch
 from machine import save
 from trained import EXAMPLE
 
-from surfkit.blocks.schedule import Compute, extract_views, planned, work
-from surfkit.blocks.worker import coarse_model
+from surfkit.blocks.block import load_blocks
+from surfkit.blocks.schedule import Compute, extract_views, load_or_make_plan, train_waiting
+from surfkit.blocks.worker import open_coarse_model
 from surfkit.cli.recipes import recipes
 from surfkit.core.codec import write_json
 from surfkit.core.tree import evolve
@@ -57,10 +58,10 @@ def tuning(steps: int) -> dict[str, float]:
             ctx = RunContext(
                 Run(out, recipe, data), read(data), select("cpu")[0], Intervals(pictures=0), CacheSettings("1GB")
             )
-            blocks = planned(ctx, coarse_model(ctx.run)).plan
+            blocks = load_blocks(ctx.run, load_or_make_plan(ctx, open_coarse_model(ctx.run)).plan)
             extract_views(ctx, blocks)
             began = time.perf_counter()
-            work(ctx, blocks, Compute("cpu", Pool(workers=workers, threads=1)))
+            train_waiting(ctx, list(blocks), Compute("cpu", Pool(workers=workers, threads=1)), len(blocks))
             seconds[f"{workers} workers s"] = time.perf_counter() - began
     return seconds | {"faster with 2": seconds["1 workers s"] / seconds["2 workers s"]}
 

@@ -22,7 +22,7 @@ from trained import EXAMPLE
 
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
-from surfkit.pipeline import Every, run, with_steps
+from surfkit.pipeline import Intervals, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.train.material import CacheSettings
@@ -35,7 +35,7 @@ def measure(data: Data, steps: int, budget: str) -> dict[str, object]:
     cache, _, copies = budget.partition("+")
     with tempfile.TemporaryDirectory() as folder:
         recipe, caches = with_steps(recipes()["2dgs"], steps), CacheSettings(cache, bool(copies))
-        metrics = run(recipe, data, Path(folder), Compute("cpu"), Every(pictures=0), caches)
+        metrics = run(recipe, data, Path(folder), Compute("cpu"), Intervals(pictures=0), caches)
         points = (Path(folder) / "point_cloud.ply").read_bytes()
     found = {name: metrics[name] for name in TIMES}
     return found | {"psnr": metrics["images"]["psnr"], "points": hashlib.blake2b(points, digest_size=8).hexdigest()}

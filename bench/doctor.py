@@ -23,14 +23,14 @@ from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, forecast
 from surfkit.pipeline import run, with_steps
 from surfkit.readers.data import Data
-from surfkit.run.stage import Every
+from surfkit.run.stage import Intervals
 
 
 def real(data: Data, steps: int, answer: multiprocessing.Queue) -> None:
     """One run, in a process of its own, so that its peak of memory is its own too."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, Compute("cpu"), Every(pictures=0))
+        metrics = run(with_steps(recipes()["2dgs"], steps), data, folder, Compute("cpu"), Intervals(pictures=0))
         disk = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     answer.put({**{key: metrics[key] for key in ("points", "seconds")}, "memory": peak_memory_bytes(), "disk": disk})
 

@@ -15,14 +15,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
 from surfkit.core.files import sweep
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import name_of
 from surfkit.core.schedule import rescale
 from surfkit.evaluate.images.lpips import networks
 from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
 from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
 from surfkit.evaluate.metrics import read_metrics
-from surfkit.execute.base import Inline
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
 from surfkit.method.base import Reconstruction, SplatModel
@@ -33,20 +32,9 @@ from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.context import RunContext
-from surfkit.run.folder import (
-    Run,
-    claim,
-    discard_results,
-    note_metrics,
-    read_data,
-    read_record,
-    refuse_changed,
-    refuse_file,
-    refuse_no_run,
-    refuse_other,
-)
-from surfkit.run.journal import kept
-from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, subject
+from surfkit.run.folder import Run, discard_results, note_metrics, read_data, read_record, refuse_file, refuse_no_run
+from surfkit.run.journal import record_events
+from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.run.method import (
     is_begun,
     method_input,
@@ -57,11 +45,12 @@ from surfkit.run.method import (
     result_path,
     with_drawing,
 )
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
-from surfkit.run.refine import refine_model, seen_by
-from surfkit.run.stage import Intervals, Job, drawer, load_state, optimise
-from surfkit.run.start import InitialPoints, priors_of
+from surfkit.run.refine import refine_model, stage_scene
+from surfkit.run.resume import refuse_changed, refuse_other_run, write_run_files
+from surfkit.run.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
+from surfkit.run.start import InitialPoints, align_priors
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
@@ -125,14 +114,14 @@ def run(
     if intervals.pictures is None:
         intervals = replace(intervals, pictures=max(1, recipe.pretrain.steps // 5))
     refuse_unready(run, compute, caches)
-    with noted() as notes, held(out), in_one_line(out), bars(), ExitStack() as use:
+    with collect_notes() as notes, locked(out), in_one_line(out), bars(), ExitStack() as use:
         recipe.refuse_unfit()
         sweep(out, out / "blocks")
-        refuse_other(run)
+        refuse_other_run(run)
         scene = read(run.data)
         meter.scene_read()
-        rasterizer, backend = drawer(compute.device)
-        state = load_state(run, scene, repair=True) if recipe.has_stages else None
+        rasterizer, backend = select_rasterizer(compute.device)
+        state = load_state(run, run.pretrain, scene, repair=True) if recipe.has_stages else None
         prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
         warn_of_gaps(scene, state)
         warn_of_no_edits(run)
@@ -144,8 +133,8 @@ def run(
         given = use.enter_context(method_input(ctx, compute.device, stages))
         recipe.method.refuse_unfit(given)
         stages.begin()
-        claim(run, backend, prints, notes, scene.frame)
-        with kept(out):
+        write_run_files(run, backend, prints, notes, scene.frame)
+        with record_events(out):
             return results(ctx, reconstruct(run, given), compute.device, meter)
 
 
@@ -166,22 +155,23 @@ class Stages:
     def begin(self) -> None:
         """Find where the first stage begins, or BadInput; nothing is written."""
         if self.ctx.run.recipe.has_stages:
-            self.start = beginning(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
+            self.start = initial_points(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
 
     def __call__(self) -> Reconstruction:
         """Optimise what is not finished yet."""
         ctx, run, state, start = self.ctx, self.ctx.run, self.state, self.start
         self.start = self.state = None
         if start is not None:
-            discard_results(run)
-            job = Job(run, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, cloud=start)
+            discard_results(run, run.pretrain)
+            job = StageJob(
+                run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, cloud=start
+            )
             state = optimise(job, state)
-            del start, job  # the memory of its photographs is free for what comes
+            del start, job  # to free the memory of the photographs
         if run.recipe.partition is not None:
             state = None  # it is in the folder
-            run, state = tune_blocks(ctx, self.compute)
-        run, state = refine_model(replace(ctx, run=run), state)
-        return optimised(run, state)
+            state = tune_blocks(ctx, self.compute)
+        return optimised(run, refine_model(ctx, state))
 
 
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
@@ -195,11 +185,11 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
         run.recipe.mesh.ready()
 
 
-def beginning(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
-    """Where pretraining begins and what it looks at, also where it goes on; None where it has all its steps."""
+def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
+    """The initial points of pretraining and its photographs, also if it is resumed; None if it has all its steps."""
     if state is not None and state.index >= run.recipe.pretrain.steps:
         return None
-    known = priors_of(run, scene, begun=state is not None)
+    known = align_priors(run, scene, begun=state is not None)
     return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 
 
@@ -245,11 +235,11 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
     mesher, out, budget = ctx.run.recipe.mesh, ctx.run.out, cache_bytes("auto")
     try:
         if made.mesh is not None:
-            what = subject(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
+            what = mesh_input(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
             make_mesh(ctx.run, made.mesh, MeshOutput(), what, made.last_steps)
             return
         with with_maps_to_mesh(ctx.run, mesher, ctx.scene, ctx.caches, device) as run:
-            what = subject(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
+            what = mesh_input(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
             make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
     except BadInput as error:
         emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
@@ -336,14 +326,14 @@ def loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstructi
     run = opened(out)
     if run.recipe.has_stages:
         run, state, scene = load_run(out)
-        ctx = RunContext(run, scene, drawer(device)[0], Intervals(), CacheSettings())
+        ctx = RunContext(run, scene, select_rasterizer(device)[0], Intervals(), CacheSettings())
         yield ctx, with_drawing(optimised(run, state), ctx.rasterizer)
         return
     if not result_path(run).exists():
         raise BadInput(
             f"{out}: method:{name_of(run.recipe.method)} has not finished; give its surfkit train command again"
         )
-    ctx = RunContext(run, read(run.data), drawer(device)[0], Intervals(), CacheSettings())
+    ctx = RunContext(run, read(run.data), select_rasterizer(device)[0], Intervals(), CacheSettings())
     with method_input(ctx, device) as given:
         yield ctx, reopened(run, given)
 
@@ -358,37 +348,37 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     if not run.recipe.has_stages:
         raise BadInput(f"{out}: method:{name_of(run.recipe.method)} has no stages, and so no state of an optimisation")
     scene = read(run.data)
-    state, ahead = None, None
-    for part in reversed(run.parts):
-        run = replace(run, part=part)
-        if (state := load_state(run, seen_by(run, scene))) is not None:
+    state, missing = None, None
+    for stage in reversed(run.stages):
+        if (state := load_state(run, stage, stage_scene(run, stage, scene))) is not None:
             break
-        ahead = part
+        missing = stage
     step, again = state.index if state else 0, "give its surfkit train command again to finish it"
-    if step < run.stage.steps:
-        raise BadInput(f"{out}: the run stopped after step {step} of {run.stage.steps}; {again}")
-    if ahead is not None:
-        raise BadInput(f"{out}: {'not all blocks are tuned' if ahead == 'tune' else f'{ahead} is not begun'}; {again}")
+    if step < stage.stage.steps:
+        raise BadInput(f"{out}: the run stopped after step {step} of {stage.stage.steps}; {again}")
+    if missing is not None:
+        what = "not all blocks are tuned" if missing.name == "tune" else f"{missing.name} is not begun"
+        raise BadInput(f"{out}: {what}; {again}")
     return run, state, scene
 
 
 def warn_of_no_edits(run: Run) -> None:
     """Say which stages cannot add a point, though they are to."""
-    for part in run.parts:
-        run = replace(run, part=part)
-        steps = run.stage.densify.edit_steps(run.stage.steps) if run.stage.densify is not None else None
-        if steps is not None and len(steps) == 0:
+    for at in run.stages:
+        stage = at.stage
+        edits = stage.densify.edits(stage.steps) if stage.densify is not None else None
+        if edits is not None and len(edits) == 0:
             emit(
                 Warned(
-                    f"{run.setting}: no point will be added, as no edit of densify falls within {run.stage.steps:,} "
-                    f"steps; more steps, or a lower {run.setting}.densify.start and every, change that"
+                    f"{at.setting}: no point will be added, as no edit of densify falls within {stage.steps:,} "
+                    f"steps; more steps, or a lower {at.setting}.densify.start and every, change that"
                 )
             )
 
 
 def warn_of_idle(run: Run, compute: Compute) -> None:
     """Say that an executor was chosen for nothing."""
-    if run.recipe.partition is None and compute.workers != Inline():
+    if run.recipe.partition is None and not compute.workers.in_process:
         emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
 
 

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -17,29 +17,34 @@ import torch
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, capped, next_fallback
+from surfkit.blocks.block import Block, read_plan
+from surfkit.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, apply_fallback, next_fallback
 from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
+from surfkit.densify import Limited
 from surfkit.densify.adc import ADC
-from surfkit.densify.filters import CountCap
+from surfkit.densify.base import Densify, Step
 from surfkit.execute import Pool
+from surfkit.execute import base as executor
 from surfkit.execute.base import Job, JobResult
 from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare, QuantileGrid
-from surfkit.pipeline import run
+from surfkit.pipeline import opened, run
+from surfkit.primitives.edit import Edit
+from surfkit.primitives.points import Points
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import map_path, write_map, write_record
 from surfkit.readers.depth_prior import alignment
 from surfkit.readers.read import read as read_scene
 from surfkit.recipe import Recipe
-from surfkit.run.folder import Run
 from surfkit.run.stage import Intervals
 from surfkit.scene import memory
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull, Diverged, OutOfMemory
+from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Stage, Trainer
 
 STEPS = 12
@@ -96,7 +101,7 @@ def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
 
     def optimising(job, state):
         def short(self, state):
-            if job.run.block == block and len(state.points) > limit:
+            if job.stage.block == block and len(state.points) > limit:
                 raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
             return step(self, state)
 
@@ -119,11 +124,11 @@ def test_a_block_for_which_memory_is_short_stops_to_grow(undisturbed, data, reci
     said = notes(tmp_path)
     assert [text for text in said if text.startswith("block 0 failed: out of memory")][0].endswith(
         "though photographs are no longer kept in it; it is tried again: photographs are not kept in memory, which "
-        "takes longer and leaves the result as it is"
+        "is slower and does not change the result"
     )
-    assert "block 0: for want of memory: at most 199 points from step 3 on" in said
+    assert "block 0: after running out of memory: at most 199 points from step 3 on" in said
     assert said[-1] == (
-        "block 0 was tuned with less than the recipe says, for want of memory: at most 199 points from step 3 on"
+        "block 0 was tuned with less than the recipe says, as memory ran out: at most 199 points from step 3 on"
     )
     capsys.readouterr()
     main(["status", str(tmp_path)])
@@ -141,7 +146,7 @@ def test_a_block_too_large_since_its_checkpoint_begins_anew(data, recipe, tmp_pa
     assert (state.fallback, state.most_points, state.begun_points) == (START_AGAIN, 199, 199) and points_of(
         tmp_path, 0
     ) <= 199
-    assert state.reduced[1:] == ("at most 390 points from step 4 on", "begun anew, at most 199 points")
+    assert state.reduced[1:] == ("at most 390 points from step 4 on", "started again, at most 199 points")
 
 
 def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, tmp_path, monkeypatch):
@@ -164,10 +169,15 @@ def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, 
 def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Real processes with a real limit: 10 MB for each point, and 3 GB more than the program has."""
     command, out = blocks.job_of, without_block_0(undisturbed, tmp_path / "run")
-    write_state(out / "blocks" / "000", fallback=NO_CACHE, reduced=("photographs not kept in memory",))
+    write_state(
+        out / "blocks" / "000",
+        read_state(out / "blocks" / "000"),
+        fallback=NO_CACHE,
+        reduced=("photographs not kept in memory",),
+    )
 
-    def limited(ctx, plan, index, compute):
-        job = command(ctx, plan, index, compute)
+    def limited(ctx, block, compute):
+        job = command(ctx, block, compute)
         code = (
             "import resource, sys, psutil, torch\nfrom surfkit.cli import main\nimport surfkit.cli.tune\n"
             "from surfkit.train.stage import Trainer\nstep = Trainer.step\n"
@@ -185,41 +195,40 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
     state = read_state(out / "blocks" / "000")
     log = (out / "blocks" / "000" / "log.txt").read_text()
     assert (state.status, state.fallback, state.most_points) == ("done", NO_GROWTH, 199), log
-    assert "block 0: for want of memory: at most 199 points from step 3 on" in notes(out), "a worker's note"
+    assert "block 0: after running out of memory: at most 199 points from step 3 on" in notes(out), "a worker's note"
     assert "are lowered from" not in log, "on its rung there is no cache to lower"
 
 
 def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, recipe, tmp_path, monkeypatch):
     """SIGKILL, and the system counts one more; the first rung leaves the result as it is."""
-    command, kills, out = blocks.job_of, iter([7, 8]), without_block_0(undisturbed, tmp_path / "run")
+    command, kills, out = blocks.job_of, iter([7, 8, 8]), without_block_0(undisturbed, tmp_path / "run")
 
-    def deadly(ctx, plan, index, compute):
-        job = command(ctx, plan, index, compute)
-        first = index == 0 and not read_state(job.folder).error
+    def deadly(ctx, block, compute):
+        job = command(ctx, block, compute)
+        first = block.index == 0 and not read_state(job.folder).error
         return replace(job, command=("-c", "import os; os.kill(os.getpid(), 9)")) if first else job
 
     with monkeypatch.context() as patch:
         patch.setattr(blocks, "job_of", deadly)
-        patch.setattr(blocks, "oom_kills", lambda: next(kills))
+        patch.setattr(executor, "oom_kills", lambda: next(kills))
         run(recipe, data, out, Compute("cpu", Pool(workers=2)), EVERY)
     assert read_state(out / "blocks" / "000").fallback == NO_CACHE and same(out, undisturbed)
-    assert any("ended by SIGKILL while memory ran out on this machine" in text for text in notes(out))
+    assert any("ended by SIGKILL while memory ran out" in text for text in notes(out))
     assert not any("less than the recipe" in text for text in notes(out))
 
 
-@pytest.mark.parametrize(
-    ("why", "kind"),
-    [
-        ("job 7 is OUT_OF_MEMORY in Slurm and has left no result; see x.err", "oom"),
-        ("Ray could not do it: OutOfMemoryError: Task was killed due to the node running low on memory.", "oom"),
-        ("job 7 is NODE_FAIL in Slurm and has left no result; see x.err", "crash"),
-    ],
-)
-def test_clusters_tell_that_memory_gave_out(data, recipe, tmp_path, why, kind):
-    ctx = tuning.RunContext(Run(tmp_path, recipe, data), None, None, EVERY, None)
-    job = Job(0, ctx.place(0), lambda: 0, ())
-    assert blocks.told(ctx, JobResult(job, 70, why)) == f"failed: {why}"
-    assert read_state(ctx.place(0)).kind == kind
+@pytest.mark.parametrize("kind", [None, "oom", "lost", "crash"])
+def test_the_kind_of_a_failure_is_what_the_executor_reports(undisturbed, kind):
+    """Whatever words its reason has."""
+    loaded = opened(undisturbed)
+    plan = read_plan(loaded).plan
+    for why, status in (("an OutOfMemoryError, or OUT_OF_MEMORY", 70), (None, -9)):
+        block = Block(replace(loaded, out=loaded.out / "elsewhere"), plan, 0)
+        told = blocks.record_failure(block, JobResult(Job(0, block.folder, lambda: 0, ()), status, why, kind))
+        assert told.startswith(f"failed: {why}" if why else "was ended by SIGKILL")
+        assert read_state(block.folder).kind == block.state.kind == (kind or "crash")
+        assert block.is_out_of_memory == (kind == "oom")
+    shutil.rmtree(loaded.out / "elsewhere")
 
 
 def test_the_system_counts_whom_it_ends(tmp_path, monkeypatch):
@@ -246,7 +255,41 @@ def test_fallbacks():
     )
     assert next_fallback(BlockState(fallback=NO_GROWTH, most_points=9, begun_points=9), GROWING) is None
     assert next_fallback(BlockState(fallback=START_AGAIN, most_points=9, begun_points=5), GROWING) is None
-    assert capped(GROWING, 50).filters == (CountCap(50),)
+
+
+@dataclass(frozen=True)
+class Splitting(Densify):
+    """Of a package outside this repository: neither a cap nor filters."""
+
+    def edit(self, points: Points, step: Step) -> Edit | None:
+        """Split every point."""
+        return Edit(split=torch.ones(len(points), dtype=torch.bool))
+
+
+def test_after_memory_ran_out_any_densifier_goes_on_with_a_limit(undisturbed, data, recipe, tmp_path):
+    """Not one that has a setting for it alone: it is neither left as it is nor left out."""
+    loaded = opened(undisturbed)
+    for densify, wanted in ((Splitting(), Limited(Splitting(), 300)), (GROWING, GROWING.limited(300)), (None, None)):
+        changed = replace(loaded.recipe, tune=replace(loaded.recipe.tune, densify=densify))
+        block = Block(replace(loaded, out=tmp_path, recipe=changed), read_plan(loaded).plan, 0)
+        assert apply_fallback(block, CacheSettings())[0] == block.stage
+        block.write(fallback=NO_GROWTH, most_points=300)
+        stage, caches = apply_fallback(block, CacheSettings())
+        assert stage.stage.densify == wanted and caches.cache == "0"
+        (block.folder / "state.json").unlink()
+
+
+def test_a_state_of_an_older_version_is_read(tmp_path):
+    write_state(tmp_path, BlockState(), status="done")
+    path = tmp_path / "state.json"
+    older = json.loads(path.read_text())
+    older = {name: value for name, value in older.items() if name not in ("fallback", "reduced")}
+    path.write_text(json.dumps(older | {"rung": 2, "eased": ["at most 9 points"]}))
+    state = read_state(tmp_path)
+    assert (state.status, state.fallback, state.reduced) == ("done", NO_GROWTH, ("at most 9 points",))
+    path.write_text(json.dumps(older | {"rungs": 2}))
+    with pytest.raises(BadInput, match="rungs.*delete it, and the block goes on from its last checkpoint"):
+        read_state(tmp_path)
 
 
 @pytest.mark.parametrize("workers", [None, Pool(workers=2)])
@@ -255,13 +298,13 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     out, limits = without_block_0(undisturbed, tmp_path / "run"), resource.getrlimit(resource.RLIMIT_FSIZE)
     compute = Compute("cpu") if workers is None else Compute("cpu", workers)
     size = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
-    work = blocks.work
+    train = blocks.train_waiting
 
     def limited(*args):
         resource.setrlimit(resource.RLIMIT_FSIZE, (2 * size, limits[1]))  # enough before points multiply twice
-        return work(*args)
+        return train(*args)
 
-    monkeypatch.setattr(blocks, "work", limited)
+    monkeypatch.setattr(blocks, "train_waiting", limited)
     try:
         with pytest.raises(DiskFull, match=r"block \d failed: .*the disk is full .*: free some space, and the same"):
             run(recipe, data, out, compute, EVERY)
@@ -270,7 +313,7 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     last, damage = checkpoint.load_last(out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     assert read_state(out / "blocks" / "000").kind == "disk" and not list(out.rglob(".*.part"))
     assert 0 < last.index < STEPS and damage is None
-    monkeypatch.setattr(blocks, "work", work)
+    monkeypatch.setattr(blocks, "train_waiting", train)
     run(recipe, data, out, Compute("cpu"), EVERY)
     assert same(out, undisturbed)
 
@@ -358,7 +401,7 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 
     def optimising(job, state):
         def spoilt(self, state):
-            if job.run.block == 1 and state.index == 7:
+            if job.stage.block == 1 and state.index == 7:
                 raise Diverged(8, "view_001.png", "the losses are nan")
             return step(self, state)
 
@@ -376,4 +419,4 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
 def test_faults_have_kinds(tmp_path):
     assert Fault("x").kind == "fault" and OutOfMemory("x", "y").kind == "oom" and DiskFull(tmp_path, "x").kind == "disk"
     for kind in ("oom", "nan", "disk", "data", "fault", "crash", "interrupted"):
-        assert write_state(tmp_path, kind=kind) and read_state(tmp_path).kind == kind
+        assert write_state(tmp_path, read_state(tmp_path), kind=kind) and read_state(tmp_path).kind == kind

@@ -18,12 +18,13 @@ from surfkit.appearance.exposure import Exposure
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
+from surfkit.blocks.block import Block
 from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.cli import main
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
 from surfkit.execute import Inline, Pool
-from surfkit.execute.state import read_state, write_state
+from surfkit.execute.state import read_state
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
@@ -87,7 +88,7 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
     stages = map(json.loads, (undisturbed / "events.jsonl").read_text().splitlines())
     assert sum(line["event"] == "StepDone" for line in stages) == STEPS, "blocks have journals of their own"
     loaded, state, _ = load_run(undisturbed)
-    assert loaded.part == "tune" and state.index == STEPS
+    assert loaded.last.name == "tune" and state.index == STEPS
 
 
 def test_merged_points_lie_in_their_block(undisturbed):
@@ -117,16 +118,16 @@ def test_a_pool_comes_to_the_same_bits(undisturbed, data, recipe, tmp_path):
 
 def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Ctrl-C between two steps of the second block; then another executor finishes."""
-    guarded = blocks.guarded
+    train_block = blocks.train_block
 
-    def stopped(ctx, plan, index):
-        if index == 1:
+    def stopped(ctx, block):
+        if block.index == 1:
             ctx = replace(ctx, intervals=Intervals(checkpoint=4, pictures=0))
             monkeypatch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
-        return guarded(ctx, plan, index)
+        return train_block(ctx, block)
 
     with monkeypatch.context() as patch:
-        patch.setattr(blocks, "guarded", stopped)
+        patch.setattr(blocks, "train_block", stopped)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     monkeypatch.undo()
@@ -164,9 +165,9 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
     """The first process of block 0 kills itself in the middle of its steps; the next one goes on."""
     command = blocks.job_of
 
-    def deadly(ctx, plan, index, compute):
-        job = command(ctx, plan, index, compute)
-        if index == 0 and not (tmp_path / "killed").exists():
+    def deadly(ctx, block, compute):
+        job = command(ctx, block, compute)
+        if block.index == 0 and not (tmp_path / "killed").exists():
             code = (
                 "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
@@ -189,7 +190,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
     optimise = tuning.optimise
 
     def failing(job, state):
-        if job.run.out.name == "001":
+        if job.stage.out.name == "001":
             raise Fault("numbers are not finite")
         return optimise(job, state)
 
@@ -303,8 +304,8 @@ def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
     shutil.copytree(undisturbed, tmp_path / "run")
     folder = tmp_path / "run" / "blocks" / "000"
     before = (folder / "state.json").read_bytes()
-    holding = "import sys, time\nfrom pathlib import Path\nfrom surfkit.core.lock import held\n"
-    holding += f"with held(Path({str(folder)!r})):\n    print('held', flush=True)\n    time.sleep(60)"
+    holding = "import sys, time\nfrom pathlib import Path\nfrom surfkit.core.lock import locked\n"
+    holding += f"with locked(Path({str(folder)!r})):\n    print('held', flush=True)\n    time.sleep(60)"
     other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"held\n"
@@ -363,7 +364,7 @@ def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, m
         views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
         wanted = plan.cells.owner(coarse.points.params["means"]) == index
         wanted |= rasterizer.render(splats, views[0].camera, loaded.recipe.pretrain.near).seen
-        begun = tuning.Start(ctx, plan, index, views)()
+        begun = tuning.Start(ctx, Block(loaded, plan, index), views)()
         found = begun.params
         assert begun.sh_degree == coarse.sh_degree == 3
         assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
@@ -405,9 +406,9 @@ def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_pat
     begun = read_state(undisturbed / "blocks" / "000").begun_points
     assert plan.blocks[0].begins == begun > plan.blocks[0].points
     fresh = tuning.RunContext(replace(loaded, out=tmp_path), scene, select("cpu")[0], EVERY, CacheSettings())
-    memory = [blocks.job_of(fresh, plan, 0, Compute("cpu")).memory_bytes]
-    write_state(fresh.place(0), begun_points=begun + 10)
-    memory.append(blocks.job_of(fresh, plan, 0, Compute("cpu")).memory_bytes)
+    memory = [blocks.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes]
+    Block(fresh.run, plan, 0).write(begun_points=begun + 10)
+    memory.append(blocks.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes)
     assert memory[1] - memory[0] == 10 * 3 * foresight.POINT_BYTES, "what it has really begun with counts more"
 
 

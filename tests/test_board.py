@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from surfkit.blocks.display import BlockDisplay, BlockProgress, state_since, table
-from surfkit.blocks.eta import all_left, in_words, pace, seconds_left, so_far
+from surfkit.blocks.display import BlockDisplay, BlockProgress, progress_table, read_state_since
+from surfkit.blocks.eta import describe_progress, seconds_elapsed, seconds_left, steps_per_second, total_seconds_left
 from surfkit.cli.status import rows
-from surfkit.execute.state import BlockState, write_state
+from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.report.status import KNOWN, Block, Status
 from surfkit.train import progress
 
@@ -21,11 +21,11 @@ STATES = {0: RUNNING, 1: DONE, 2: BlockState(), 3: FAILED}
 
 
 def test_time_left_of_a_block():
-    assert (so_far(RUNNING), pace(RUNNING), seconds_left(RUNNING)) == (20.0, 5.0, 34.0)
-    assert in_words(RUNNING) == "step 130/300, 0:20, 0:34 left"
+    assert (seconds_elapsed(RUNNING), steps_per_second(RUNNING), seconds_left(RUNNING)) == (20.0, 5.0, 34.0)
+    assert describe_progress(RUNNING) == "step 130/300, 0:20, 0:34 left"
     early = replace(RUNNING, heard=1001.0)
-    assert pace(early) is None and in_words(early) == "step 130/300, 0:01"
-    assert so_far(FAILED) is None and seconds_left(DONE) is None
+    assert steps_per_second(early) is None and describe_progress(early) == "step 130/300, 0:01"
+    assert seconds_elapsed(FAILED) is None and seconds_left(DONE) is None
 
 
 def test_a_block_that_is_worked_on_no_more():
@@ -38,12 +38,14 @@ def test_a_block_that_is_worked_on_no_more():
 
 def test_time_left_of_all_blocks():
     blocks, rest = list(STATES.values()), (300 - 130) + 300 + (300 - 70)
-    assert all_left(blocks, 300) == pytest.approx(rest / 5)
-    assert all_left(blocks, 300, at_once=2) == pytest.approx(rest / 10)
-    assert all_left(blocks, 300, at_once=9) == pytest.approx(rest / 15), "three are left to work on"
-    assert all_left([RUNNING, replace(RUNNING, heard=1001.0)], 300) == pytest.approx(34), "the new one will be as fast"
-    assert all_left([DONE, BlockState()], 300) == pytest.approx(30), "as long as the one before"
-    assert all_left([DONE], 300) is None and all_left([BlockState()], 300) is None
+    assert total_seconds_left(blocks, 300) == pytest.approx(rest / 5)
+    assert total_seconds_left(blocks, 300, at_once=2) == pytest.approx(rest / 10)
+    assert total_seconds_left(blocks, 300, at_once=9) == pytest.approx(rest / 15), "three are left to work on"
+    assert total_seconds_left([RUNNING, replace(RUNNING, heard=1001.0)], 300) == pytest.approx(34), (
+        "the new one will be as fast"
+    )
+    assert total_seconds_left([DONE, BlockState()], 300) == pytest.approx(30), "as long as the one before"
+    assert total_seconds_left([DONE], 300) is None and total_seconds_left([BlockState()], 300) is None
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch):
@@ -59,7 +61,7 @@ def test_lines_where_there_is_no_terminal(monkeypatch):
 def test_a_table_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=110)
     reduced = replace(RUNNING, reduced=("at most 9 points from step 3 on",))
-    console.print(table(BlockProgress(STATES | {2: reduced}, 300, 2)))
+    console.print(progress_table(BlockProgress(STATES | {2: reduced}, 300, 2)))
     text = console.file.getvalue()
     assert "1 of 4 blocks done" in text and "at most 9 points" in text and "numbers" in text
     assert text.count("/300") == 3 and "silent for" in text, "heard of long ago"
@@ -74,10 +76,13 @@ def test_a_larger_display_gets_the_sum(monkeypatch):
 
 
 def test_what_an_earlier_attempt_has_left_is_not_told(tmp_path):
-    write_state(tmp_path, status="running", step=5)
+    write_state(tmp_path, read_state(tmp_path), status="running", step=5)
     now = time.time()
-    assert state_since(tmp_path, now - 60).status == "running" and state_since(tmp_path, now + 60).status == "planned"
-    write_state(tmp_path, status="done")
-    assert state_since(tmp_path, now + 60).status == "done"
+    assert (
+        read_state_since(tmp_path, now - 60).status == "running"
+        and read_state_since(tmp_path, now + 60).status == "planned"
+    )
+    write_state(tmp_path, read_state(tmp_path), status="done")
+    assert read_state_since(tmp_path, now + 60).status == "done"
     (tmp_path / "state.json").write_text("{")
-    assert state_since(tmp_path, 0) == BlockState()
+    assert read_state_since(tmp_path, 0) == BlockState()

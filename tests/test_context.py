@@ -11,7 +11,8 @@ from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F4
 from surfkit.blocks import forecast as foresight
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
-from surfkit.blocks.forecast import BlockPoints, begun, memory_of, need
+from surfkit.blocks.block import Block
+from surfkit.blocks.forecast import BlockPoints, forecast, initial_points, point_memory
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -19,7 +20,7 @@ from surfkit.core.codec import read_json
 from surfkit.densify import ADC
 from surfkit.densify.trim import Trim
 from surfkit.execute import Pool
-from surfkit.execute.state import read_state, write_state
+from surfkit.execute.state import read_state
 from surfkit.losses.depth import DepthRegression
 from surfkit.partition import PictureShare
 from surfkit.pipeline import load_run, run
@@ -120,10 +121,10 @@ def killed_in_block_1(monkeypatch):
     """A worker that is killed without a word after step 7 of block 1, three steps after its last checkpoint."""
     command = blocks.job_of
 
-    def deadly(ctx, plan, index, compute):
-        job = command(ctx, plan, index, compute)
+    def deadly(ctx, block, compute):
+        job = command(ctx, block, compute)
         mark = ctx.run.out / "killed"
-        if index == 1 and not mark.exists():
+        if block.index == 1 and not mark.exists():
             code = (
                 "import os, sys, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
                 "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
@@ -159,7 +160,7 @@ def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypa
     checkpoint.save(path, state)
     with pytest.raises(blocks.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"):
         run(frozen, data, tmp_path, Compute("cpu"), EVERY)
-    assert checkpoint.load(path).index == 6 and "delete" in capsys.readouterr().err
+    assert checkpoint.load(path).block.index == 6 and "delete" in capsys.readouterr().err
     with pytest.raises(BadInput, match='context "frozen", and this one has "tuned"'):
         run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu"), EVERY)
 
@@ -197,13 +198,13 @@ def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F81
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     ctx = tuning.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
-    assert tuning.guarded(ctx, plan, 0) == 0
+    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 0
     again = block_state(tmp_path / "run", 0)
     assert all(torch.equal(value, again.points.params[name]) for name, value in true.points.params.items())
     map_path(made.path, plan.blocks[0].views[0]).unlink()
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert tuning.guarded(ctx, plan, 0) == 2, "its own it does need"
+    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
 
 
 @dataclass(frozen=True)
@@ -222,20 +223,19 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         place = replace(loaded, out=tmp_path / context, recipe=replace(growing, context=context))
         (place.out / "pretrain").mkdir(parents=True)
         os.link(runs["frozen"] / "pretrain" / "checkpoint.safetensors", place.out / "pretrain/checkpoint.safetensors")
-        ctx = tuning.RunContext(place, scene, select("cpu")[0], EVERY, CacheSettings())
-        block = plan.blocks[0]
-        told = need(ctx, [block], coarse, [])
-        found[context] = Found(memory_of(ctx, block), told.least_bytes, told.disk_bytes, told.seconds)
-        own, both = block.points, block.begins
+        block = Block(place, plan, 0)
+        told = forecast([block], tuning.open_coarse_model(place), [])
+        found[context] = Found(point_memory(block), told.least_bytes, told.disk_bytes, told.seconds)
+        own, both = block.planned.points, block.planned.begins
         wanted = {
             "densified": BlockPoints(both, 0, False),
             "tuned": BlockPoints(own, both - own, False),
             "frozen": BlockPoints(own, both - own, True),
         }
-        assert begun(ctx, block) == wanted[context]
-        write_state(ctx.place(0), begun_points=own + 7 if context == "frozen" else both + 7)
+        assert initial_points(block) == wanted[context]
+        block.write(begun_points=own + 7 if context == "frozen" else both + 7)
         more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * foresight.POINT_BYTES
-        assert memory_of(ctx, block) - found[context].memory == more
+        assert point_memory(block) - found[context].memory == more
     around = plan.blocks[0].begins - plan.blocks[0].points
     assert found["densified"].memory - found["tuned"].memory == 2 * around * foresight.POINT_BYTES
     less = foresight.POINT_BYTES - foresight.FROZEN_BYTES

@@ -16,7 +16,7 @@ import torch
 from surfkit.blocks.schedule import Compute
 from surfkit.cli import main
 from surfkit.core.check import BadInput
-from surfkit.core.lock import USED, held, is_used, used
+from surfkit.core.lock import USED, is_used, locked, mark_used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -312,10 +312,10 @@ def test_those_longest_unused_go_when_the_cache_is_full(own_cache):
     assert old.exists() and older.exists() and not (own_cache / "depth/.dropped-x").exists()
     make_room(mine, 25_000)
     assert old.exists() and not older.exists() and mine.exists()
-    with used(old):
+    with mark_used(old):
         make_room(mine, 0)
         assert old.exists() and is_used(old)
-    with held(old):
+    with locked(old):
         make_room(mine, 0)
         assert old.exists()
     make_room(mine, 0)

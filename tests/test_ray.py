@@ -20,6 +20,7 @@ from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.core.check import BadInput
 from surfkit.execute import Ray
 from surfkit.execute.base import LOG, Job
+from surfkit.execute.ray import _kind_of
 from surfkit.execute.state import read_state
 from surfkit.pipeline import run
 from surfkit.testing import check_executor
@@ -110,6 +111,13 @@ def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
     assert (tmp_path / "000" / "saved").exists() and not (tmp_path / "001" / "began").exists()
 
 
+def test_the_kind_of_failure_that_an_error_means():
+    known = ray.exceptions
+    errors = [known.OutOfMemoryError("no memory"), known.NodeDiedError("away"), known.WorkerCrashedError()]
+    assert [_kind_of(ray, error) for error in errors] == ["oom", "lost", "lost"]
+    assert _kind_of(ray, known.RaySystemError(ValueError("an OutOfMemoryError in words"))) == "crash"
+
+
 def test_the_driver_is_killed(cluster, tmp_path):
     """Ray kills the agents of a driver that is gone; what works for them notices, and saves."""
     here, folder = str(Path(__file__).parent), str(tmp_path)
@@ -128,19 +136,19 @@ def test_the_driver_is_killed(cluster, tmp_path):
 
 def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):  # noqa: F811
     """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
-    guarded, command = blocks.guarded, blocks.job_of
+    train_block, command = blocks.train_block, blocks.job_of
 
-    def stopped(ctx, plan, index):
+    def stopped(ctx, block):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
-            return guarded(ctx, plan, index)
+            return train_block(ctx, block)
 
-    def failing(ctx, plan, index, compute):
-        made = command(ctx, plan, index, compute)
-        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
+    def failing(ctx, block, compute):
+        made = command(ctx, block, compute)
+        return replace(made, needs=(tmp_path / "elsewhere",)) if block.index == 1 else made
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(blocks, "guarded", stopped)
+        patch.setattr(blocks, "train_block", stopped)
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert read_state(tmp_path / "blocks" / "000").step == 6
     with (
@@ -170,8 +178,8 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
-    def lingering(ctx, plan, index, compute):
-        made = command(ctx, plan, index, compute)
+    def lingering(ctx, block, compute):
+        made = command(ctx, block, compute)
         return replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
 
     def lose():

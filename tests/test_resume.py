@@ -19,7 +19,7 @@ from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core import lock
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
 from surfkit.evaluate.images import measure as images
@@ -150,7 +150,7 @@ def test_a_longer_run_of_another_recipe_is_refused(done, whole_recipe, path, val
 
 def test_a_folder_in_use_is_refused(data, recipe, tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
-    with held(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on \S+ works in it"):
+    with locked(tmp_path / "run"), pytest.raises(BadInput, match=rf"run: process {os.getpid()} on \S+ works in it"):
         run(recipe, data, tmp_path / "run")
 
 
@@ -407,7 +407,7 @@ def test_a_disk_that_is_full_at_the_end(done, recipe, monkeypatch, name):
 def test_commands_on_a_run_folder_take_its_lock(done, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
     _, out = done
-    with held(out):
+    with locked(out):
         for words in (["evaluate", str(out)], ["export", str(out)]):
             assert main(words) == 2 and f"process {os.getpid()} on" in capsys.readouterr().err
         assert main(["export", str(out), "--out", str(tmp_path / "a.ply")]) == 0

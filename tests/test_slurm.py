@@ -131,11 +131,11 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
-    def lingering(ctx, plan, index, compute):
-        made = command(ctx, plan, index, compute)
-        if index == 0 and not reached.exists():
+    def lingering(ctx, block, compute):
+        made = command(ctx, block, compute)
+        if block.index == 0 and not reached.exists():
             made = replace(made, command=("-c", code.replace("{words!r}", repr(list(made.command[2:])))))
-        return replace(made, needs=(tmp_path / "elsewhere",)) if index == 1 else made
+        return replace(made, needs=(tmp_path / "elsewhere",)) if block.index == 1 else made
 
     def preempt():
         wait_for(lambda: reached.exists() and reached.read_text())
@@ -199,15 +199,27 @@ def test_what_slurm_is_told(cluster, capsys):
     for option in [*wanted, "account=maps", "signal=USR2@90", "job-name='surfkit-my run'"]:
         assert f"#SBATCH --{option}\n" in script, option
     assert "#SBATCH --exclusive\n" in script and "#SBATCH --requeue\n" in script
-    assert (lost.job.index, lost.status) == (
-        0,
-        slurm.CRASHED,
-    ) and "job 17_1 is OUT_OF_MEMORY (OutOfMemory) in Slurm" in lost.why
+    assert (lost.job.index, lost.status, lost.kind) == (0, slurm.CRASHED, "oom")
+    assert "job 17_1 is OUT_OF_MEMORY (OutOfMemory) in Slurm" in lost.why
     asked = (cluster / "asked").read_text().splitlines()
     assert asked[-1] == "scancel 17_0" and "scancel 17_1" not in asked
     said = capsys.readouterr().err
     assert "block 1: job 17_0 is PENDING\n" in said and "block 1: job 17_0 is RUNNING\n" in said
     assert "block 0: job 17_1 is PENDING (PartitionTimeLimit)\n" in said
+
+
+@pytest.mark.parametrize(
+    ("state", "kind"),
+    [
+        ("OUT_OF_MEMORY (OutOfMemory)", "oom"),
+        ("NODE_FAIL", "lost"),
+        ("gone", "lost"),
+        ("CANCELLED by 7", "interrupted"),
+        ("FAILED (OUT_OF_MEMORY)", "crash"),
+    ],
+)
+def test_the_kind_of_failure_that_a_state_means(state, kind):
+    assert slurm._kind_of(state) == kind
 
 
 def test_what_slurm_does_not_take(cluster):

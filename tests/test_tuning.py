@@ -4,40 +4,48 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
 
 from surfkit.blocks import schedule as blocks
 from surfkit.blocks import worker as tuning
+from surfkit.blocks.block import Block, read_plan
 from surfkit.blocks.schedule import Compute
-from surfkit.blocks.worker import signs
+from surfkit.blocks.worker import heartbeats
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.execute.base import Job, JobResult
 from surfkit.execute.remote import DRIVER
 from surfkit.execute.state import STALE_S, read_state, write_state
-from surfkit.pipeline import run
+from surfkit.pipeline import opened, run
 
 
-def test_signs_of_life_while_no_step_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning, "ALIVE_S", 0.0)
-    write_state(tmp_path, status="running", step=3, heard=0.0)
-    with signs(tmp_path):
+@pytest.fixture
+def block(undisturbed, tmp_path) -> Block:  # noqa: F811
+    """A block of a run, in a folder of its own."""
+    loaded = opened(undisturbed)
+    return Block(replace(loaded, out=tmp_path), read_plan(loaded).plan, 0)
+
+
+def test_heartbeats_while_no_step_is_made(block, monkeypatch):
+    monkeypatch.setattr(tuning, "HEARTBEAT_S", 0.0)
+    block.write(status="running", step=3, heard=0.0)
+    with heartbeats(block):
         until = time.monotonic() + 20
-        while not read_state(tmp_path).heard and time.monotonic() < until:
+        while not read_state(block.folder).heard and time.monotonic() < until:
             time.sleep(0.02)
-        state = read_state(tmp_path)
+        state = read_state(block.folder)
     assert time.time() - state.heard < 20 and (state.status, state.step) == ("running", 3)
 
 
-def test_a_driver_that_goes_while_no_step_is_made(tmp_path, monkeypatch):
+def test_a_driver_that_goes_while_no_step_is_made(block, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setenv(DRIVER, str(os.getppid()))
     began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), signs(tmp_path):
+    with pytest.raises(KeyboardInterrupt), heartbeats(block):
         monkeypatch.setattr(os, "getppid", lambda: 1)
         time.sleep(20)
     assert time.monotonic() - began < 15 and signal.getsignal(signal.SIGTERM) == before
@@ -50,7 +58,12 @@ def elsewhere(undisturbed, tmp_path):  # noqa: F811
 
     def heard(seconds_ago: float) -> Path:
         write_state(
-            tmp_path / "run" / "blocks" / "000", status="running", host="far", pid=7, heard=time.time() - seconds_ago
+            tmp_path / "run" / "blocks" / "000",
+            read_state(tmp_path / "run" / "blocks" / "000"),
+            status="running",
+            host="far",
+            pid=7,
+            heard=time.time() - seconds_ago,
         )
         return tmp_path / "run"
 
@@ -61,7 +74,8 @@ def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
     folder = elsewhere(10)
     assert main(["tune", str(folder), "0"]) == tuning.BUSY
     assert (
-        "process 7 on far was heard of" in capsys.readouterr().err and read_state(folder / "blocks/000").host == "far"
+        "process 7 on far sent a heartbeat" in capsys.readouterr().err
+        and read_state(folder / "blocks/000").host == "far"
     )
     elsewhere(STALE_S - 3)
     assert main(["tune", str(folder), "0", "--patience", "60"]) == 0
@@ -69,12 +83,12 @@ def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
 
 
 def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
-    """Its signs of life would otherwise be those of a block that nobody works on."""
-    ctx = SimpleNamespace(place=lambda index: folder / "blocks" / f"{index:03}")
+    """Its heartbeats would otherwise be those of a block that no process trains."""
     lost = JobResult(Job(0, Path(), lambda: 0, ()), 70, "its machine is gone")
     for seconds, status in ((10, "running"), (STALE_S, "failed")):
         folder = elsewhere(seconds)
-        assert blocks.told(ctx, lost) == "failed: its machine is gone"
+        loaded = opened(folder)
+        assert blocks.record_failure(Block(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
         assert read_state(folder / "blocks" / "000").status == status
 
 

@@ -1,4 +1,4 @@
-"""What a person sees while blocks are tuned in other processes: a table on a terminal, else a line now and then."""
+"""Progress of blocks that other processes train: a table on a terminal, else a line from time to time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from surfkit.blocks.eta import all_left, in_words, seconds_left, so_far
+from surfkit.blocks.eta import describe_progress, seconds_elapsed, seconds_left, total_seconds_left
 from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.execute.state import BlockState, read_state
@@ -28,12 +28,12 @@ PLAIN_EVERY_S = 30.0
 
 @dataclass(frozen=True)
 class BlockProgress:
-    """Where all blocks stand.
+    """The progress of all blocks.
 
     Attributes:
-        states: Of each block that is tuned at all, by number.
-        steps: That each has to make.
-        at_once: How many are worked on at a time.
+        states: Of each block with views, by number.
+        steps: Of each.
+        at_once: How many run at a time.
     """
 
     states: Mapping[int, BlockState]
@@ -45,20 +45,20 @@ class BlockProgress:
         """Blocks that are done."""
         return sum(state.status == "done" and state.step >= self.steps for state in self.states.values())
 
-    def heading(self) -> str:
-        """All blocks in a few words: 3 of 20 blocks done, about 2:10:00 left."""
-        left = all_left(list(self.states.values()), self.steps, self.at_once)
+    def summary(self) -> str:
+        """All blocks in one phrase: 3 of 20 blocks done, about 2:10:00 left."""
+        left = total_seconds_left(list(self.states.values()), self.steps, self.at_once)
         text = f"{self.done} of {len(self.states)} blocks done"
         return text if left is None else f"{text}, about {clock(left)} left"
 
     def line(self) -> str:
-        """All blocks that are worked on, in one line."""
-        working = [f"block {at}: {in_words(s)}" for at, s in self.states.items() if s.status == "running"]
-        return "; ".join([self.heading(), *working])
+        """All running blocks, in one line."""
+        working = [f"block {at}: {describe_progress(s)}" for at, s in self.states.items() if s.status == "running"]
+        return "; ".join([self.summary(), *working])
 
 
-def state_since(folder: Path, since: float) -> BlockState:
-    """The state of the block in a folder, as far as it tells of the time since then, in seconds since 1970."""
+def read_state_since(folder: Path, since: float) -> BlockState:
+    """The state of the block in a folder; planned if it has sent no heartbeat since then, in seconds since 1970."""
     try:
         state = read_state(folder)
     except (BadInput, OSError):  # damaged, or gone just now
@@ -67,16 +67,16 @@ def state_since(folder: Path, since: float) -> BlockState:
 
 
 class BlockDisplay:
-    """Looks at the folders of blocks every so often, in a thread, and shows how far they are."""
+    """Reads the states of blocks periodically, in a thread, and shows their progress."""
 
     def __init__(self, look: Callable[[], BlockProgress], console: Console | None = None) -> None:
-        """Show what `look` tells."""
+        """Show what `look` returns."""
         self.look = look
         self.console = console or Console(stderr=True)
         self.outer = larger()
         self.live: Live | None = None
         self.over = threading.Event()
-        self.thread = threading.Thread(target=self.watch, name="board", daemon=True)
+        self.thread = threading.Thread(target=self.watch, name="block display", daemon=True)
 
     def __enter__(self) -> BlockDisplay:
         if self.outer is None and self.console.is_terminal:
@@ -98,26 +98,26 @@ class BlockDisplay:
             self.show(self.look())
 
     def show(self, now: BlockProgress) -> None:
-        """Show where the blocks stand."""
+        """Show the progress of the blocks."""
         if self.outer is not None:
             made = sum(min(state.step, now.steps) for state in now.states.values())
-            self.outer("blocks", made, len(now.states) * now.steps, now.heading())
+            self.outer("blocks", made, len(now.states) * now.steps, now.summary())
         elif self.live is not None:
-            self.live.update(table(now), refresh=True)
+            self.live.update(progress_table(now), refresh=True)
         else:
             self.console.print(now.line(), highlight=False, soft_wrap=True)
 
 
-def table(now: BlockProgress) -> Table | Text:
-    """A row for each block that is worked on or has failed; the others are only counted."""
-    told = {index: state for index, state in now.states.items() if state.status in ("running", "failed")}
-    if not told:
-        return Text(now.heading())
-    drawn = Table(title=now.heading(), title_justify="left", box=None, padding=(0, 2, 0, 0))
+def progress_table(now: BlockProgress) -> Table | Text:
+    """A row for each block that runs or has failed; the others are only counted."""
+    shown = {index: state for index, state in now.states.items() if state.status in ("running", "failed")}
+    if not shown:
+        return Text(now.summary())
+    drawn = Table(title=now.summary(), title_justify="left", box=None, padding=(0, 2, 0, 0))
     for name in ("block", "", "step", "time", "left", ""):
         drawn.add_column(name, justify="right" if name in ("step", "time", "left") else "left")
-    for index, state in told.items():
-        times = [clock(s) if s is not None else "" for s in (so_far(state), seconds_left(state))]
+    for index, state in shown.items():
+        times = [clock(s) if s is not None else "" for s in (seconds_elapsed(state), seconds_left(state))]
         silent = time.time() - state.heard
         word = (state.error or "") if state.status == "failed" else f"silent for {clock(silent)}" * (silent > 60)
         notes = "; ".join(filter(None, (word, *state.reduced)))

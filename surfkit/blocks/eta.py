@@ -1,4 +1,4 @@
-"""How long blocks that are worked on will take, from what each has last told of itself; needs no torch."""
+"""Time left for running blocks, from their last heartbeats; needs no torch."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ LEAST_S = 3.0
 """The first steps are slower than the others."""
 
 
-class Clocked(Protocol):
-    """What a block tells of itself; see `surfkit.execute.state.BlockState`."""
+class TimedBlock(Protocol):
+    """The fields of `surfkit.execute.state.BlockState` that are needed."""
 
     status: str
     step: int
@@ -22,37 +22,39 @@ class Clocked(Protocol):
     heard: float
 
 
-def so_far(block: Clocked) -> float | None:
-    """Seconds since a block was last begun, when it was last heard of; None if that is not known."""
+def seconds_elapsed(block: TimedBlock) -> float | None:
+    """Seconds from the last start of a block to its last heartbeat; None if not known."""
     return max(0.0, block.heard - block.began) if block.began > 0 and block.status in ("running", "done") else None
 
 
-def pace(block: Clocked) -> float | None:
-    """Steps a second since it was last begun; None before there is something to tell from."""
-    seconds, made = so_far(block) or 0.0, block.step - block.first
+def steps_per_second(block: TimedBlock) -> float | None:
+    """Steps per second since the last start; None if there are too few steps yet."""
+    seconds, made = seconds_elapsed(block) or 0.0, block.step - block.first
     return made / seconds if made > 0 and (seconds > LEAST_S or block.status == "done" and seconds > 0) else None
 
 
-def seconds_left(block: Clocked) -> float | None:
-    """Until a block that is worked on is done, at its pace."""
-    speed = pace(block)
+def seconds_left(block: TimedBlock) -> float | None:
+    """Seconds until a running block is done, at its speed."""
+    speed = steps_per_second(block)
     return (block.steps - block.step) / speed if speed and block.status == "running" else None
 
 
-def all_left(blocks: Sequence[Clocked], steps: int, at_once: int = 1) -> float | None:
-    """Seconds until all blocks are done, at the pace of those that are worked on, or else of those that are done.
+def total_seconds_left(blocks: Sequence[TimedBlock], steps: int, at_once: int = 1) -> float | None:
+    """Seconds until all blocks are done, at the mean speed of the running blocks, or else of those that are done.
 
     Args:
-        blocks: Those that are tuned at all.
-        steps: That each has to make, also if it has not been begun.
-        at_once: How many are worked on at a time, where it is not more.
+        blocks: Those with views.
+        steps: Of each, also if it has not been started.
+        at_once: How many run at a time, if not more.
 
     Returns:
-        None where no block tells its pace, and when all are done.
+        None if no speed is known, or all are done.
     """
     rest = [block for block in blocks if block.status != "done"]
     running = [block for block in rest if block.status == "running"]
-    paces = [speed for speed in map(pace, running) if speed] or [speed for speed in map(pace, blocks) if speed]
+    paces = [speed for speed in map(steps_per_second, running) if speed] or [
+        speed for speed in map(steps_per_second, blocks) if speed
+    ]
     if not paces or not rest:
         return None
     together = sum(paces) / len(paces) * max(len(running), min(at_once, len(rest)))
@@ -60,9 +62,9 @@ def all_left(blocks: Sequence[Clocked], steps: int, at_once: int = 1) -> float |
     return max(lasts, sum(max(0, steps - block.step) for block in rest) / together)
 
 
-def in_words(block: Clocked) -> str:
-    """Step, time and time left of a block that is worked on: step 120/300, 0:12, 0:20 left."""
+def describe_progress(block: TimedBlock) -> str:
+    """Step, time and time left of a running block: step 120/300, 0:12, 0:20 left."""
     parts = [f"step {block.step:,}/{block.steps:,}"]
-    parts += [clock(seconds) for seconds in [so_far(block)] if seconds is not None]
+    parts += [clock(seconds) for seconds in [seconds_elapsed(block)] if seconds is not None]
     parts += [f"{clock(seconds)} left" for seconds in [seconds_left(block)] if seconds is not None]
     return ", ".join(parts)

@@ -1,43 +1,41 @@
-"""What the tuning of the blocks will take, told before it begins: time, disk and memory, from the coarse model."""
+"""A forecast of the time, disk and memory that training the blocks will take, from the coarse model."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 
+from surfkit.blocks.block import Block
 from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.core.events import Warned, emit, say
 from surfkit.core.memory import size
-from surfkit.execute.state import read_state
-from surfkit.partition.plan import Block
-from surfkit.run.context import RunContext
-from surfkit.run.folder import Run
 from surfkit.scene.memory import free_bytes
-from surfkit.train.stage import StageState
+from surfkit.train.streaming import Stored
 
 KEPT = 2
-"""Checkpoints of a block that stay."""
+"""Checkpoints of a block that are kept."""
 GROWN = 3.0
-"""Times as many points as in the coarse model that a block may come to, where points multiply; a rule of thumb."""
+"""Growth of the number of points of a block with densification, as a factor; a rule of thumb."""
 POINT_BYTES, FROZEN_BYTES = 3_000, 1_500
-"""What a point takes of memory, as far as it can be told before: with values, moments, gradients and records of the
-rasterizer; and without moments and gradients. Measured at 1,640 and 770 more for each, and as much again for tiles."""
+"""Memory of a point: with parameters, moments, gradients and buffers of the rasterizer; and of a frozen one, without
+moments and gradients. Measured at 1,640 and 770 for each additional point; about as much again is for tiles."""
 FROZEN_PACE = 0.75
-"""Of the time that a point takes in a step, what a frozen one does (measured: 0.78 ms to 1.03 ms for 1,000 points)."""
+"""Time of a frozen point in a step, as a share of that of another (measured: 0.78 ms to 1.03 ms for 1,000 points)."""
 
 
 @dataclass(frozen=True)
-class Need:
-    """What the blocks that are left will take.
+class Forecast:
+    """What the unfinished blocks will take.
 
     Attributes:
         steps: Of all of them.
-        seconds: At the mean pace of the coarse model, on this machine.
-        least_bytes: Of disk, for the last checkpoint of each if no point were added.
-        disk_bytes: Of disk, for all checkpoints if points multiply.
-        memory_bytes: Of the block that needs most; 0 where blocks are tuned on other machines.
+        seconds: At the mean speed of the coarse model, on this machine.
+        least_bytes: Of disk, for the last checkpoint of each if no point is added.
+        disk_bytes: Of disk, for all checkpoints if points are added.
+        memory_bytes: Of the block that needs most; 0 where blocks are trained on other machines.
     """
 
     steps: int
@@ -52,8 +50,8 @@ class BlockPoints:
     """Points that a block begins with.
 
     Attributes:
-        growing: Those that may multiply.
-        still: Those that may not; they are as many at the end, but for what is dropped.
+        growing: Those that may be densified.
+        still: Those that may not.
         frozen: Whether the latter are frozen.
     """
 
@@ -62,55 +60,52 @@ class BlockPoints:
     frozen: bool
 
     def bytes(self, each: float, frozen: float, grown: float) -> int:
-        """What they come to, where each takes so much, a frozen one so much, and those that multiply so many times."""
+        """Bytes of all, from those of each and of a frozen one, when densification adds points by a factor."""
         return int(grown * each * self.growing + (frozen if self.frozen else each) * self.still)
 
     @property
     def pace(self) -> float:
-        """The time of a step as a share of what it takes where none is frozen."""
+        """The time of a step as a share of its time if no point were frozen."""
         return (self.growing + (FROZEN_PACE if self.frozen else 1) * self.still) / max(1, self.growing + self.still)
 
 
-def begun(ctx: RunContext, block: Block) -> BlockPoints:
-    """The points that a block begins with, from its plan; from its state, if it has been begun."""
-    around_is, known = ctx.run.recipe.context, read_state(ctx.place(block.index)).begun_points
-    around = max(0, block.begins - block.points)
-    if around_is == "frozen":
-        return BlockPoints(known or block.points, around, True)
-    both = known or block.points + around
-    return (
-        BlockPoints(both, 0, False)
-        if around_is == "densified"
-        else BlockPoints(block.points, max(0, both - block.points), False)
-    )
+def initial_points(block: Block) -> BlockPoints:
+    """The points that a block begins with, by its plan; by its state, if it has been started."""
+    planned, context, known = block.planned, block.run.recipe.context, block.state.begun_points
+    around = max(0, planned.begins - planned.points)
+    if context == "frozen":
+        return BlockPoints(known or planned.points, around, True)
+    both = known or planned.points + around
+    if context == "densified":
+        return BlockPoints(both, 0, False)
+    return BlockPoints(planned.points, max(0, both - planned.points), False)
 
 
-def memory_of(ctx: RunContext, block: Block) -> int:
-    """Bytes of memory that the points of a block may come to."""
-    grown = GROWN if ctx.run.recipe.tune.densify is not None else 1.0
-    return begun(ctx, block).bytes(POINT_BYTES, FROZEN_BYTES, grown)
+def point_memory(block: Block) -> int:
+    """Bytes of memory that the points of a block may need."""
+    grown = GROWN if block.run.recipe.tune.densify is not None else 1.0
+    return initial_points(block).bytes(POINT_BYTES, FROZEN_BYTES, grown)
 
 
-def need(ctx: RunContext, left: Sequence[Block], coarse: StageState, memory: Sequence[int]) -> Need:
+def forecast(blocks: Sequence[Block], coarse: Stored, memory: Sequence[int]) -> Forecast:
     """What blocks will take.
 
     Args:
-        ctx: Run and data.
-        left: Blocks with steps to make.
+        blocks: One or more with steps to do.
         coarse: The coarse model.
-        memory: Bytes that each of them is expected to need, where they are tuned on this machine.
+        memory: Bytes that each of them is expected to need, where they are trained on this machine.
     """
-    tune = ctx.run.recipe.tune
-    steps = [max(0, tune.steps - read_state(ctx.place(block.index)).step) for block in left]
-    whole = replace(ctx.run, part="pretrain").checkpoint.stat().st_size
-    each = whole / max(1, len(coarse.points))
-    begins, there = [begun(ctx, block) for block in left], [size_of(ctx.block(block.index)) for block in left]
+    tune, model = blocks[0].run.recipe.tune, coarse.state
+    steps = [max(0, tune.steps - block.state.step) for block in blocks]
+    whole = coarse.path.stat().st_size
+    each = whole / max(1, len(model.points))
+    begins, there = [initial_points(block) for block in blocks], [checkpoint_bytes(block) for block in blocks]
     grown = GROWN if tune.densify is not None else 1.0
     least, most = ([points.bytes(each, each / 3, times) for points in begins] for times in (1.0, grown))
-    return Need(
+    return Forecast(
         steps=sum(steps),
         seconds=sum(count * points.pace for count, points in zip(steps, begins, strict=True))
-        * (coarse.seconds / max(1, coarse.index)),
+        * (model.seconds / max(1, model.index)),
         least_bytes=sum(max(0, size - found) for size, found in zip(least, there, strict=True)),
         disk_bytes=sum(max(0, KEPT * size - found) for size, found in zip(most, there, strict=True))
         + int(KEPT * grown * whole),  # of the blocks, and of all when they are merged
@@ -118,21 +113,21 @@ def need(ctx: RunContext, left: Sequence[Block], coarse: StageState, memory: Seq
     )
 
 
-def size_of(block: Run) -> int:
-    """Bytes of the checkpoints of a block that are there."""
-    folder = block.checkpoint.parent
+def checkpoint_bytes(block: Block) -> int:
+    """Bytes of the existing checkpoints of a block."""
+    folder = block.stage.folder
     return sum(path.stat().st_size for path in folder.glob("*.safetensors")) if folder.exists() else 0
 
 
-def tell(ctx: RunContext, found: Need) -> None:
-    """Say what blocks will take, and warn where that is more than there is.
+def report_forecast(out: Path, found: Forecast) -> None:
+    """Print what blocks will take, and warn where that is more than there is; `out` is the run folder.
 
     Raises:
         BadInput: The disk is certainly too small.
     """
-    disk, memory = shutil.disk_usage(ctx.run.out).free, free_bytes()
+    disk, memory = shutil.disk_usage(out).free, free_bytes()
     text = (
-        f"{found.steps:,} steps to tune, about {clock(found.seconds)} at the pace of the coarse model; "
+        f"{found.steps:,} steps to tune, about {clock(found.seconds)} at the speed of the coarse model; "
         f"checkpoints take about {size(found.disk_bytes)} of disk, {size(disk)} are free"
     )
     if found.memory_bytes:
@@ -140,20 +135,20 @@ def tell(ctx: RunContext, found: Need) -> None:
     say(text)
     if found.least_bytes > disk:
         raise BadInput(
-            f"{ctx.run.out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "
+            f"{out}: the blocks need at least {size(found.least_bytes)} of disk for their checkpoints, and "
             f"{size(disk)} are free; make room, and give the same command again"
         )
     if found.disk_bytes > disk:
         emit(
             Warned(
                 f"the blocks may need about {size(found.disk_bytes)} of disk, and {size(disk)} are free; make room "
-                "while they are tuned, or they stop at their last checkpoints and the same command goes on from there"
+                "while they are trained, or they stop at their last checkpoints, and the same command continues them"
             )
         )
     if found.memory_bytes > memory:
         emit(
             Warned(
-                f"a block may need about {size(found.memory_bytes)} of memory, and {size(memory)} are free; where it "
-                "gives out, the block is tried again with less, which will be told; more blocks need less each"
+                f"a block may need about {size(found.memory_bytes)} of memory, and {size(memory)} are free; if it "
+                "runs out, the block is tried again with less, with a warning; more blocks need less each"
             )
         )

@@ -1,47 +1,44 @@
-"""Blocks put together: the results of all of them as one state, without holding them all at once."""
+"""Merging: the results of all blocks as one state, without holding all of them in memory at once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
-from surfkit.blocks.oom_retry import shortfall
+from surfkit.blocks.block import Block
+from surfkit.blocks.oom_retry import reduction
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
-from surfkit.execute.state import read_state, write_state
 from surfkit.partition.merge import Merge, Pieces, Share
-from surfkit.partition.plan import Plan
 from surfkit.primitives.points import Columns, Points
 from surfkit.run.context import RunContext
-from surfkit.train import checkpoint
-from surfkit.train import streaming as pieces
+from surfkit.train import checkpoint, streaming
 from surfkit.train.look import fresh_looks
 from surfkit.train.stage import Stage, StageState
 from surfkit.train.streaming import Stored
 from surfkit.train.views import Order
 
 
-def put_together(ctx: RunContext, blocks: Plan, coarse: Stored) -> bool:
-    """Write all blocks as one state, each point from its owner; where nothing was tuned, from the coarse model.
+def merge_blocks(ctx: RunContext, blocks: Sequence[Block], coarse: Stored) -> bool:
+    """Write all blocks as one state, each point from its owner; where nothing was trained, from the coarse model.
 
-    False if a result is not what its state says; that block is planned again.
+    False if a result is not what its state says; that block is to be trained again.
     """
-    recipe, final = ctx.run.recipe, replace(ctx.run, part="tune")
-    skipped = frozenset(block.index for block in blocks.blocks if not block.views)
-    results = {index: sound(ctx, index) for index in range(len(blocks.blocks)) if index not in skipped}
+    recipe, path = ctx.run.recipe, ctx.run.merged.checkpoint
+    skipped = frozenset(block.index for block in blocks if not block.planned.views)
+    results = {block.index: open_result(block) for block in blocks if block.index not in skipped}
     found = {index: result for index, result in results.items() if result is not None}
     if len(found) < len(results):
         return False
-    tuned_pieces = {index: finished(recipe.tune, result) for index, result in found.items()}
-    merge = Merge(blocks.cells, finished(recipe.pretrain, coarse), tuned_pieces, skipped)
+    trained = {index: finished(recipe.tune, result) for index, result in found.items()}
+    merge = Merge(blocks[0].plan.cells, finished(recipe.pretrain, coarse), trained, skipped)
     shares = merge.shares()
-    note(ctx, shares)
+    write_shares(blocks, shares)
     parts = [result.state for result in (coarse, *found.values())]
-    pieces.save(final.checkpoint, together(ctx, parts, shares), merge.pieces())
-    emit(FileWritten(final.checkpoint, "merged blocks"))
+    streaming.save(path, merged_state(ctx, parts, shares), merge.pieces())
+    emit(FileWritten(path, "merged blocks"))
     return True
 
 
@@ -53,7 +50,7 @@ def finished(stage: Stage, stored: Stored) -> Pieces:
     )
 
 
-def together(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Share]) -> StageState:
+def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Share]) -> StageState:
     """The state of the merged blocks but for the values of its points; `parts` are the coarse model and the blocks."""
     recipe, points = ctx.run.recipe, sum(share.kept for share in shares)
     like = parts[0].points.params
@@ -74,12 +71,12 @@ def together(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Shar
 
 
 def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns:
-    """What belongs to no point: the mean over the blocks that were tuned, each weighted by the points that it gives.
+    """Parameters that belong to no point: their mean over the trained blocks, weighted by the points each gives.
 
-    `parts` are the coarse model and the tuned blocks, in the order of those shares that the coarse model did not fill.
+    `parts` are the coarse model and the trained blocks, in the order of the shares that the coarse model did not fill.
     """
-    tuned = [share.kept for share in shares if not share.filled]
-    weights, total = (tuned, sum(tuned)) if sum(tuned) else ([1] * len(tuned), len(tuned))
+    trained = [share.kept for share in shares if not share.filled]
+    weights, total = (trained, sum(trained)) if sum(trained) else ([1] * len(trained), len(trained))
     coarse, *blocks = [part.points.shared for part in parts]
     if not blocks:
         return coarse
@@ -91,29 +88,29 @@ def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns
     }
 
 
-def sound(ctx: RunContext, index: int) -> Stored | None:
+def open_result(block: Block) -> Stored | None:
     """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
-    path, steps = ctx.block(index).checkpoint, ctx.run.recipe.tune.steps
+    path, steps = block.stage.checkpoint, block.stage.stage.steps
     try:
-        found = pieces.open_last(path)
+        found = streaming.open_last(path)
     except BadInput as error:
-        emit(Warned(f"block {index} is tuned from its beginning again: {error}"))
+        emit(Warned(f"block {block.index} is tuned from its beginning again: {error}"))
         checkpoint.discard(path)
         found = None
     step = found[0].state.index if found else 0
     if found is not None and step >= steps:
         return found[0]
-    emit(Warned(f"block {index} has lost steps: its checkpoint is of {step}, not of {steps}"))
-    write_state(ctx.place(index), status="planned", step=step)
+    emit(Warned(f"block {block.index} has lost steps: its checkpoint is of {step}, not of {steps}"))
+    block.write(status="planned", step=step)
     return None
 
 
-def note(ctx: RunContext, shares: Sequence[Share]) -> None:
-    """Write down what each block gave, and say where the coarse model had to fill in."""
-    write_json(ctx.folder / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
+def write_shares(blocks: Sequence[Block], shares: Sequence[Share]) -> None:
+    """Write merge.json; warn of blocks that were reduced for lack of memory, and of those without views."""
+    write_json(blocks[0].run.blocks / "merge.json", {"blocks": shares, "points": sum(share.kept for share in shares)})
     for share in shares:
-        less = shortfall(read_state(ctx.place(share.index)))
+        less = reduction(blocks[share.index].state)
         if less and not share.filled:
-            emit(Warned(f"block {share.index} was tuned with less than the recipe says, for want of memory: {less}"))
+            emit(Warned(f"block {share.index} was tuned with less than the recipe says, as memory ran out: {less}"))
     if filled := [str(share.index) for share in shares if share.filled]:
         emit(Warned(f"blocks {', '.join(filled)} have no views, and are as they were in the coarse model"))

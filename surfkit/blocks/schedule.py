@@ -1,7 +1,7 @@
-"""The blocks of a large scene: planned, tuned apart by whoever has hands free, and merged (CityGaussianV2, sec. 3.3).
+"""The blocks of a large scene: planned, trained by an executor, and merged (CityGaussianV2, sec. 3.3).
 
-The folder of the run is the contract: `blocks/plan.json` says what is cut how, `blocks/NNN/` holds what one block has
-come to, and whoever comes back to it goes on from there.
+The files in the run folder are all that connects the processes: `blocks/plan.json` has the plan, and `blocks/NNN/` the
+state and the checkpoints of one block, from which any process continues.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ import itertools
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from surfkit.blocks.display import BlockDisplay, BlockProgress, state_since
-from surfkit.blocks.forecast import memory_of, need, tell
-from surfkit.blocks.merge import put_together
+from surfkit.blocks.block import Block, Record, load_blocks, plan_file, read_plan, started_folders, unfinished
+from surfkit.blocks.display import BlockDisplay, BlockProgress, read_state_since
+from surfkit.blocks.forecast import forecast, point_memory, report_forecast
+from surfkit.blocks.merge import merge_blocks
 from surfkit.blocks.oom_retry import next_fallback
-from surfkit.blocks.worker import BUSY, FULL, coarse_model, coarse_model_of, guarded
+from surfkit.blocks.worker import BUSY, FULL, activate_coarse_model, open_coarse_model, train_block
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.execute import base as executor
 from surfkit.execute.base import Executor, Inline, JobResult
 from surfkit.execute.remote import POLL_S
-from surfkit.execute.state import STALE_S, heard_elsewhere, read_state, worked_on, write_state
+from surfkit.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.partition.picture import plan_picture
-from surfkit.partition.plan import Fewest, Plan, plan
+from surfkit.partition.plan import Fewest, plan
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.readers.depth_prior import alignment
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, discard_results, relay
-from surfkit.run.notes import naming
-from surfkit.scene.memory import oom_kills
+from surfkit.run.folder import Run, discard_results
+from surfkit.run.notes import prefix_notes, repeat_warnings
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull
 from surfkit.train.material import needs_normals, needs_priors
@@ -44,27 +44,24 @@ from surfkit.train.stage import StageState
 from surfkit.train.streaming import Stored
 
 ATTEMPTS = 3
-"""How often a block is begun in one command before it counts as failed."""
+"""How often a block is started in one command before it counts as failed."""
 PROGRAM_BYTES, PIXEL_BYTES = 400 << 20, 150
-"""What a process takes beside its points, as far as it can be told before: for itself, and for each pixel of a
-photograph."""
-STARVED = ("OUT_OF_MEMORY", "OutOfMemoryError")
-"""How Slurm and Ray say that memory gave out."""
+"""Memory of a process beside its points: of the program, and for each pixel of a photograph."""
 LEAVE_S = 20.0
-"""How long workers of a driver that is gone may take to notice."""
+"""Seconds in which the workers of a driver that is gone notice that and end."""
 PATIENCE_S = STALE_S + LEAVE_S
-"""How long a worker on another machine waits for one before it, whose machine may be gone."""
+"""Seconds that a worker on another machine waits for an earlier one, whose machine may be lost."""
 ARRIVE_S = 90.0
-"""How long what was written on another machine may take until it is seen here."""
+"""Seconds until files written on another machine are visible here."""
 
 
 @dataclass(frozen=True)
 class Compute:
-    """Who computes.
+    """What computes a run.
 
     Attributes:
-        device: Where.
-        workers: Who tunes the blocks, where the recipe cuts the scene into some.
+        device: The device.
+        workers: The executor of the blocks, where the recipe has a partition.
         tensorboard: Whether workers in processes of their own write scalars for TensorBoard.
     """
 
@@ -74,287 +71,267 @@ class Compute:
 
 
 class Unfinished(Fault):
-    """Some blocks are not tuned; the others are, and stay so."""
+    """Some blocks have failed; the others are done and are kept."""
 
     status = 3
 
 
-@dataclass(frozen=True)
-class Record:
-    """The plan on disk.
-
-    Attributes:
-        coarse_steps: Of the coarse model that it was made for.
-        plan: Cells and blocks.
-    """
-
-    coarse_steps: int
-    plan: Plan
-
-
-def tune_blocks(ctx: RunContext, compute: Compute) -> tuple[Run, StageState]:
-    """The run with the state of all blocks together; what is done already is not done again.
+def tune_blocks(ctx: RunContext, compute: Compute) -> StageState:
+    """The state of all blocks together; what is done already is not done again.
 
     Args:
-        ctx: Run, data and means; the coarse model is in its folder.
-        compute: Who tunes the blocks.
+        ctx: The run; the coarse model is in its folder.
+        compute: What trains the blocks.
 
     Raises:
         Unfinished: Blocks failed, also when they were tried again.
-        KeyboardInterrupt: Someone asked to stop; every block has saved its state.
+        KeyboardInterrupt: The user asked to stop; every block has saved its state.
     """
-    final = replace(ctx.run, part="tune")
-    if not ctx.folder.exists() and (state := whole(final)):  # deleted to make room
-        return final, state
-    coarse = coarse_model(ctx.run)
-    sweep(ctx.folder, deep=False)  # a block's own folder is its worker's
-    record = planned(ctx, coarse)
-    state = merged(ctx, record)
-    if state is not None:
-        return final, state
-    discard_results(final)
-    while state is None:
-        await_workers(ctx)
-        foresee(ctx, record.plan, coarse, compute)
-        extract_views(ctx, record.plan)
-        work(ctx, record.plan, compute)
-        for folder in ctx.folders():  # also of blocks that were tuned by hand
-            relay(ctx.run.out, folder, f"block {int(folder.name)}: ")
-        if put_together(ctx, record.plan, coarse):
-            state = checkpoint.load(final.checkpoint)
-    return final, state
+    run = ctx.run
+    if not run.blocks.exists() and (state := load_merged(run)):  # the blocks were deleted to free disk space
+        return state
+    coarse = open_coarse_model(run)
+    sweep(run.blocks, deep=False)  # in the folder of a block, only its worker may delete files
+    record = load_or_make_plan(ctx, coarse)
+    if not unfinished(load_blocks(run, record.plan)) and (state := load_merged(run)):
+        return state
+    discard_results(run, run.merged)
+    while True:
+        await_workers(run)
+        blocks = load_blocks(run, record.plan)
+        train_all(ctx, blocks, coarse, compute)
+        for folder in started_folders(run):  # also of blocks that were trained by hand
+            repeat_warnings(run.out, folder, f"block {int(folder.name)}: ")
+        if merge_blocks(ctx, blocks, coarse):
+            return checkpoint.load(run.merged.checkpoint)
 
 
-def planned(ctx: RunContext, coarse: Stored) -> Record:
-    """The plan in the folder, or a new one; blocks of another coarse model are put aside."""
-    path = ctx.folder / "plan.json"
+def load_or_make_plan(ctx: RunContext, coarse: Stored) -> Record:
+    """The plan in the folder, or a new one; blocks of another coarse model are renamed."""
+    run, path = ctx.run, plan_file(ctx.run)
     if path.exists():
-        record = read_json(path, Record)
+        record = read_plan(run)
         known = {view.name for view in ctx.scene.train}
         if unknown := {name for block in record.plan.blocks for name in block.views} - known:
-            raise BadInput(f"{path}: names a view that is not there, {min(unknown)}; delete {ctx.folder} to plan again")
+            raise BadInput(f"{path}: names a view that is not there, {min(unknown)}; delete {run.blocks} to plan again")
         if record.coarse_steps == coarse.state.index:
             return record
-    if ctx.folders():  # of another coarse model, or of a plan that is gone
-        await_workers(ctx)
-        aside = put_aside(ctx)
-        checkpoint.discard(replace(ctx.run, part="tune").checkpoint)
+    if started_folders(run):  # of another coarse model, or of a plan that is gone
+        await_workers(run)
+        aside = rename_blocks(run)
+        checkpoint.discard(run.merged.checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
-    recipe = ctx.run.recipe
-    sight = coarse_model_of(ctx, checkpoint.load(coarse.path))
-    made = Record(coarse.state.index, plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
-    picture = ctx.folder / "plan.png"
-    plan_picture(picture, sight, made.plan)
+    return make_plan(ctx, coarse)
+
+
+def make_plan(ctx: RunContext, coarse: Stored) -> Record:
+    """Plan the blocks, and write the plan and its picture."""
+    recipe, path = ctx.run.recipe, plan_file(ctx.run)
+    model = activate_coarse_model(ctx, checkpoint.load(coarse.path))
+    record = Record(coarse.state.index, plan(model, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
+    picture = ctx.run.blocks / "plan.png"
+    plan_picture(picture, model, record.plan)
     emit(FileWritten(picture, "picture of the blocks"))
-    write_json(path, made)
+    write_json(path, record)
     emit(FileWritten(path, "plan of the blocks"))
-    for block in made.plan.blocks:
+    for block in record.plan.blocks:
         say(
             f"block {block.index}: {len(block.views)} views, {block.cameras} of them inside; {block.points:,} points; "
             f"{block.work:.0%} of the work" + ("" if block.views else "; stays as it is")
         )
-    return made
+    return record
 
 
-def extract_views(ctx: RunContext, blocks: Plan) -> None:
-    """Write the views of each block into its folder, with the alignment of their depth priors if a loss asks for any.
-
-    The priors are aligned as those of the whole scene: a block's own views would give another scale to its loss, and
-    another judgement of failed alignments.
-    """
-    missing = [block for block in blocks.blocks if block.views and not extract.is_whole(ctx.views(block.index))]
-    priors = None
-    if missing and needs_priors(losses := ctx.run.recipe.tune.losses):
-        with naming("blocks: "):  # what the coarse stage has said already is not said again
-            priors = alignment(ctx.run.data, ctx.scene, needs_normals(losses))
-    for block in missing:
-        extract.save(ctx.views(block.index), extract.of(ctx.scene, block.views, priors))
-
-
-def put_aside(ctx: RunContext) -> Path:
-    """Rename the folder of the blocks, and leave alone what was put aside before; its new name."""
+def rename_blocks(run: Run) -> Path:
+    """Rename the folder of the blocks to a free name, and return it."""
     names = itertools.chain(["blocks-before"], (f"blocks-before-{number}" for number in itertools.count(2)))
-    aside = next(path for path in (ctx.run.out / name for name in names) if not path.exists())
-    os.replace(ctx.folder, aside)
+    aside = next(path for path in (run.out / name for name in names) if not path.exists())
+    os.replace(run.blocks, aside)
     return aside
 
 
-def merged(ctx: RunContext, record: Record) -> StageState | None:
-    """The state of all blocks together, if it was made and none has been tuned for longer since."""
-    return whole(replace(ctx.run, part="tune")) if done(ctx, record.plan) else None
+def load_merged(run: Run) -> StageState | None:
+    """The state of all blocks together, if it is in the folder; further steps of the coarse model delete it."""
+    found = checkpoint.load_last(run.merged.checkpoint)
+    return None if found is None or found[0].index < run.merged.stage.steps else found[0]
 
 
-def whole(final: Run) -> StageState | None:
-    """The state of all blocks together that is in the folder, if any; further steps of the coarse model delete it."""
-    found = checkpoint.load_last(final.checkpoint)
-    return None if found is None or found[0].index < final.stage.steps else found[0]
+def await_workers(run: Run) -> None:
+    """Wait for workers of an earlier driver, which end when they notice that it is gone.
 
+    Those of another machine may have been lost with it, which shows when they send no heartbeat for long enough.
 
-def done(ctx: RunContext, blocks: Plan) -> bool:
-    """Whether every block has all its steps."""
-    return not left(ctx, blocks)
-
-
-def left(ctx: RunContext, blocks: Plan) -> list[int]:
-    """Blocks that still have steps to make."""
-    steps = ctx.run.recipe.tune.steps
-    found = []
-    for block in blocks.blocks:
-        state = read_state(ctx.place(block.index))
-        if block.views and not (state.status == "done" and state.step >= steps):
-            found.append(block.index)
-    return found
-
-
-def await_workers(ctx: RunContext) -> None:
-    """Wait for workers of an earlier driver, which stop when they notice that it is gone.
-
-    Those of another machine may have died with it; this shows when they have not been heard of for long enough.
+    Raises:
+        BadInput: One does not end.
     """
     began = time.monotonic()
-    while busy := [folder for folder in ctx.folders() if worked_on(folder)]:
-        patience = LEAVE_S + (STALE_S if any(map(heard_elsewhere, busy)) else 0)
+    while busy := [folder for folder in started_folders(run) if find_worker(folder)]:
+        patience = LEAVE_S + (STALE_S if any(map(find_remote_worker, busy)) else 0)
         if time.monotonic() - began > patience:
-            raise BadInput(f"{busy[0]}: {worked_on(busy[0])} works on the block; wait for its end, or stop it")
+            raise BadInput(f"{busy[0]}: {find_worker(busy[0])} works on the block; wait for its end, or stop it")
         time.sleep(POLL_S)
 
 
-def foresee(ctx: RunContext, blocks: Plan, coarse: Stored, compute: Compute) -> None:
-    """Say what the blocks that are left will take; BadInput if there is certainly no room for them."""
-    indices, here = left(ctx, blocks), compute.workers.at_once is not None
-    memory = [job_of(ctx, blocks, index, compute).memory_bytes for index in indices] if here else []
-    if indices:
-        tell(ctx, need(ctx, [blocks.blocks[index] for index in indices], coarse.state, memory))
+def train_all(ctx: RunContext, blocks: Sequence[Block], coarse: Stored, compute: Compute) -> None:
+    """Train all blocks that are not done, after a forecast of what that takes.
 
-
-def work(ctx: RunContext, blocks: Plan, compute: Compute) -> None:
-    """Have all blocks tuned that are not.
-
-    One that crashes is tried again, and one whose memory gave out too, with less and with the machine for itself.
+    Raises:
+        BadInput: There is certainly no room for them.
+        Unfinished: Blocks failed, also when they were tried again.
     """
-    waiting = left(ctx, blocks)
-    attempts, kills = dict.fromkeys(waiting, 0), oom_kills()
-    look = looking(ctx, compute, waiting)
-    failed: dict[int, str] = {}
+    waiting = unfinished(blocks)
+    if waiting:
+        here = compute.workers.at_once is not None
+        memory = [job_of(ctx, block, compute).memory_bytes for block in waiting] if here else []
+        report_forecast(ctx.run.out, forecast(waiting, coarse, memory))
+    extract_views(ctx, blocks)
+    train_waiting(ctx, waiting, compute, len(blocks))
+
+
+def extract_views(ctx: RunContext, blocks: Sequence[Block]) -> None:
+    """Write the views of each block into its folder, with the alignment of their depth priors if a loss needs any.
+
+    The priors are aligned as those of the whole scene: with the views of a block alone, their scale would differ, and
+    so would the choice of those whose alignment has failed.
+    """
+    missing = [block for block in blocks if block.planned.views and not extract.is_whole(block.views_file)]
+    priors = None
+    if missing and needs_priors(losses := ctx.run.recipe.tune.losses):
+        with prefix_notes("blocks: "):  # warnings of the coarse stage are not repeated
+            priors = alignment(ctx.run.data, ctx.scene, needs_normals(losses))
+    for block in missing:
+        extract.save(block.views_file, extract.of(ctx.scene, block.planned.views, priors))
+
+
+def train_waiting(ctx: RunContext, waiting: list[Block], compute: Compute, total: int) -> None:
+    """Train the blocks of a list, of a `total` number; those that fail are tried again.
+
+    A block that ran out of memory is tried again when the others have ended, with less, and with no other beside it.
+    """
+    attempts = {block.index: 0 for block in waiting}
+    look = watch_progress(ctx, compute, waiting)
+    failed: dict[Block, str] = {}
     while waiting:
-        batch = [index for index in waiting if not short(ctx, index)]
+        batch = [block for block in waiting if not block.is_out_of_memory]
         batch = batch or (waiting[:1] if (compute.workers.at_once or 1) > 1 else list(waiting))
-        waiting = [index for index in waiting if index not in batch]
-        say(f"{len(batch)} of {len(blocks.blocks)} blocks to tune")
-        for ended in done_by(compute, [job_of(ctx, blocks, index, compute) for index in batch], look):
-            index = ended.job.index
-            attempts[index] += 1
-            relay(ctx.run.out, ctx.place(index), f"block {index}: ")
-            if ended.status == 0 and arrived(ctx, blocks, index):
-                say(f"block {index} is done; {look().heading()}")
-                continue
-            starved = ended.status == -signal.SIGKILL and oom_kills() > kills
-            kills += starved
-            reason = told(ctx, ended, starved)
-            if ended.status == FULL:
-                raise DiskFull(ctx.place(index), f"block {index} {reason}")
-            again = another_way(ctx, index, ended.status, attempts[index])
-            emit(Warned(f"block {index} {reason}" + (f"; {again}" if again else "")))
-            if again:
-                waiting.append(index)
-            else:
-                failed[index] = reason
+        waiting = [block for block in waiting if block not in batch]
+        say(f"{len(batch)} of {total} blocks to tune")
+        with closing(run_jobs(ctx, batch, compute, look)) as ended:
+            for block, result in ended:
+                attempts[block.index] += 1
+                repeat_warnings(ctx.run.out, block.folder, f"block {block.index}: ")
+                if result.status == 0 and has_arrived(block):
+                    say(f"block {block.index} is done; {look().summary()}")
+                    continue
+                reason = record_failure(block, result)
+                if result.status == FULL:
+                    raise DiskFull(block.folder, f"block {block.index} {reason}")
+                remedy = choose_remedy(block, result.status, attempts[block.index])
+                emit(Warned(f"block {block.index} {reason}" + (f"; {remedy}" if remedy else "")))
+                if remedy:
+                    waiting.append(block)
+                else:
+                    failed[block] = reason
     if failed:
-        what = "; ".join(f"block {index} {reason}" for index, reason in sorted(failed.items()))
-        if any(short(ctx, index) for index in failed):
-            what += "; more blocks or smaller photographs need less memory, in a folder of their own"
-        raise Unfinished(f"{ctx.run.out}: {what}; the others are done, and the same command tries these again")
+        raise Unfinished(
+            f"{ctx.run.out}: {describe(failed)}; the others are done, and the same command tries these again"
+        )
 
 
-def arrived(ctx: RunContext, blocks: Plan, index: int) -> bool:
-    """Whether a block that is done somewhere is so here; a network's file system may take a while."""
+def describe(failed: Mapping[Block, str]) -> str:
+    """The blocks that have failed and why, and what helps those that ran out of memory."""
+    parts = [f"block {block.index} {failed[block]}" for block in sorted(failed, key=lambda block: block.index)]
+    if any(block.is_out_of_memory for block in failed):
+        parts.append("more blocks or smaller photographs need less memory, in a folder of their own")
+    return "; ".join(parts)
+
+
+def run_jobs(
+    ctx: RunContext, batch: Sequence[Block], compute: Compute, look: Callable[[], BlockProgress]
+) -> Iterator[tuple[Block, JobResult]]:
+    """The blocks of a batch as their jobs end, with their states read again; other processes' progress is shown."""
+    by_index = {block.index: block for block in batch}
+    jobs = [job_of(ctx, block, compute) for block in batch]
+    with (
+        nullcontext() if compute.workers.in_process else BlockDisplay(look),
+        closing(compute.workers.run(jobs)) as results,
+    ):
+        for result in results:
+            block = by_index[result.job.index]
+            block.read()
+            yield block, result
+
+
+def has_arrived(block: Block) -> bool:
+    """Whether a block that is done on some machine is done here, too; a network file system may take a while."""
     until = time.monotonic() + ARRIVE_S
-    while index in left(ctx, blocks):
+    while not block.is_done:
         if time.monotonic() > until:
             return False
         time.sleep(POLL_S)
+        block.read()
     return True
 
 
-def done_by(compute: Compute, jobs: Sequence[executor.Job], look: Callable[[], BlockProgress]) -> Iterator[JobResult]:
-    """The jobs as they end; where others do them, it is shown how far they are."""
-    shown = nullcontext() if isinstance(compute.workers, Inline) else BlockDisplay(look)
-    with shown, closing(compute.workers.run(jobs)) as ended:
-        yield from ended
-
-
-def looking(ctx: RunContext, compute: Compute, indices: Iterable[int]) -> Callable[[], BlockProgress]:
-    """What tells where blocks stand that are tuned from now on."""
-    since, indices = time.time(), tuple(indices)
+def watch_progress(ctx: RunContext, compute: Compute, blocks: Sequence[Block]) -> Callable[[], BlockProgress]:
+    """A function that reads the progress which blocks make from now on."""
+    since, folders = time.time(), {block.index: block.folder for block in blocks}
 
     def look() -> BlockProgress:
-        states = {index: state_since(ctx.place(index), since) for index in indices}
-        return BlockProgress(states, ctx.run.recipe.tune.steps, compute.workers.at_once or len(indices))
+        states = {index: read_state_since(folder, since) for index, folder in folders.items()}
+        return BlockProgress(states, ctx.run.recipe.tune.steps, compute.workers.at_once or len(folders))
 
     return look
 
 
-def short(ctx: RunContext, index: int) -> bool:
-    """Whether memory gave out when a block was last worked on."""
-    return read_state(ctx.place(index)).kind == "oom"
-
-
-def another_way(ctx: RunContext, index: int, status: int, attempts: int) -> str | None:
+def choose_remedy(block: Block, status: int, attempts: int) -> str | None:
     """How a block that failed is tried again, in a few words; None if it is not."""
-    if short(ctx, index):
-        fallback = next_fallback(read_state(ctx.place(index)), ctx.run.recipe.tune.densify)
+    if block.is_out_of_memory:
+        fallback = next_fallback(block.state, block.run.recipe.tune.densify)
         return f"it is tried again: {fallback.text}" if fallback else None
     return "it is tried again" if status not in (1, 2) and attempts < ATTEMPTS else None
 
 
-def told(ctx: RunContext, ended: JobResult, starved: bool = False) -> str:
-    """What became of a block, in a few words; also noted in its state.
-
-    `starved`: the system has ended processes for want of memory meanwhile.
-    """
-    index, status = ended.job.index, ended.status
-    state = read_state(ctx.place(index))
-    if ended.why is not None or status == 0:
-        why = ended.why or f"nothing of its work has come to {ctx.place(index)}"
-        kind = "oom" if any(word in why for word in STARVED) else "data" if status == 2 else "crash"
-        if not heard_elsewhere(ctx.place(index)):  # it may only be cut off, and the next one must wait for its end
-            write_state(ctx.place(index), status="failed", kind=kind, error=why)
+def record_failure(block: Block, result: JobResult) -> str:
+    """The failure of a block in a few words; written into the state of the block, unless its worker has done so."""
+    status, kind = result.status, result.kind or "crash"
+    if result.why is not None or status == 0:
+        why = result.why or f"nothing of its work has come to {block.folder}"
+        if not find_remote_worker(block.folder):  # it may only be cut off, and the next worker must wait for its end
+            block.write(status="failed", kind=kind, error=why)
         return f"failed: {why}"
     if status < 0:
-        error = f"ended by {signal.Signals(-status).name}" + " while memory ran out on this machine" * starved
-        write_state(ctx.place(index), status="failed", kind="oom" if starved else "crash", error=error)
+        error = f"ended by {signal.Signals(-status).name}" + " while memory ran out" * (kind == "oom")
+        block.write(status="failed", kind=kind, error=error)
         return f"was {error}"
     if status == BUSY:
         return "is worked on by another process"
-    if state.status != "failed":
-        log = ctx.place(index) / executor.LOG
-        write_state(ctx.place(index), status="failed", kind="crash", error=f"exit status {status}")
-        return f"ended with status {status}; see {log}"
-    return f"failed: {state.error}"
+    if block.state.status != "failed":
+        block.write(status="failed", kind=kind, error=f"exit status {status}")
+        return f"ended with status {status}; see {block.folder / executor.LOG}"
+    return f"failed: {block.state.error}"
 
 
-def job_of(ctx: RunContext, blocks: Plan, index: int, compute: Compute) -> executor.Job:
-    """The work on one block."""
-    block = blocks.blocks[index]
+def job_of(ctx: RunContext, block: Block, compute: Compute) -> executor.Job:
+    """The job that trains one block."""
     elsewhere = compute.workers.at_once is None
     share = ctx.caches.bytes() // (compute.workers.at_once or 1)
-    command = ["-m", "surfkit.cli", "tune", str(ctx.run.out.resolve()), str(index), "--device", compute.device]
+    command = ["-m", "surfkit.cli", "tune", str(ctx.run.out.resolve()), str(block.index), "--device", compute.device]
     command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
     command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
     command += ["--patience", f"{PATIENCE_S}"] * elsewhere
     pixels = max(view.camera.width * view.camera.height for view in ctx.scene.train)
-    mine = [view for view in ctx.scene.train if view.name in block.views]
-    photos = 3 * sum(view.camera.width * view.camera.height for view in mine)
+    names = set(block.planned.views)
+    views = [view for view in ctx.scene.train if view.name in names]
+    photos = 3 * sum(view.camera.width * view.camera.height for view in views)
+    cached = photos if elsewhere and ctx.caches.cache == "auto" else min(share, photos)
     return executor.Job(
-        index=index,
-        folder=ctx.place(index),
-        call=lambda: guarded(ctx, blocks, index),
+        index=block.index,
+        folder=block.folder,
+        call=lambda: train_block(ctx, block),
         command=tuple(command),
-        cost=block.work,
-        memory_bytes=PROGRAM_BYTES
-        + memory_of(ctx, block)
-        + PIXEL_BYTES * pixels
-        + (photos if elsewhere and ctx.caches.cache == "auto" else min(share, photos)),
-        needs=(ctx.run.data.path, mine[0].path),
+        cost=block.planned.work,
+        memory_bytes=PROGRAM_BYTES + point_memory(block) + PIXEL_BYTES * pixels + cached,
+        needs=(ctx.run.data.path, views[0].path),
     )

@@ -10,7 +10,7 @@ import tyro
 
 from surfkit.cli.result import show, show_geometry
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
@@ -23,7 +23,7 @@ from surfkit.report.regions import Distance, Zones, measure_zones, rendered_dept
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
 from surfkit.run.method import refuse_not_drawn
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -75,7 +75,7 @@ class Evaluate:
     def run(self) -> None:
         """Measure, and print the results."""
         zones = Zones(self.seen, self.seams)
-        with noted(), bars():
+        with collect_notes(), bars():
             if self.gt is not None:
                 return self._geometry(self.gt, zones)
             if (self.views, self.out, self.geometry) != (None, None, Comparison()):
@@ -83,7 +83,7 @@ class Evaluate:
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
-            with held(self.target), full_disk_in_one_line(self.target):
+            with locked(self.target), full_disk_in_one_line(self.target):
                 with loaded(self.target, self.device) as (ctx, made):
                     self._photographs(ctx, made, zones)
 
@@ -133,7 +133,7 @@ class Evaluate:
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:
         """Figures of parts of the held-out photographs of a run; a mesh as truth, else rendered depth, says which."""
-        with held(self.target), full_disk_in_one_line(self.target):
+        with locked(self.target), full_disk_in_one_line(self.target):
             with loaded(self.target, self.device) as (ctx, made):
                 run, scene = ctx.run, ctx.scene
                 depths = rendered_depths(made.draw) if truth is None else true_depths(truth, scene.frame, matrix)

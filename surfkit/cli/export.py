@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.export.ply import write_splats
 from surfkit.method.base import SplatModel
 from surfkit.pipeline import loaded
@@ -36,7 +36,7 @@ class Export:
     def run(self) -> None:
         """Write the file."""
         refuse_no_run(self.run_folder)
-        with held(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
+        with locked(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
             with loaded(self.run_folder, "cpu") as (ctx, made):
                 self._write(ctx.run, splats_of(ctx.run, made), ctx.scene)
 

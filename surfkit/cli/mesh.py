@@ -14,7 +14,7 @@ from surfkit.cli.result import mesh_rows
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
@@ -22,10 +22,10 @@ from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
-from surfkit.run.journal import kept
-from surfkit.run.mesh import MeshOutput, make_mesh, subject
+from surfkit.run.journal import record_events
+from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
 from surfkit.run.method import refuse_mesher
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps_to_mesh
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
@@ -89,14 +89,14 @@ class MeshOf:
         caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
         caches.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
-        with noted(), bars(), loaded(self.run_folder, self.device) as (ctx, made):
+        with collect_notes(), bars(), loaded(self.run_folder, self.device) as (ctx, made):
             run, scene = ctx.run, ctx.scene
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             mesher = None if made.mesh is not None else self.mesh
             maps = nullcontext(run) if mesher is None else with_maps_to_mesh(run, mesher, scene, caches, self.device)
-            with held(run.out), full_disk_in_one_line(run.out), maps as run, kept(run.out):
-                what = subject(run, made, scene, ctx.rasterizer, budget, mesher)
+            with locked(run.out), full_disk_in_one_line(run.out), maps as run, record_events(run.out):
+                what = mesh_input(run, made, scene, ctx.rasterizer, budget, mesher)
                 record = make_mesh(run, mesher or made.mesh, self.delivery, what, made.last_steps)
         show(run, record)
 

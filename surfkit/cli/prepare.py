@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -67,7 +67,7 @@ class Depth:
             print(f"note: {notice}", file=sys.stderr)
         given = preparation.material(scene)
         folder, views = self.data / FOLDER, given.views
-        with held(folder):
+        with locked(folder):
             sweep(folder)
             wanted = preparation.begin(scene, self.again)
             if there := len(views) - len(wanted):

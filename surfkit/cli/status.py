@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.blocks.eta import seconds_left, so_far
+from surfkit.blocks.eta import seconds_elapsed, seconds_left
 from surfkit.cli.table import print_table
 from surfkit.core.clock import clock
 from surfkit.report.status import Block, Status, as_json, status
@@ -80,11 +80,11 @@ def _where(block: Block) -> str:
     left = seconds_left(block) if silent <= SILENT_S else None
     parts += [f"but silent for {clock(silent)}"] * (silent > SILENT_S)
     parts.append(f"step {block.step:,} of {block.steps:,}")
-    parts += [clock(seconds) for seconds in [so_far(block)] if seconds is not None]
+    parts += [clock(seconds) for seconds in [seconds_elapsed(block)] if seconds is not None]
     parts += [f"{clock(seconds)} left" for seconds in [left] if seconds is not None]
     parts.append(f"{block.views} views")
     parts += [f"attempt {block.attempts}"] * (block.attempts > 1)
-    parts += [f"for want of memory {'; then '.join(block.reduced)}"] * bool(block.reduced)
+    parts += [f"after running out of memory: {'; then '.join(block.reduced)}"] * bool(block.reduced)
     return ", ".join(parts)
 
 

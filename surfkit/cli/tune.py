@@ -9,17 +9,16 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.blocks.schedule import Record
-from surfkit.blocks.worker import guarded
+from surfkit.blocks.block import Block, plan_file, read_plan
+from surfkit.blocks.worker import train_block
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.pipeline import opened
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.report.tensorboard import tensorboard
-from surfkit.run.context import RunContext, views_file
-from surfkit.run.notes import noted
-from surfkit.run.stage import CHECKPOINT_EVERY, Intervals, drawer
+from surfkit.run.context import RunContext
+from surfkit.run.notes import collect_notes
+from surfkit.run.stage import CHECKPOINT_EVERY, Intervals, select_rasterizer
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import CacheSettings
@@ -59,14 +58,12 @@ class Tune:
 
     def run(self) -> int:
         """Train the block; the exit status is that of `surfkit train`."""
-        run, path = opened(self.run_folder), self.run_folder / "blocks" / "plan.json"
-        if not path.exists():
-            raise BadInput(f"{path} is not there: the run has no blocks, or its coarse model is not finished")
-        record = read_json(path, Record)
+        run = opened(self.run_folder)
+        record = read_plan(run)
         plan, steps = record.plan, run.recipe.pretrain.steps
         if record.coarse_steps != steps:
-            message = f"{path} is for a coarse model of {record.coarse_steps} steps, not {steps}"
-            raise BadInput(f"{message}; give the surfkit train command again")
+            what = f"{plan_file(run)} is for a coarse model of {record.coarse_steps} steps, not {steps}"
+            raise BadInput(f"{what}; give the surfkit train command again")
         if not 0 <= self.block < len(plan.blocks):
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:
@@ -74,10 +71,11 @@ class Tune:
         caches, intervals = CacheSettings(self.cache, self.resized_copies), Intervals(self.checkpoint_every, 0)
         caches.bytes()
         scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
-        with scalars, noted(), in_one_line(self.run_folder), bars():
-            rasterizer, _ = drawer(self.device)
-            scene = extract.load(views_file(run.out, self.block)).scene  # the data set may be much larger
-            return guarded(RunContext(run, scene, rasterizer, intervals, caches), plan, self.block, self.patience)
+        with scalars, collect_notes(), in_one_line(self.run_folder), bars():
+            rasterizer, _ = select_rasterizer(self.device)
+            block = Block(run, plan, self.block)
+            scene = extract.load(block.views_file).scene  # the data set may be much larger
+            return train_block(RunContext(run, scene, rasterizer, intervals, caches), block, self.patience)
 
 
 COMMAND = Tune

@@ -1,4 +1,4 @@
-"""One process at a time in a folder. The kernel lets go of the lock when its process dies, however it dies."""
+"""One process at a time in a folder. The kernel releases the lock when its process ends, also after kill -9."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ USED = "in-use"
 """File of a folder that several processes may use at once; its time is when one last began to."""
 DAY_S = 86_400
 PATIENCE_S = 0.5
-"""How long to ask again: a process that only looks (`holder`) has the lock for a moment."""
+"""How long to ask again: a process that only looks (`lock_holder`) has the lock for a moment."""
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Within, no other process gets here for this folder, which is made and, if left empty, removed again.
+def locked(folder: Path) -> Iterator[None]:
+    """Within, no other process can lock this folder. It is created if missing, and removed again if left empty.
 
     Raises:
         BadInput: Another process has it; names the process and its host.
     """
     made = _make(folder)
     try:
-        file = _locked(folder / NAME, folder)
+        file = _lock(folder / NAME, folder)
         try:
             yield
         finally:
@@ -46,8 +46,8 @@ def held(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def holder(folder: Path) -> str | None:
-    """Who works in a folder, as "process PID on HOST"; None if nobody does."""
+def lock_holder(folder: Path) -> str | None:
+    """The process that has locked a folder, as "process PID on HOST"; None if none has."""
     import fcntl
 
     try:
@@ -64,8 +64,8 @@ def holder(folder: Path) -> str | None:
 
 
 @contextmanager
-def used(folder: Path) -> Iterator[None]:
-    """Within, `is_used` is true of a folder, for other processes too."""
+def mark_used(folder: Path) -> Iterator[None]:
+    """Within, `is_used` is true for the folder, also in other processes."""
     import fcntl
 
     file = os.open(folder / USED, os.O_RDWR | os.O_CREAT, 0o666)
@@ -104,7 +104,7 @@ def _make(folder: Path) -> list[Path]:
     return missing
 
 
-def _locked(path: Path, folder: Path) -> int | None:
+def _lock(path: Path, folder: Path) -> int | None:
     """The open, locked file; None where the file system has no locks."""
     import fcntl
 

@@ -13,7 +13,7 @@ import inspect
 import os
 import re
 from abc import ABC
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, TypeVar, Union
@@ -214,15 +214,17 @@ def kebab(name: str) -> str:
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).lower()
 
 
-def choice(base: type[Component], optional: bool = False) -> Any:
+def choice(base: type[Component], optional: bool = False, without: Sequence[str] = ()) -> Any:
     """Let `FIELD:NAME` on the command line pick any offered subclass of `base`, and `FIELD:none` if `optional`.
 
     For an annotation: `Annotated[Prune, choice(Prune)]`. The union is made when the command line is, so plugins
-    that are loaded later still appear.
+    that are loaded later still appear. A component that wraps another of its own kind names itself in `without`: the
+    choices on the command line would otherwise have no end.
     """
 
     def union() -> Any:
-        named = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in components(base).items()]
+        known = {name: cls for name, cls in components(base).items() if name not in without}
+        named = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in known.items()]
         members = tuple(named + [None] * optional)
         return Union[members] if members else Annotated[base, tyro.conf.Fixed]  # noqa: UP007 (made at run time)
 

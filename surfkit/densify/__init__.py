@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from surfkit.core.registry import Component, hookimpl
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap, Elongation
+from surfkit.densify.limited import Limited
 from surfkit.densify.prune import Faint, Importance
 from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.densify.trim import Trim
@@ -15,6 +16,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     """Policies, filters and signals, by name."""
     return {
         "adc": ADC,
+        "limited": Limited,
         "elongation": Elongation,
         "count-cap": CountCap,
         "loss-gradient": LossGradient,

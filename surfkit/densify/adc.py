@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import choice
 from surfkit.core.schedule import StepCount, Steps
 from surfkit.densify.base import Densify, Filter, Step, admitted
+from surfkit.densify.filters import CountCap
 from surfkit.primitives.base import SHRINK
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
@@ -106,9 +107,19 @@ class ADC(Densify):
                 drop |= points.stat(SIZE) > self.cull_screen
         return Edit(drop, clone, split, cap)
 
-    def edit_steps(self, steps: int) -> range:
-        """See `Densify.edit_steps`."""
+    def edits(self, steps: int) -> range:
+        """See `Densify.edits`."""
         return range((self.start // self.every + 1) * self.every, min(self.until, steps + 1), self.every)
+
+    @property
+    def most_points(self) -> int | None:
+        """See `Densify.most_points`."""
+        limits = [limit for one in self.filters if (limit := one.most_points) is not None]
+        return min(limits, default=None)
+
+    def limited(self, points: int) -> ADC:
+        """See `Densify.limited`; the points with the largest gradient come first."""
+        return replace(self, filters=(*self.filters, CountCap(points)))
 
     def _due(self, index: int) -> bool:
         return self.start < index < self.until and index % self.every == 0

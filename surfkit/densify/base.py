@@ -99,12 +99,27 @@ class Policy(Component):
 class Densify(Policy):
     """A policy that adds points where detail is missing."""
 
-    def edit_steps(self, steps: int) -> Sequence[int] | None:
-        """The steps 1 to `steps` of a stage after which points may be densified, in order; None if unknown.
+    def edits(self, steps: int) -> Sequence[int] | None:
+        """The steps 1 to `steps` of a stage after which points may be added, in order; None where that is not known.
 
         Where there are none, a note says so before the run.
         """
         return None
+
+    @property
+    def most_points(self) -> int | None:
+        """The number of points beyond which none is added; None where there is no such number."""
+        return None
+
+    def limited(self, points: int) -> Densify:
+        """The same densifier, but one that adds no point beyond a number of `points`.
+
+        It is used where memory has run out and where an ablation limits all rows alike, so the limit must hold. This
+        default wraps the densifier; one with a limit of its own, which knows whom to prefer, lowers that.
+        """
+        from surfkit.densify.limited import Limited
+
+        return Limited(self, points)
 
 
 class Prune(Policy):
@@ -114,9 +129,14 @@ class Prune(Policy):
 class Filter(Component):
     """A condition that a point must meet to be densified."""
 
+    @property
+    def most_points(self) -> int | None:
+        """As for `Densify.most_points`."""
+        return None
+
     @abstractmethod
     def admits(self, step: Step, want: Tensor) -> Tensor:
-        """(N,) bool, the points that may be densified.
+        """(N,) bool, which points may be densified.
 
         Args:
             step: About the N points.

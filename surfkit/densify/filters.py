@@ -35,14 +35,19 @@ class Elongation(Filter):
 
 @dataclass(frozen=True)
 class CountCap(Filter):
-    """Never grow beyond a number of points; those that want it most come first."""
+    """Never add points beyond a number of them; those with the largest densification signal come first."""
 
     points: int = 1_000_000
-    """The most points there may be."""
+    """Largest number of points."""
 
     def __post_init__(self) -> None:
         if self.points < 1:
             raise BadInput(f"filters: count-cap.points is {self.points}; it must be 1 or more")
+
+    @property
+    def most_points(self) -> int:
+        """See `Filter.most_points`."""
+        return self.points
 
     def admits(self, step: Step, want: Tensor) -> Tensor:
         """(N,) bool, as many as there is room for: each adds one."""

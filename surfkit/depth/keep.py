@@ -15,7 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import sweep
-from surfkit.core.lock import USED, held, holder, is_used, used
+from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare import Preparation
 from surfkit.readers.fingerprint import Fingerprint, digest
@@ -71,7 +71,7 @@ def maps(
     with ExitStack() as use:
         with hold_folder(folder, preparation.data.path):
             sweep(folder)
-            use.enter_context(used(folder))
+            use.enter_context(mark_used(folder))
             fresh, made = make_missing(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
         if fresh:
             make_room(folder, budget_bytes)
@@ -85,11 +85,11 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
         told = False
         while True:
             try:
-                inside.enter_context(held(folder))
+                inside.enter_context(locked(folder))
                 break
             except BadInput:
                 if not told:
-                    say(f"waiting for the depth maps that {holder(folder) or 'another process'} makes in {folder}")
+                    say(f"waiting for the depth maps that {lock_holder(folder) or 'another process'} makes in {folder}")
                 told = True
             except FileNotFoundError:  # it was deleted just now, to make room
                 pass
@@ -178,7 +178,7 @@ def drop_folder(folder: Path) -> bool:
     """Delete a folder of maps, unless somebody works with it; whether it is gone."""
     aside = folder.with_name(f"{DROPPED}{folder.name}-{os.getpid()}")
     try:
-        with held(folder):
+        with locked(folder):
             if is_used(folder):
                 return False
             os.replace(folder, aside)

@@ -1,4 +1,4 @@
-"""Who works on the blocks: this process one after the other, or several processes at a time."""
+"""How blocks are trained: one after the other in this process, or in several processes at a time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.execute.remote import DRIVER, INTERRUPTED, POLL_S
-from surfkit.scene.memory import free_bytes
+from surfkit.execute.state import Kind
+from surfkit.scene.memory import free_bytes, oom_kills
 
 LOG = "log.txt"
-"""What a worker process prints, in the folder of its block."""
+"""Output of a worker process, in the folder of its block."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,12 @@ class Job:
     """The work on one block.
 
     Attributes:
-        index: Of the block.
-        folder: Its own.
-        call: Does it in this process and returns the exit status.
-        command: Does it in a process of its own.
+        index: Number of the block.
+        folder: Of the block.
+        call: Runs the job in this process and returns the exit status.
+        command: Arguments of `python` that run the job in a process of its own.
         cost: Expected work, in any unit.
-        memory_bytes: Expected at its peak; 0 if unknown.
+        memory_bytes: Expected peak memory; 0 if unknown.
         needs: Paths that it reads, beside its folder.
     """
 
@@ -48,30 +49,37 @@ class Job:
 
 @dataclass(frozen=True)
 class JobResult:
-    """A job has come to an end.
+    """The end of a job.
 
     Attributes:
-        job: Which.
-        status: 0 when done; negative for the signal that ended it, as `subprocess` has it.
-        why: What the job itself could not tell, such as that its machine is gone.
+        job: Which one.
+        status: Exit status; 0 for success, negative for the signal that ended it, as in `subprocess`.
+        why: A reason that the job itself could not write into its state, such as that its machine was lost.
+        kind: Of a failure that the job itself could not write into its state; None if only its state tells.
     """
 
     job: Job
     status: int
     why: str | None = None
+    kind: Kind | None = None
 
 
 class Executor(Component):
-    """A way to get jobs done. What they leave on disk is the same whoever did them."""
+    """A way to run jobs. What they leave on disk does not depend on the executor."""
+
+    @property
+    def in_process(self) -> bool:
+        """Whether jobs run in this process, and show their own progress."""
+        return False
 
     @property
     @abstractmethod
     def at_once(self) -> int | None:
-        """How many jobs share this machine at a time; None if they run on others, and look there for what is free."""
+        """How many jobs run on this machine at a time; None if they run on other machines."""
 
     @abstractmethod
     def ready(self) -> None:
-        """Look, before hours are spent, whether it can work.
+        """Check that it can run jobs, before the run begins.
 
         Raises:
             BadInput: Something is missing on this machine.
@@ -79,10 +87,10 @@ class Executor(Component):
 
     @abstractmethod
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
-        """Do the jobs and tell of each as it ends. On the way out, nothing is left running.
+        """Run the jobs and yield the result of each when it ends. When the iterator is closed, no job runs any more.
 
         Raises:
-            KeyboardInterrupt: Someone asked to stop; the jobs under way have saved their states.
+            KeyboardInterrupt: The user asked to stop; running jobs have saved their states.
         """
 
 
@@ -91,12 +99,17 @@ class Inline(Executor):
     """One block after the other, in this process."""
 
     @property
+    def in_process(self) -> bool:
+        """See `Executor.in_process`."""
+        return True
+
+    @property
     def at_once(self) -> int:
         """See `Executor.at_once`."""
         return 1
 
     def ready(self) -> None:
-        """See `Executor.ready`; it always can."""
+        """See `Executor.ready`; nothing to check."""
 
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
@@ -115,10 +128,11 @@ class Pool(Executor):
     """Processes at a time."""
 
     threads: int = 0
-    """Of each; 0 divides the processors among them."""
+    """Threads of each; 0 divides the CPU cores among them."""
 
     memory_share: float = 0.9
-    """No further block begins when the expected memory of those under way would exceed this share of what was free."""
+    """No further block is started if the expected memory of all running blocks would exceed this share of the memory
+    that was free."""
 
     def __post_init__(self) -> None:
         if self.workers < 1 or self.threads < 0:
@@ -132,36 +146,37 @@ class Pool(Executor):
         return self.workers
 
     def ready(self) -> None:
-        """See `Executor.ready`; it always can."""
+        """See `Executor.ready`; nothing to check."""
 
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
-        waiting = largest_first(jobs)
-        crew = Crew(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
+        waiting = sort_by_cost(jobs)
+        workers = Workers(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
         room = self.memory_share * free_bytes()
         with terminable():
             try:
-                while waiting or crew.busy:
-                    while waiting and len(crew.busy) < self.workers:
-                        fits = [job for job in waiting if not crew.busy or crew.memory_bytes + job.memory_bytes <= room]
+                while waiting or workers.busy:
+                    while waiting and len(workers.busy) < self.workers:
+                        left = room - workers.memory_bytes
+                        fits = [job for job in waiting if not workers.busy or job.memory_bytes <= left]
                         if not fits:
                             break
                         waiting.remove(fits[0])
-                        crew.begin(fits[0])
-                    yield from crew.ended()
+                        workers.begin(fits[0])
+                    yield from workers.ended()
                     time.sleep(POLL_S)
             finally:
-                crew.stop()
+                workers.stop()
 
 
-def largest_first(jobs: Sequence[Job]) -> list[Job]:
-    """In the order to begin them, so that none of the long ones is left for the end."""
+def sort_by_cost(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs in the order to start them: the longest first, so that none of these is the last to end."""
     return sorted(jobs, key=lambda job: (-job.cost, job.index))
 
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Within, SIGTERM acts as Ctrl-C, so that workers save their states."""
+    """Within, SIGTERM acts like Ctrl-C, so that workers save their states."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -173,19 +188,20 @@ def terminable() -> Iterator[None]:
 
 
 @dataclass
-class Crew:
-    """Worker processes and what each works on."""
+class Workers:
+    """Worker processes and the job of each."""
 
     threads: int
     busy: dict[subprocess.Popen[bytes], Job] = field(default_factory=dict)
+    kills: int = field(default_factory=lambda: oom_kills())
 
     @property
     def memory_bytes(self) -> int:
-        """Expected of the jobs under way."""
+        """Expected memory of the running jobs."""
         return sum(job.memory_bytes for job in self.busy.values())
 
     def begin(self, job: Job) -> None:
-        """Start a process; it gets no Ctrl-C of its own, but is told by `stop`."""
+        """Start a process; it does not receive Ctrl-C, but SIGTERM from `stop`."""
         job.folder.mkdir(parents=True, exist_ok=True)
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         with open(job.folder / LOG, "ab") as log:
@@ -200,14 +216,19 @@ class Crew:
         self.busy[process] = job
 
     def ended(self) -> list[JobResult]:
-        """The jobs that have ended since it was last asked."""
-        over = [process for process in self.busy if process.poll() is not None]
-        return [JobResult(self.busy.pop(process), process.returncode) for process in over]
+        """The results of the jobs that have ended since the last call."""
+        return [self._result(process) for process in list(self.busy) if process.poll() is not None]
+
+    def _result(self, process: subprocess.Popen[bytes]) -> JobResult:
+        """The result of a process that has ended; the kernel tells whether one was killed for lack of memory."""
+        killed = process.returncode == -signal.SIGKILL and oom_kills() > self.kills
+        self.kills += killed
+        return JobResult(self.busy.pop(process), process.returncode, kind="oom" if killed else None)
 
     def stop(self) -> None:
-        """Ask every process to save its state and end, and wait until they have.
+        """Ask every process to save its state and end, and wait for it.
 
-        By SIGTERM: SIGINT is ignored by what a shell has started in the background.
+        With SIGTERM, because processes that a shell has started in the background ignore SIGINT.
         """
         for process in self.busy:
             with suppress(ProcessLookupError):

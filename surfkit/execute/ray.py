@@ -12,38 +12,39 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.execute.base import Executor, Job, JobResult, largest_first, terminable
-from surfkit.execute.remote import CRASHED, POLL_S, attend
-from surfkit.execute.shared import marked, remote_job
+from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost, terminable
+from surfkit.execute.remote import CRASHED, POLL_S, run_remote_job
+from surfkit.execute.shared import mark_folder, remote_job
+from surfkit.execute.state import Kind
 
 REACH_S = 10.0
 STORE_BYTES = 100 << 20
-"""For Ray's object store on this machine, through which next to nothing goes."""
+"""Size of Ray's object store on this machine, which is hardly used."""
 
 
 @dataclass(frozen=True)
 class Ray(Executor):
     """Blocks on the machines of a Ray cluster, each in a process of its own; the largest first.
 
-    Every machine must see run folder and data set at the same paths. A block whose machine is lost goes on from its
+    Every machine must see run folder and data set at the same paths. A block whose machine is lost continues from its
     checkpoint on another one. Needs `pip install 'surfkit[ray]'`.
     """
 
     address: str = ""
-    """Of the cluster to join, as HOST:PORT, or auto for the one that this machine is part of; if left out, Ray is
+    """Address of the cluster, as HOST:PORT, or auto for the one that this machine belongs to; if left out, Ray is
     started on this machine alone."""
 
     cpus: int = 0
-    """Processors of each block; 0 divides those of the cluster among the blocks under way."""
+    """CPU cores of each block; 0 divides those of the cluster among the running blocks."""
 
     gpus: float = 0.0
-    """Graphics processors of each block; with 0.5, two share one. With 0 it sees none."""
+    """GPUs of each block; with 0.5, two blocks share one. With 0 a block sees none."""
 
     memory_gb: float = 0.0
-    """Memory to reserve for each block; 0 takes what is expected of the largest, or a whole machine if it has less."""
+    """Memory to reserve for each block; 0 takes what the largest should need, or a whole machine if it has less."""
 
     retries: int = 3
-    """How often a block is begun again because its machine was lost."""
+    """How often a block is started again because its machine was lost."""
 
     def __post_init__(self) -> None:
         if self.cpus < 0 or self.memory_gb < 0 or self.retries < 0:
@@ -68,11 +69,11 @@ class Ray(Executor):
 
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
-        with _connected(self.address) as ray, marked(jobs) as mark:
+        with _connected(self.address) as ray, mark_folder(jobs) as mark:
             share = self.share([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
-            task = ray.remote(max_retries=self.retries, **share)(attend)
+            task = ray.remote(max_retries=self.retries, **share)(run_remote_job)
             what = {job.index: remote_job(job, mark, int(share["num_cpus"]), self.gpus > 0) for job in jobs}
-            under_way = {task.remote(what[job.index]): job for job in largest_first(jobs)}
+            under_way = {task.remote(what[job.index]): job for job in sort_by_cost(jobs)}
             try:
                 while under_way:
                     for ref in ray.wait(list(under_way), timeout=POLL_S)[0]:
@@ -84,11 +85,11 @@ class Ray(Executor):
                     ray.wait(list(under_way), num_returns=len(under_way))
 
     def share(self, nodes: Sequence[dict[str, float]], jobs: Sequence[Job]) -> dict[str, float]:
-        """What each block reserves, in Ray's words: the same for all, so that Ray keeps their order.
+        """Resources of each block, as Ray names them: the same for all, so that Ray keeps their order.
 
         Args:
-            nodes: What each machine of the cluster has.
-            jobs: What there is to do.
+            nodes: Resources of each machine of the cluster.
+            jobs: The jobs.
 
         Raises:
             BadInput: No machine has as much.
@@ -110,7 +111,7 @@ class Ray(Executor):
         return {"num_cpus": int(cpus), "num_gpus": self.gpus, "memory": int(memory)}
 
     def _fair(self, nodes: Sequence[dict[str, float]], jobs: int, memory: float) -> int:
-        """Processors for each of as many blocks as can be under way."""
+        """CPU cores for each block when as many blocks run as have room."""
         room = 0
         for node in nodes:
             most = [node.get("CPU", 0)]
@@ -129,7 +130,7 @@ def _imported() -> ModuleType:
 
 @contextmanager
 def _connected(address: str) -> Iterator[ModuleType]:
-    """Ray, connected; within, SIGTERM acts as Ctrl-C does, and not as Ray would have it."""
+    """Ray, connected; within, SIGTERM acts like Ctrl-C, instead of as Ray defines it."""
     ray = _imported()
     own = not ray.is_initialized()
     with terminable():
@@ -170,11 +171,19 @@ def _reach(address: str) -> None:
 
 
 def _ended(ray: ModuleType, ref: Any, job: Job) -> JobResult:
-    """What became of a job whose task is over."""
+    """The result of a job whose task has ended."""
     try:
         found = ray.get(ref)
     except ray.exceptions.RayError as error:
-        told = str(error).strip().splitlines()
-        why = f"{type(error).__name__}: {told[0] if told else 'Ray says no more'}"
-        return JobResult(job, CRASHED, f"Ray could not do it: {why}")
-    return JobResult(job, found.status, found.why)
+        lines = str(error).strip().splitlines()
+        why = f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
+        return JobResult(job, CRASHED, f"Ray could not run it: {why}", _kind_of(ray, error))
+    return JobResult(job, found.status, found.why, found.kind)
+
+
+def _kind_of(ray: ModuleType, error: Exception) -> Kind:
+    """The kind of failure that an error of Ray means."""
+    if isinstance(error, ray.exceptions.OutOfMemoryError):
+        return "oom"
+    lost = (ray.exceptions.NodeDiedError, ray.exceptions.WorkerCrashedError, ray.exceptions.LocalRayletDiedError)
+    return "lost" if isinstance(error, lost) else "crash"

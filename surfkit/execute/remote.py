@@ -1,6 +1,6 @@
 """A command that is run on another machine, which sees the same folders.
 
-What is imported here is all that the agents of a cluster load for it: no torch, only what starts and stops a process.
+The agents of a cluster import only this module and what it imports: no torch, only what starts and stops a process.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from surfkit.core.version import own_version
+from surfkit.scene.memory import oom_kills
 
 DRIVER = "SURFKIT_DRIVER"
-"""Names the process that a worker works for; without it, the worker stops."""
+"""Environment variable with the process that started a worker; when that process is gone, the worker stops."""
 INTERRUPTED, CRASHED = 130, 70
-"""Exit statuses: someone asked to stop; something went wrong that nobody foresaw."""
+"""Exit statuses: asked to stop; an unexpected error."""
 POLL_S = 0.2
-CARRIED = ("PYTHONPATH", "SURFKIT_PLUGINS")
-"""Variables of whoever asks, without which another machine might run other code."""
+FORWARDED = ("PYTHONPATH", "SURFKIT_PLUGINS")
+"""Environment variables of the driver that decide which code runs."""
 WATCHDOG = f"""
 import os, signal, subprocess, sys
 agent = int(os.environ["{DRIVER}"])
@@ -47,40 +48,43 @@ if status < 0:
     os.kill(os.getpid(), -status)
 sys.exit(status)
 """
-"""Stands between an agent and the command, and stops it when the agent is gone. An agent of Ray that has to go kills
-its children first, without a chance to save anything; that is this process, and the command notices that it is alone.
-By SIGUSR2, Slurm tells every process of a job that its time is nearly up; the agent knows what to do then."""
+"""A process between an agent and the command that stops the command when the agent is gone. An agent of Ray that is
+stopped first kills its children, which then cannot save anything; it kills this process, and the command notices that.
+With SIGUSR2, Slurm tells every process of a job that its time limit is near; only the agent reacts to it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an errand.
+    """The end of a remote job.
 
     Attributes:
         status: Exit status; negative for the signal that ended it.
-        host: Where.
-        why: Why it was not even begun.
+        host: The machine it ran on.
+        why: Why it was not started; None if it was.
+        kind: Of a failure that the command itself could not record: its machine cannot run it ("data"), or the kernel
+            killed it for lack of memory ("oom"); else None.
     """
 
     status: int
     host: str
     why: str | None = None
+    kind: Literal["data", "oom"] | None = None
 
 
 @dataclass
 class RemoteJob:
-    """A command, and what its machine has to have.
+    """A command, and what its machine must have.
 
     Attributes:
-        words: After `python`.
-        log: Gets what it prints; its folder must be there, and writable.
-        needs: Paths that must be there, too.
-        threads: That it may use.
-        version: Of surfkit, which must be the same.
-        carried: Variables of the environment of whoever asks.
-        hold_s: Seconds to wait for our own end when someone else interrupted the command: when a cluster preempts a
-            job, it tells every process, and it is not for us to call the job done.
-        process: The one that was started here.
+        words: Arguments of `python`.
+        log: File for its output; its folder must exist and be writable.
+        needs: Other paths that must exist.
+        threads: Number of CPU threads that it may use.
+        version: Of surfkit; must be the same on the machine.
+        variables: Environment variables of the driver.
+        hold_s: Seconds to wait before returning after the command was interrupted. A cluster that preempts a job sends
+            a signal to every process, and will end this one soon; returning earlier would mark the job as done.
+        process: The process that was started here.
     """
 
     words: tuple[str, ...]
@@ -88,15 +92,15 @@ class RemoteJob:
     needs: tuple[Path, ...] = ()
     threads: int = 1
     version: str = field(default_factory=own_version)
-    carried: Mapping[str, str] = field(default_factory=lambda: _carried())
+    variables: Mapping[str, str] = field(default_factory=lambda: _forwarded())
     hold_s: float = 0.0
     process: subprocess.Popen[bytes] | None = None
 
     def __call__(self) -> Outcome:
         """Run it here and wait for its end; when this process is interrupted, the command saves its state first."""
-        host = socket.gethostname()
-        if lacking := self.lacking():
-            return Outcome(2, host, f"machine {host}: {lacking}")
+        host, kills = socket.gethostname(), oom_kills()
+        if missing := self.missing():
+            return Outcome(2, host, f"machine {host}: {missing}", "data")
         try:
             self.begin()
             while self.process.poll() is None:
@@ -105,10 +109,11 @@ class RemoteJob:
             self.stop()
         if self.process.returncode == INTERRUPTED:
             time.sleep(self.hold_s)
-        return Outcome(self.process.returncode, host)
+        killed = self.process.returncode == -signal.SIGKILL and oom_kills() > kills
+        return Outcome(self.process.returncode, host, kind="oom" if killed else None)
 
-    def lacking(self) -> str | None:
-        """What this machine has not, in words."""
+    def missing(self) -> str | None:
+        """What this machine lacks to run it, as a message; None if nothing."""
         for path in (self.log.parent, *self.needs):
             if not path.exists():
                 return f"{path} is not there; run folder and data set must lie at the same paths on all machines"
@@ -119,12 +124,12 @@ class RemoteJob:
         return None
 
     def begin(self) -> None:
-        """Start it."""
+        """Start the process."""
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
         with open(self.log, "ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", WATCHDOG, *self.words],
-                env={**os.environ, **self.carried, **limits, DRIVER: str(os.getpid())},
+                env={**os.environ, **self.variables, **limits, DRIVER: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -140,23 +145,23 @@ class RemoteJob:
             os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOWAIT)
 
     def checkpoint(self) -> Any:
-        """What submitit calls before a job ends at its time limit or is preempted: the errand that goes on later."""
+        """What submitit calls before a job ends at its time limit or is preempted: the job to submit again."""
         from submitit.helpers import DelayedSubmission
 
         self.stop()
         return DelayedSubmission(replace(self, process=None))
 
 
-def attend(remote_job: RemoteJob) -> Outcome:
-    """Run an errand; a function of its own, as Ray wants it.
+def run_remote_job(remote_job: RemoteJob) -> Outcome:
+    """Run a remote job; a function, as Ray needs one.
 
-    Ray cancels by a simulated Ctrl-C, which means nothing where that is ignored, as by all that a shell begins in the
-    background; the driver would then wait for ever.
+    Ray cancels by a simulated Ctrl-C. Processes that a shell starts in the background ignore Ctrl-C, and the driver
+    would then wait for ever.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return remote_job()
 
 
-def _carried() -> dict[str, str]:
-    return {name: os.environ[name] for name in CARRIED if name in os.environ}
+def _forwarded() -> dict[str, str]:
+    return {name: os.environ[name] for name in FORWARDED if name in os.environ}

@@ -1,4 +1,4 @@
-"""Jobs for machines that see the same folders as this one."""
+"""Jobs for machines that share a file system with this one."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ MARK = ".seen-from-all-"
 
 
 @contextmanager
-def marked(jobs: Sequence[Job]) -> Iterator[Path]:
-    """Within, a file lies beside the folders of the jobs by which they know that they see the same disk.
+def mark_folder(jobs: Sequence[Job]) -> Iterator[Path]:
+    """Within, a marker file beside the folders of the jobs shows other machines that they see the same disk.
 
-    A folder of that path may well be on another machine's own disk, with an earlier copy of the run in it.
+    Without it, the same path on another machine's own disk, with an earlier copy of the run, would go unnoticed.
     """
     beside = jobs[0].folder.resolve().parent
     beside.mkdir(parents=True, exist_ok=True)
-    for left in beside.glob(f"{MARK}*"):  # by a driver that was killed
+    for left in beside.glob(f"{MARK}*"):  # of a driver that was killed
         left.unlink(missing_ok=True)
     with tempfile.NamedTemporaryFile(dir=beside, prefix=MARK) as file:
         yield Path(file.name)
 
 
 def remote_job(job: Job, mark: Path, threads: int, gpu: bool) -> RemoteJob:
-    """A job as another machine does it.
+    """A job to be run on another machine.
 
     Args:
-        job: What there is to do.
-        mark: See `marked`.
-        threads: That it may use.
-        gpu: Whether it may see the graphics processors that the cluster gave it; whoever was given none would else take
-            those of others.
+        job: The job.
+        mark: See `mark_folder`.
+        threads: Number of CPU threads that it may use.
+        gpu: Whether it may use the GPUs that the cluster has given it; without this, a job that was given none would
+            use those of others.
     """
     folder = job.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     made = RemoteJob(job.command, folder / LOG, (mark, *(path.absolute() for path in job.needs)), threads)
-    return made if gpu else replace(made, carried={**made.carried, "CUDA_VISIBLE_DEVICES": ""})
+    return made if gpu else replace(made, variables={**made.variables, "CUDA_VISIBLE_DEVICES": ""})

@@ -20,27 +20,34 @@ from typing import Any, Literal
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.optional import needed
-from surfkit.execute.base import Executor, Job, JobResult, largest_first, terminable
+from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost, terminable
 from surfkit.execute.remote import CRASHED, POLL_S, RemoteJob
-from surfkit.execute.shared import marked, remote_job
-from surfkit.execute.state import worked_on
+from surfkit.execute.shared import mark_folder, remote_job
+from surfkit.execute.state import Kind, find_worker
 
 SLURM_POLL_S = 1.0
 SQUEUE = ("squeue", "--noheader", "--array", "--states=all", "--format=%i %T %r")
 """States and reasons of jobs, also of those that are over."""
 USUAL = ("None", "Priority", "Resources", "BeginTime")
-"""Reasons to wait that need no word."""
+"""Reasons to wait that are not printed."""
 JOBS = "jobs"
 """Folder of what submitit writes, beside the folders of the blocks."""
 ASK_S = 30.0
-"""Seconds between two questions to Slurm."""
+"""Seconds between two queries of Slurm."""
 HOLD_S, LEAVE_S = 120.0, 60.0
-"""How long a job that was told to end waits until Slurm ends it, and how long we wait for those that we cancelled."""
+"""How long a job that was asked to end waits until Slurm ends it, and how long we wait for those that we cancelled."""
 ARRIVE_S = 90.0
 """How long after its end the result of a job may take to be seen here."""
 ALIVE = ("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "COMPLETING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED")
 ALIVE += ("RESIZING", "SIGNALING", "STAGE_OUT", "STOPPED", "SPECIAL_EXIT", "PREEMPTED")
 """States of jobs that may still come to a result."""
+
+KINDS: dict[tuple[str, ...], Kind] = {
+    ("OUT_OF_MEMORY",): "oom",
+    ("NODE_FAIL", "BOOT_FAIL", "gone"): "lost",
+    ("CANCELLED",): "interrupted",
+}
+"""States of jobs that have left no result, and the kinds of failure that they mean."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +60,13 @@ class Slurm(Executor):
     """
 
     cluster: Literal["slurm", "local", "debug"] = "slurm"
-    """Whose jobs: slurm; local starts processes on this machine; debug does one block after the other, in ours."""
+    """Where jobs run: slurm; local starts processes on this machine; debug runs one block after the other."""
 
     partition: str = ""
-    """Of Slurm, to submit to; its default if left out."""
+    """Slurm partition to submit to; its default if left out."""
 
     account: str = ""
-    """To charge; your default if left out."""
+    """Slurm account to charge; your default if left out."""
 
     hours: float = 24.0
     """Time limit of each job. One that has not finished by then is queued again."""
@@ -68,13 +75,13 @@ class Slurm(Executor):
     """How often a job may reach its time limit and be queued again."""
 
     cpus: int = 8
-    """Processors of each job."""
+    """CPU cores of each job."""
 
     gpus: int = 0
-    """Graphics processors of each job, 0 or 1. With 0 it sees none."""
+    """GPUs of each job, 0 or 1. With 0 a job sees none."""
 
     memory_gb: float = 0.0
-    """Memory of each job; 0 takes what is expected of the largest block."""
+    """Memory of each job; 0 takes what the largest block is expected to need."""
 
     parallel: int = 0
     """Jobs at a time; 0 leaves it to Slurm, and is 1 for local."""
@@ -101,7 +108,7 @@ class Slurm(Executor):
 
     @property
     def _limit(self) -> int:
-        """Jobs of ours to be submitted at a time, where nobody else counts them."""
+        """Jobs submitted at a time, where Slurm does not limit them."""
         return 1 if self.cluster == "debug" else max(1, self.parallel)
 
     def ready(self) -> None:
@@ -116,21 +123,21 @@ class Slurm(Executor):
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         self.ready()
-        waiting, queue = largest_first(jobs), Queue(self.cluster)
-        with terminable(), marked(jobs) as mark:
+        waiting, queue = sort_by_cost(jobs), Queue(self.cluster)
+        with terminable(), mark_folder(jobs) as mark:
             executor = self._submitter(mark.parent / JOBS, jobs)
             try:
                 while waiting or queue.jobs:
                     room = len(waiting) if self.cluster == "slurm" else self._limit - len(queue.jobs)
                     if batch := waiting[:room]:
                         del waiting[:room]
-                        queue.submit(executor, batch, [self._errand(job, mark) for job in batch])
+                        queue.submit(executor, batch, [self._remote_job(job, mark) for job in batch])
                     yield from queue.ended()
                     time.sleep(POLL_S if self.cluster != "slurm" else SLURM_POLL_S)
             finally:
                 queue.cancel()
 
-    def _errand(self, job: Job, mark: Path) -> RemoteJob:
+    def _remote_job(self, job: Job, mark: Path) -> RemoteJob:
         if self.cluster == "slurm":
             return replace(remote_job(job, mark, self.cpus, self.gpus > 0), hold_s=HOLD_S)
         return remote_job(job, mark, min(self.cpus, max(1, len(os.sched_getaffinity(0)) // self._limit)), self.gpus > 0)
@@ -156,10 +163,10 @@ class Slurm(Executor):
 
 
 @contextmanager
-def _heard() -> Iterator[None]:
-    """Within, processes are begun that hear Ctrl-C, by which submitit cancels them on this machine.
+def _interruptible() -> Iterator[None]:
+    """Within, started processes receive Ctrl-C, by which submitit cancels them on this machine.
 
-    What a shell has begun in the background ignores it, and so would all that it begins.
+    A process that a shell has started in the background ignores Ctrl-C, and so would the processes that it starts.
     """
     before = signal.getsignal(signal.SIGINT)
     ignored = before is signal.SIG_IGN and threading.current_thread() is threading.main_thread()
@@ -174,7 +181,7 @@ def _heard() -> Iterator[None]:
 
 @dataclass
 class Queue:
-    """Jobs that were submitted, and what each works on.
+    """Jobs that were submitted, and the block of each.
 
     Attributes:
         cluster: Whose.
@@ -188,12 +195,12 @@ class Queue:
     states: dict[Any, tuple[str, float]] = field(default_factory=dict)
     asked: float = -math.inf
 
-    def submit(self, executor: Any, batch: Sequence[Job], errands: Sequence[RemoteJob]) -> None:
+    def submit(self, executor: Any, batch: Sequence[Job], remote_jobs: Sequence[RemoteJob]) -> None:
         """Submit some jobs; to Slurm, as one array."""
         submitit = _imported()
         try:
-            with _heard(), executor.batch():
-                handles = [executor.submit(what) for what in errands]
+            with _interruptible(), executor.batch():
+                handles = [executor.submit(what) for what in remote_jobs]
         except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError) as error:
             reason = " ".join(str(error).split())
             raise BadInput(f"executor:slurm: Slurm does not take the jobs: {reason}") from error
@@ -202,7 +209,7 @@ class Queue:
             say(f"block {job.index}: job {handle.job_id}")
 
     def ended(self) -> Iterator[JobResult]:
-        """The jobs that have ended since it was last asked."""
+        """The results of the jobs that have ended since the last call."""
         if self.cluster == "slurm":
             self.ask()
         for handle, job in list(self.jobs.items()):
@@ -213,19 +220,18 @@ class Queue:
             elif state and state.split()[0] not in ALIVE and time.monotonic() - since > ARRIVE_S:
                 del self.jobs[handle]
                 why = f"job {handle.job_id} is {state} in Slurm and has left no result; see {handle.paths.stderr}"
-                yield JobResult(
-                    job, 1 if state.startswith("CANCELLED") else CRASHED, why
-                )  # what a person cancels stays so
+                cancelled = state.startswith("CANCELLED")  # by a person, so it is not tried again
+                yield JobResult(job, 1 if cancelled else CRASHED, why, _kind_of(state))
 
     def ask(self) -> None:
-        """Ask Slurm where the jobs are; by squeue, for not every cluster keeps accounts of what is over."""
+        """Ask Slurm for the states of the jobs; with squeue, as not every cluster keeps accounts of past jobs."""
         if time.monotonic() - self.asked < ASK_S:
             return
         self.asked = time.monotonic()
-        told = subprocess.run([*SQUEUE, "--me"], capture_output=True, text=True)
-        if told.returncode:  # the controller is away; it comes back
+        answer = subprocess.run([*SQUEUE, "--me"], capture_output=True, text=True)
+        if answer.returncode:  # the controller does not answer now
             return
-        found = dict(line.split(maxsplit=1) for line in told.stdout.splitlines())
+        found = dict(line.split(maxsplit=1) for line in answer.stdout.splitlines())
         for handle, job in self.jobs.items():
             state, _, reason = found.get(handle.job_id, "gone").partition(" ")
             state += f" ({reason})" if reason and reason not in USUAL else ""
@@ -234,13 +240,13 @@ class Queue:
                 say(f"block {job.index}: job {handle.job_id} is {state}")
 
     def cancel(self) -> None:
-        """Cancel every job, and wait until none works on a block any more."""
+        """Cancel every job, and wait until none trains a block any more."""
         if self.jobs:
             say(f"{len(self.jobs)} jobs are cancelled; the same command goes on with their blocks")
         for handle in self.jobs:
             handle.cancel(check=False)
         until = time.monotonic() + LEAVE_S
-        while time.monotonic() < until and any(worked_on(job.folder) for job in self.jobs.values()):
+        while time.monotonic() < until and any(find_worker(job.folder) for job in self.jobs.values()):
             time.sleep(POLL_S)
         self.jobs.clear()
 
@@ -252,11 +258,20 @@ def _imported() -> ModuleType:
 
 
 def _ended(handle: Any, job: Job) -> JobResult:
-    """What became of a job that is over."""
+    """The result of a job that has ended."""
     error = handle.exception()
     if error is None:
         found = handle.result()
-        return JobResult(job, found.status, found.why)
-    told = [line for line in str(error).splitlines() if line.strip(" -")]
-    last = next((line for line in reversed(told) if "Error" in line), told[0] if told else "no log")
-    return JobResult(job, CRASHED, f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}")
+        return JobResult(job, found.status, found.why, found.kind)
+    lines = [line for line in str(error).splitlines() if line.strip(" -")]
+    last = next((line for line in reversed(lines) if "Error" in line), lines[0] if lines else "no log")
+    why = f"job {handle.job_id} came to no result: {last.strip()}; see {handle.paths.stderr}"
+    return JobResult(job, CRASHED, why, _kind_of(handle.state))
+
+
+def _kind_of(state: str) -> Kind:
+    """The kind of failure that a state of a Slurm job without a result means."""
+    for words, kind in KINDS.items():
+        if state.startswith(words):
+            return kind
+    return "crash"

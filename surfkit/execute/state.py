@@ -1,49 +1,49 @@
-"""Where the work on a block stands, in a small file that whoever looks can read."""
+"""The state of the training of a block, in a small file that any process can read."""
 
 from __future__ import annotations
 
 import os
 import platform
-import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json, write_json
-from surfkit.core.lock import holder
+from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.lock import lock_holder
 
 Status = Literal["planned", "running", "done", "failed"]
-Kind = Literal["oom", "nan", "disk", "data", "fault", "crash", "interrupted"]
-"""Why a block failed: memory, numbers or disk gave out, its data cannot be used, something else that was foreseen, or
-was not, or someone asked it to stop."""
+Kind = Literal["oom", "nan", "disk", "data", "fault", "crash", "lost", "interrupted"]
+"""Why a block failed: out of memory, NaN or Inf, disk full, unusable data, another error with a message, an unexpected
+error, its machine was lost, or it was asked to stop."""
 
 STALE_S = 120.0
-"""Seconds without a sign of life after which a block of another machine counts as abandoned."""
-_WRITING = threading.Lock()
+"""Seconds without a heartbeat after which a block of another machine counts as abandoned."""
+FORMER_NAMES = {"rung": "fallback", "eased": "reduced"}
+"""Fields of older versions, and what they are called now."""
 
 
 @dataclass(frozen=True)
 class BlockState:
-    """Where one block stands.
+    """The state of one block.
 
     Attributes:
         status: planned, running, done or failed.
-        step: Steps made, as last heard of.
-        steps: Steps to make.
-        attempts: How often it was begun.
+        step: Steps done, at the last heartbeat.
+        steps: Steps to do.
+        attempts: How often it was started.
         kind: Of the failure.
-        error: What went wrong, in one line.
-        host: The machine that works or worked on it.
+        error: The reason of the failure, in one line.
+        host: The machine that trains or trained it.
         pid: The process.
-        heard: When it last gave a sign of life, seconds since 1970.
-        began: When it was last begun.
-        first: Step after which it was.
-        begun_points: At its first step.
-        fallback: Of the ladder that it has come down for want of memory; 0 for none.
-        most_points: Beyond which it does not grow, on its rung.
-        reduced: What each rung has changed, in a few words.
+        heard: Time of the last heartbeat, seconds since 1970.
+        began: When it was last started, seconds since 1970.
+        first: Step after which it was last started.
+        begun_points: Points at its first step.
+        fallback: Number of the last fallback that was used after it ran out of memory; 0 for none.
+        most_points: Its limit on the number of points, by that fallback; None for none.
+        reduced: What each fallback has changed, in a few words.
     """
 
     status: Status = "planned"
@@ -63,13 +63,13 @@ class BlockState:
     reduced: tuple[str, ...] = ()
 
 
-def worked_on(folder: Path) -> str | None:
-    """Who works on the block in a folder, as "process PID on HOST": it holds the lock, or was heard of elsewhere."""
-    return heard_elsewhere(folder) or holder(folder)
+def find_worker(folder: Path) -> str | None:
+    """The process that trains the block in a folder, as "process PID on HOST": by its lock, or by its heartbeat."""
+    return find_remote_worker(folder) or lock_holder(folder)
 
 
-def heard_elsewhere(folder: Path) -> str | None:
-    """Who works on the block on another machine, as far as signs of life tell: not all file systems share locks."""
+def find_remote_worker(folder: Path) -> str | None:
+    """The process that trains the block on another machine, by its heartbeat: not all file systems share locks."""
     state = read_state(folder)
     if state.status != "running" or state.host == platform.node() or time.time() - state.heard >= STALE_S:
         return None
@@ -77,27 +77,35 @@ def heard_elsewhere(folder: Path) -> str | None:
 
 
 def state_path(folder: Path) -> Path:
-    """Where the state of a block lies in its folder."""
+    """The file of the state in the folder of a block."""
     return folder / "state.json"
 
 
 def read_state(folder: Path) -> BlockState:
-    """The state of the block in a folder; planned if nothing is there.
+    """The state of the block in a folder; planned if there is no file.
 
     Raises:
         BadInput: The file is damaged.
     """
     path = state_path(folder)
     try:
-        return read_json(path, BlockState) if path.exists() else BlockState()
+        return load_state(read_json(path, dict[str, Any]), str(path)) if path.exists() else BlockState()
     except BadInput as error:
         raise BadInput(f"{error}; delete it, and the block goes on from its last checkpoint") from error
 
 
-def write_state(folder: Path, **changes: object) -> BlockState:
-    """Change some of the state of a block, and sign it. Only one process does, but any of its threads."""
-    signed = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
-    with _WRITING:
-        state = replace(read_state(folder), **(signed | changes))
-        write_json(state_path(folder), state)
+def load_state(content: dict[str, Any], where: str) -> BlockState:
+    """A state from the content of its file, also of one that an older version has written.
+
+    Raises:
+        BadInput: It is damaged; `where` begins the message.
+    """
+    return load(BlockState, {FORMER_NAMES.get(name, name): value for name, value in content.items()}, where)
+
+
+def write_state(folder: Path, state: BlockState, **changes: object) -> BlockState:
+    """Save a state of a block with some changes, as a heartbeat of this process; the new state."""
+    heartbeat = {"host": platform.node(), "pid": os.getpid(), "heard": time.time()}
+    state = replace(state, **(heartbeat | changes))
+    write_json(state_path(folder), state)
     return state

@@ -9,7 +9,6 @@ from typing import Any
 from surfkit.core.check import BadInput
 from surfkit.core.registry import unknown
 from surfkit.core.tree import evolve
-from surfkit.densify.filters import CountCap
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe, unused, without_unused
 
@@ -98,16 +97,19 @@ def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
     return with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
 
 
-def capped(recipe: Recipe, points: int | None) -> Recipe:
-    """The recipe with a limit on the number of points, if there is one to set."""
+def limit_points(recipe: Recipe, points: int | None) -> Recipe:
+    """The recipe with pretraining limited to a number of points; None sets no limit.
+
+    Raises:
+        BadInput: The number is below 1.
+    """
     if points is None:
         return recipe
-    limit = CountCap(points)
+    if points < 1:
+        raise BadInput(f"--max-points {points}: give 1 or more")
     recipe = replace(recipe, start=recipe.start.limited(points))
-    if recipe.pretrain.densify is None:
-        return recipe
-    filters = getattr(recipe.pretrain.densify, "filters", ())
-    return evolve(recipe, "pretrain.densify.filters", (*filters, limit))
+    densify = recipe.pretrain.densify
+    return recipe if densify is None else evolve(recipe, "pretrain.densify", densify.limited(points))
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.blocks.schedule import Record
+from surfkit.blocks.block import plan_file, read_plan
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.images.measure import Draw
@@ -75,10 +74,10 @@ def seams_of(run: Run, frame: Frame, distance: Distance) -> Seams:
     Raises:
         BadInput: It has none, or the distance is in metres and nobody knows how long a unit is.
     """
-    path = run.out / "blocks" / "plan.json"
+    path = plan_file(run)
     if not path.exists():
         raise BadInput(f"--seams: no {path}: the run is not one in blocks, or they are deleted; leave --seams out")
-    cells = read_json(path, Record).plan.cells
+    cells = read_plan(run).plan.cells
     if cells.count < 2:
         raise BadInput(f"--seams: {path} has one block, and so no borders; leave --seams out")
     if distance == "auto":

@@ -8,11 +8,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from surfkit.blocks.eta import all_left
+from surfkit.blocks.eta import total_seconds_left
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
-from surfkit.core.lock import holder
+from surfkit.core.lock import lock_holder
 from surfkit.evaluate.metrics import read_metrics
+from surfkit.execute.state import read_state
 from surfkit.run import journal
 
 NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
@@ -57,7 +58,7 @@ class Block:
 
 
 KNOWN = tuple(field.name for field in fields(Block) if field.name not in ("index", "views"))
-"""What a block's state says of it."""
+"""What is shown of the state of a block."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def status(out: Path) -> Status:
     Raises:
         BadInput: There is no run.
     """
-    recipe, record, process = out / "recipe.json", out / "run.json", holder(out)
+    recipe, record, process = out / "recipe.json", out / "run.json", lock_holder(out)
     if not recipe.exists() or not record.exists():
         doing = f"; {process} is about to begin one" if process else ""
         raise BadInput(f"{out}: no run folder (no recipe.json and run.json in it){doing}")
@@ -151,10 +152,8 @@ def _blocks(folder: Path) -> tuple[Block, ...]:
         raise BadInput(f"{path}: damaged; delete {folder}, and the surfkit train command plans again") from error
     found = []
     for index, count in enumerate(views):
-        state = folder / f"{index:03}" / "state.json"
-        said = read_json(state, dict[str, Any]) if state.exists() else {}
-        known = {name: said[name] for name in KNOWN if said.get(name) is not None}
-        found.append(load(Block, {"index": index, "views": count} | known, str(state)))
+        state = read_state(folder / f"{index:03}")
+        found.append(Block(index, count, **{name: getattr(state, name) for name in KNOWN}))
     return tuple(found)
 
 
@@ -162,7 +161,7 @@ def _left(stage: float | None, blocks: tuple[Block, ...]) -> float | None:
     """Seconds to the end of the blocks, while some are left to tune, else of the stage."""
     tuned = [block for block in blocks if block.views]
     waiting = any(block.status != "done" for block in tuned)
-    found = all_left(tuned, max(block.steps for block in tuned)) if waiting else stage
+    found = total_seconds_left(tuned, max(block.steps for block in tuned)) if waiting else stage
     return None if found is None else round(found, 1)
 
 

@@ -23,11 +23,12 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
-from surfkit.report.ablation import Table, build, capped, pick, scaled
+from surfkit.report.ablation import Table, build, limit_points, pick, scaled
 from surfkit.report.compare import compare, figures
 from surfkit.report.table import markdown
 from surfkit.report.truth import Truth
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
+from surfkit.run.stage import select_rasterizer
 
 TRACE = "failed.txt"
 """Where a run that failed in an unforeseen way leaves its traceback."""
@@ -132,7 +133,7 @@ def sized(recipe: Recipe, plan: Plan) -> Recipe:
     if plan.truth is not None and recipe.mesh is None and "mesh" not in recipe.unused:
         recipe = replace(recipe, mesh=TSDF())
     recipe = scaled(recipe, plan.table, plan.steps)
-    return capped(recipe, plan.max_points) if recipe.has_stages else recipe
+    return limit_points(recipe, plan.max_points) if recipe.has_stages else recipe
 
 
 def unfinished(every: Sequence[Trial], labels: Collection[str], outcomes: Collection[Path]) -> list[Trial]:
@@ -178,7 +179,7 @@ def refuse_unusable(plan: Plan) -> None:
     """BadInput for what would make every run fail, before anything is written."""
     if plan.out.exists() and not plan.out.is_dir():
         raise BadInput(f"--out {plan.out}: a file, not a folder; name another one")
-    pipeline.drawer(plan.device)
+    select_rasterizer(plan.device)
     if not read(plan.data).held_out:
         raise BadInput("no photograph is kept from training, so rows cannot be compared; see --test-every")
     if plan.truth is not None:
@@ -192,7 +193,7 @@ def attempt(trial: Trial, plan: Plan) -> Outcome:
         if found is None:
             found = figures(pipeline.run(trial.recipe, plan.data, trial.folder, Compute(plan.device)))
         if plan.truth is not None:
-            with noted():
+            with collect_notes():
                 found = figures(plan.truth.measure(trial.folder, plan.out))
     except (BadInput, Fault) as error:
         return Outcome(found, " ".join(str(error).split()))

@@ -1,38 +1,69 @@
-"""A run folder: what lies where, what it was made from, and whether this run may go on in it."""
+"""A run folder: what lies where, its stages, and what it was made from."""
 
 from __future__ import annotations
 
-import itertools
-import json
-import platform
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, load, read_json, write_json
-from surfkit.core.events import FileWritten, PhotoSkipped, Warned, emit
-from surfkit.core.registry import records
-from surfkit.core.schedule import rescale_like
-from surfkit.core.version import own_version
+from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.events import FileWritten, emit
 from surfkit.primitives.base import Primitive
 from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import prior_files
-from surfkit.readers.fingerprint import Fingerprint, changed, fingerprint
-from surfkit.readers.made_maps import is_there, located, read_made
 from surfkit.recipe import Recipe
 from surfkit.refine.base import Refine
 from surfkit.run import journal
-from surfkit.run.notes import Notes
-from surfkit.scene.scene import Frame, Scene
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
 FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result")
+
+
+@dataclass(frozen=True)
+class RunStage:
+    """One stage of a run, or of one of its blocks: where it lies, and what is done in it.
+
+    Attributes:
+        name: Of its folder, and in events: "pretrain" for the whole scene at once; "tune" for a block, and for all
+            blocks when they are merged; then "refine0", "refine1" and so on.
+        setting: Its path in the recipe, as on the command line.
+        out: Folder of the run, or of the block.
+        stage: Its settings.
+        primitive: What the points are in it.
+        refine: What it does to the model of the stage before; None if it is no refinement.
+        block: Number of the block, if it is one's.
+    """
+
+    name: str
+    setting: str
+    out: Path
+    stage: Stage
+    primitive: Primitive
+    refine: Refine | None = None
+    block: int | None = None
+
+    @property
+    def title(self) -> str:
+        """What is being done, for people."""
+        return self.name if self.block is None else f"block {self.block}"
+
+    @property
+    def folder(self) -> Path:
+        """What belongs to the stage alone."""
+        return self.out / self.name
+
+    @property
+    def checkpoint(self) -> Path:
+        """The state of the optimisation."""
+        return self.folder / "checkpoint.safetensors"
+
+    @property
+    def learns_from_photographs(self) -> bool:
+        """Whether it is shown photographs, and not what another model draws."""
+        return self.refine is None or not self.refine.taught
 
 
 @dataclass(frozen=True)
@@ -43,76 +74,60 @@ class Run:
         out: The folder.
         recipe: Part of it as recipe.json.
         data: Part of it in run.json.
-        part: The stage that is spoken of: "pretrain" for the whole scene at once, "tune" for a block, and for all of
-            them when they are merged; then "refine0", "refine1" and so on.
-        block: Number of the block, if it is one's.
     """
 
     out: Path
     recipe: Recipe
     data: Data
-    part: str = "pretrain"
-    block: int | None = None
 
     @property
-    def title(self) -> str:
-        """What is being done, for people."""
-        return self.part if self.block is None else f"block {self.block}"
+    def stages(self) -> tuple[RunStage, ...]:
+        """All stages, in their order."""
+        recipe, primitive = self.recipe, self.recipe.primitive
+        found = [RunStage("pretrain", "pretrain", self.out, recipe.pretrain, primitive)]
+        if recipe.partition is not None:
+            found.append(RunStage("tune", "tune", self.out, recipe.tune, primitive))
+        for at, refine in enumerate(recipe.refine):
+            primitive = refine.primitive(primitive)
+            found.append(RunStage(f"refine{at}", f"refine.{at}.stage", self.out, refine.stage, primitive, refine))
+        return tuple(found)
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """All there are, in their order."""
-        tune = ("tune",) if self.recipe.partition is not None else ()
-        return ("pretrain", *tune, *(f"refine{at}" for at in range(len(self.recipe.refine))))
+    def pretrain(self) -> RunStage:
+        """The stage of the whole scene at once."""
+        return self.stages[0]
 
     @property
-    def refined(self) -> tuple[Refine, ...]:
-        """What the model has gone through as a whole at the end of the stage that is spoken of."""
-        return self.recipe.refine[: int(self.part[6:]) + 1] if self.part.startswith("refine") else ()
+    def merged(self) -> RunStage:
+        """The stage of all blocks together, for a recipe with a partition."""
+        return self.stages[1]
 
     @property
-    def stage(self) -> Stage:
-        """The one that is spoken of."""
-        return self.refined[-1].stage if self.refined else getattr(self.recipe, self.part)
+    def last(self) -> RunStage:
+        """The stage whose result is that of the run."""
+        return self.stages[-1]
 
     @property
-    def shown(self) -> Stage:
-        """The last one so far that was shown photographs: colours are as it has learnt them."""
-        so_far = [replace(self, part=part) for part in self.parts[: self.parts.index(self.part) + 1]]
-        return [run.stage for run in so_far if not (run.refined and run.refined[-1].taught)][-1]
+    def color_stage(self) -> RunStage:
+        """The last stage that is shown photographs: colours are as it has learnt them."""
+        return [stage for stage in self.stages if stage.learns_from_photographs][-1]
 
     @property
-    def setting(self) -> str:
-        """Where that stage stands in the recipe, as the command line has it."""
-        return f"refine.{len(self.refined) - 1}.stage" if self.refined else self.part
-
-    @property
-    def primitive(self) -> Primitive:
-        """What the points are in the stage that is spoken of."""
-        found = self.recipe.primitive
-        for refine in self.refined:
-            found = refine.primitive(found)
-        return found
+    def blocks(self) -> Path:
+        """Folder of the blocks."""
+        return self.out / "blocks"
 
     @property
     def needs_priors(self) -> bool:
         """Whether training looks at depth priors: the method, a loss of the recipe, or its start."""
-        if self.recipe.method.needs_prior:
-            return True
-        stages = [replace(self, part=part).stage for part in self.parts]
-        return self.recipe.start.needs_prior or any(
-            loss.needs_prior for stage in stages for loss in stage.losses.values()
-        )
+        losses = [loss for one in self.stages for loss in one.stage.losses.values()]
+        needed = self.recipe.method.needs_prior or self.recipe.start.needs_prior
+        return needed or any(loss.needs_prior for loss in losses)
 
     @property
     def wants_priors(self) -> bool:
         """Whether anything looks at depth priors: training, or the mesher."""
         return self.needs_priors or (self.recipe.mesh is not None and self.recipe.mesh.needs_prior)
-
-    @property
-    def checkpoint(self) -> Path:
-        """The state of the optimisation."""
-        return self.out / self.part / "checkpoint.safetensors"
 
     @property
     def metrics(self) -> Path:
@@ -209,155 +224,6 @@ def _require_texts(path: Path, name: str, value: Any) -> None:
         raise BadInput(f"{path}: {name} is not a list of texts; {path.parent} is damaged, begin in another folder")
 
 
-def refuse_other(run: Run) -> None:
-    """BadInput if the folder holds a run that this one does not continue; a note if this one makes it longer."""
-    there = recipe_before(run.out / "recipe.json", run.recipe)
-    now = dump(run.recipe)
-    remesh = isinstance(there, dict) and there.get("mesh") != now["mesh"]
-    if isinstance(there, dict):
-        there |= {"mesh": now["mesh"]}  # training is the same
-        before = there.get("refine")
-        prefix = isinstance(before, list) and difference(before, now["refine"][: len(before)]) is None
-        if prefix and there.get("pretrain") == now["pretrain"]:
-            there |= {"refine": now["refine"]}  # the model that is there can be refined further
-    found = None if there is None else difference(there, now)
-    if found and not (found := longer(run, there)):
-        emit(
-            Warned(
-                f"the run is made longer, from {there['pretrain']['steps']} steps to {run.recipe.pretrain.steps}: "
-                "steps still to come follow the schedules of the new length, those already made followed the old ones, "
-                "so the result is not that of a run of this length from the start"
-            )
-        )
-    if not found and run.record.exists():
-        before = dump(read_data(run.out))  # with defaults of newer settings
-        found = difference(before | {"priors": None}, dump(run.data) | {"priors": None}, "data")
-    if found:
-        at, old, new = found
-        raise BadInput(
-            f"--out {run.out} holds a run with {at} {short(old)}, and this one has {short(new)}; "
-            "name another folder, or delete that one"
-        )
-    if remesh:
-        run.mesh_record.unlink(missing_ok=True)
-
-
-def recipe_before(path: Path, now: Recipe) -> Any:
-    """What a recipe.json says, with defaults of newer settings if it is still a recipe; None where there is none.
-
-    Runs of before made no depth maps: they go on as they began, however the recipe makes them `now`.
-    """
-    there = read_json(path, dict[str, Any]) if path.exists() else None
-    if there is not None:
-        there = {"depth": dump(now.depth)} | there
-    try:
-        return dump(load(Recipe, there)) if there is not None else None
-    except BadInput:
-        return there  # the difference will tell
-
-
-def longer(run: Run, there: Any) -> tuple[str, Any, Any] | None:
-    """What else than its length distinguishes a longer recipe from the one in the folder; None if nothing does.
-
-    Longer with all schedules scaled along (`--steps`), or with none (`--pretrain.steps`).
-    """
-    plain = difference(there, dump(run.recipe))
-    now = run.recipe.pretrain.steps
-    stage = there.get("pretrain") if isinstance(there, dict) else None
-    before = stage.get("steps") if isinstance(stage, dict) else None
-    if not isinstance(before, int) or not 0 < before < now:
-        return plain
-    old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
-    if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
-        return None
-    return difference(dump(rescale_like(old, now / before, run.recipe)), dump(run.recipe))
-
-
-def difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
-    """Path and both values of the first difference between plain data; what a recipe says of itself does not count."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old)]:
-            path = f"{at}.{key}" if at else key
-            if path != "about" and (found := difference(old.get(key), new.get(key), path)):
-                return found
-        return None
-    if isinstance(old, list) and isinstance(new, list):  # where one is longer, its first item too many tells
-        pairs = enumerate(itertools.zip_longest(old, new))
-        first = next((found for i, (a, b) in pairs if (found := difference(a, b, f"{at}.{i}"))), None)
-        return first or (None if len(old) == len(new) else (at, old, new))
-    return None if old == new else (at, old, new)
-
-
-def refuse_changed(run: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
-    """The fingerprint of the data, or BadInput if it is not that of the data which the run began with.
-
-    Args:
-        run: The run.
-        scene: Its data.
-        skipped: Names of photographs that the run has found damaged; they do not count.
-    """
-    before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
-    own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
-    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None)
-    if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
-        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-        raise BadInput(
-            f"--out {run.out}: the data in {run.data.path} are not those that the run began with: {found[0].what}"
-            f"{more}; put them back, name another folder, or delete that one"
-        )
-    return now
-
-
-def claim(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
-    """Write down what the run is made from, and on what it runs; the recipe last, as it makes the folder a run."""
-    before = read_record(run.out)
-    notes.begin(
-        run.record,
-        {
-            "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
-            "plugins": [str(plugin) for plugin in records() if plugin.distribution],
-            "device": backend,
-            "threads": torch.get_num_threads(),
-            "seed": run.recipe.seed,
-            "data": run.data,
-            "prepare_cpu_seconds": prepare_cpu_seconds(run, before),
-            "frame": {
-                "origin": frame.origin.tolist(),
-                "scale": frame.scale,
-                "offset": frame.shift,
-                "crs": frame.crs,
-                "metres_per_unit": frame.metres,
-            },
-        },
-        before,
-    )
-    write_json(run.inputs, prints)
-    write_json(run.out / "recipe.json", run.recipe)
-
-
-def prepare_cpu_seconds(run: Run, before: dict[str, Any]) -> float | None:
-    """What the depth maps have cost that were made for a run; None where it uses those of the data set, or none."""
-    if run.data.priors is None:
-        return None
-    if not is_there(run.data.priors):
-        return before.get("prepare_cpu_seconds")
-    return round(read_made(located(run.data.priors)).cpu_seconds, 2)
-
-
-def relay(out: Path, folder: Path, prefix: str) -> None:
-    """Note for the run in `out` what the journal of a part of it, written by another process, has been warned of."""
-    record = read_record(out)
-    notes, skipped = set(record.get("notes", [])), set(record.get("skipped", []))
-    for line in journal.read(folder / journal.NAME):
-        text, name = line.get("text"), line.get("name")
-        if line["event"] == "Warned" and isinstance(text, str) and not {text, prefix + text} & notes:
-            notes.add(text)
-            emit(Warned(prefix + text))
-        elif line["event"] == "PhotoSkipped" and isinstance(name, str) and name not in skipped:
-            skipped.add(name)
-            emit(PhotoSkipped(name, str(line.get("reason"))))
-
-
 def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     """Put measurements into metrics.json beside those of other kinds that are there already, and return them all."""
     metrics = (read_json(path, dict[str, Any]) if path.exists() else {}) | found
@@ -366,17 +232,11 @@ def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
     return metrics
 
 
-def discard_results(run: Run) -> None:
+def discard_results(run: Run, stage: RunStage) -> None:
     """Delete what further steps of a stage make wrong: results, and the states of the stages after it."""
     for path in (run.metrics, run.cloud, run.mesh_record):
         path.unlink(missing_ok=True)
-    for part in run.parts[run.parts.index(run.part) + 1 :]:
-        later = replace(run, part=part).checkpoint
-        checkpoint.discard(later)
-        (later.parent / journal.NAME).unlink(missing_ok=True)
-
-
-def short(value: Any) -> str:
-    """A value in a few words."""
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    names = [one.name for one in run.stages]
+    for later in run.stages[names.index(stage.name) + 1 :]:
+        checkpoint.discard(later.checkpoint)
+        (later.folder / journal.NAME).unlink(missing_ok=True)

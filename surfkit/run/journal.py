@@ -1,4 +1,4 @@
-"""events.jsonl: what happened in a run, one JSON object a line, as it happened."""
+"""events.jsonl: the events of a run, one JSON object per line, in the order in which they happened."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from surfkit.core.registry import hookimpl, plugins
 
 NAME = "events.jsonl"
 COUNTED = {"StepDone", "PointsEdited", "Measured"}
-"""Events that carry the index of their step."""
+"""Events that have the index of their step."""
 ALWAYS = {"event": str, "time": (int, float)}
 """What every line has."""
 
 
 class Journal:
-    """Writes every event down at once, so that a killed process loses none, and lets the disk know at checkpoints.
+    """Writes every event at once, so that a killed process loses none, and flushes the file to disk at checkpoints.
 
-    When a stage goes on from a checkpoint, what was written of the steps after it is taken out: they come again.
+    When a stage continues from a checkpoint, the events of later steps are removed: these steps are made again.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -37,13 +37,13 @@ class Journal:
 
     @hookimpl
     def surfkit_event(self, event: Any) -> None:
-        """See one event. Of other progress than steps only the end is written down: the way there is many lines."""
+        """Write one event. Of progress other than steps, only the end is written, as there are many events before."""
         if isinstance(event, Progress) and event.done < event.total:
             return
         if isinstance(event, StageBegan):
             self.close()
         if self.file is None:
-            forget(self.path, event.first if isinstance(event, StageBegan) else sys.maxsize)
+            remove_steps(self.path, event.first if isinstance(event, StageBegan) else sys.maxsize)
             self.file = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         facts = dump(event)
         if isinstance(event, FileWritten) and event.path.is_relative_to(self.folder):
@@ -54,14 +54,14 @@ class Journal:
             os.fsync(self.file)
 
     def close(self) -> None:
-        """Let go of the file; the next event opens it again."""
+        """Close the file; the next event opens it again."""
         if self.file is not None:
             os.close(self.file)
             self.file = None
 
 
 @contextmanager
-def kept(folder: Path) -> Iterator[None]:
+def record_events(folder: Path) -> Iterator[None]:
     """Within, events are written into the journal of a run folder, and not into that of a run around it."""
     journal, name = Journal(folder), "journal of the run"
     around = plugins().unregister(name=name) if plugins().has_plugin(name) else None
@@ -80,8 +80,8 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [line for _, line in _lines(path)]
 
 
-def forget(path: Path, first: int) -> None:
-    """Take out the events of step `first` and all later ones, and lines that are not whole."""
+def remove_steps(path: Path, first: int) -> None:
+    """Remove the events of step `first` and of all later ones, and incomplete lines."""
     if not path.exists():
         return
     stays = [text for text, line in _lines(path) if line["event"] not in COUNTED or line.get("index", 0) < first]
@@ -100,12 +100,12 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
             line = from_json(text)
         except BadInput:
             continue
-        if text.endswith("\n") and _is_sound(line):
+        if text.endswith("\n") and _is_valid(line):
             found.append((text, line))
     return found
 
 
-def _is_sound(line: Any) -> bool:
+def _is_valid(line: Any) -> bool:
     if not isinstance(line, dict) or not all(isinstance(line.get(name), kind) for name, kind in ALWAYS.items()):
         return False
     return line["event"] not in COUNTED or isinstance(line.get("index"), int)

@@ -1,4 +1,4 @@
-"""From a trained run to its mesh: made, cleaned, written in the frame of the input, and looked at."""
+"""From a trained run to its mesh: made, cleaned, written in the frame of the input, and rendered."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class MeshOutput:
         return None if self.crop is None else read_crop(self.crop)
 
 
-def subject(
+def mesh_input(
     run: Run,
     made: Reconstruction,
     scene: Scene,
@@ -162,7 +162,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
     mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
     del raw
-    forget(run)
+    delete_meshes(run)
     written = list(write_files(run, mesh, delivery, subject))
     record = {
         "mesher": None if isinstance(mesher, Mesh) else mesher,
@@ -175,7 +175,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }
-    look(run, mesh, subject)
+    write_pictures(run, mesh, subject)
     write_json(run.mesh_record, record)
     emit(FileWritten(run.mesh_record, "facts of the mesh"))
     return dump(record)
@@ -204,8 +204,8 @@ def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
     return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
 
 
-def forget(run: Run) -> None:
-    """Delete what an earlier mesh left; its record goes first."""
+def delete_meshes(run: Run) -> None:
+    """Delete the files of an earlier mesh; its record first."""
     run.mesh_record.unlink(missing_ok=True)
     for path in (*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*"), *run.mesh_pictures.rglob("*.png")):
         path.unlink(missing_ok=True)
@@ -224,8 +224,8 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
                 yield path
 
 
-def look(run: Run, mesh: Mesh, subject: MeshInput) -> None:
-    """Write pictures of the mesh: beside the renders of a few training views, and from above."""
+def write_pictures(run: Run, mesh: Mesh, subject: MeshInput) -> None:
+    """Write pictures of the mesh: from above, and beside the renders of a few training views."""
     count = min(SHOWN, len(subject.views))
     views = [subject.views[(2 * at + 1) * len(subject.views) // (2 * count)] for at in range(count)]
     cameras = [view.camera for view in subject.views]

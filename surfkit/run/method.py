@@ -149,7 +149,7 @@ def reconstruct(run: Run, given: MethodInput) -> Reconstruction:
         return reopened(run, given)
     if is_begun(run):
         say(f"{run.out}: going on with what method:{name_of(method)} has kept")
-    discard_results(run)
+    discard_results(run, run.pretrain)
     given.folder.mkdir(parents=True, exist_ok=True)
     with clocked(result_path(run).with_name("cost.json")) as cost, steps_shown(name_of(method)):
         made = method.reconstruct(given)
@@ -315,16 +315,15 @@ def refuse_mesher(out: Path) -> None:
 
 def optimised(run: Run, state: StageState) -> Reconstruction:
     """The reconstruction that the stages of a recipe have come to."""
-    stage = run.stage
-    before = run.parts[: run.parts.index(run.part) + 1]
+    last = run.last
     return Reconstruction(
-        splats=SplatModel(run.primitive, stage.finished(state), state.sh_degree, stage.near),
-        steps=sum(replace(run, part=part).stage.steps for part in before),
+        splats=SplatModel(last.primitive, last.stage.finished(state), state.sh_degree, last.stage.near),
+        steps=sum(stage.stage.steps for stage in run.stages),
         last_steps=state.index,
         seconds=state.seconds,
         cpu_seconds=state.cpu_seconds,
         peak_memory_bytes=state.peak_memory_bytes,
-        correct_color=run.shown.appearance is not None,
+        correct_color=run.color_stage.stage.appearance is not None,
     )
 
 

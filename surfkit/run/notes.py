@@ -1,4 +1,4 @@
-"""What a run tells on its way: printed, and kept in run.json."""
+"""The warnings of a run: printed, and kept in run.json."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.codec import write_json
-from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, say
+from surfkit.core.events import MemoryTaken, PhotoSkipped, Warned, emit, say
 from surfkit.core.registry import hookimpl, plugins
+from surfkit.run import journal
+from surfkit.run.folder import read_record
 
 NOTES = "notes of the run"
 """Name of the plugin."""
 
 
 class Notes:
-    """Prints the warnings of a run, and keeps them, the photographs it passed over and its memory in run.json."""
+    """Prints the warnings of a run; keeps them, the names of skipped photographs and the memory in run.json."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -45,7 +47,7 @@ class Notes:
         """See one event."""
         if isinstance(event, Warned):
             if self.prefix and event.text in self.texts:
-                return  # it has been said of the whole run
+                return  # the whole run has been warned of it
             say(f"note: {self.prefix}{event.text}")
             self.keep(self.texts, self.prefix + event.text)
         elif isinstance(event, MemoryTaken):
@@ -56,7 +58,7 @@ class Notes:
             say(f"note: {event.reason}; the run goes on without this photograph")
 
     def keep(self, kept: list[str], text: str) -> bool:
-        """Keep a text unless it is there already; whether it is new."""
+        """Keep a text unless it is there already; True if it is new."""
         if text in kept:
             return False
         kept.append(text)
@@ -65,8 +67,8 @@ class Notes:
 
 
 @contextmanager
-def noted() -> Iterator[Notes]:
-    """Within, warnings are printed and kept."""
+def collect_notes() -> Iterator[Notes]:
+    """Within, warnings are printed and collected."""
     notes = Notes()
     plugins().register(notes, NOTES)
     try:
@@ -76,8 +78,8 @@ def noted() -> Iterator[Notes]:
 
 
 @contextmanager
-def naming(prefix: str) -> Iterator[None]:
-    """Within, warnings are noted as those of a part of the run, which they begin with."""
+def prefix_notes(prefix: str) -> Iterator[None]:
+    """Within, warnings are those of a part of the run, and begin with its name."""
     notes = plugins().get_plugin(NOTES)
     if notes is not None:
         notes.prefix = prefix
@@ -86,3 +88,17 @@ def naming(prefix: str) -> Iterator[None]:
     finally:
         if notes is not None:
             notes.prefix = ""
+
+
+def repeat_warnings(out: Path, folder: Path, prefix: str) -> None:
+    """Emit for the run in `out` the warnings in the journal of a part of it, which another process has written."""
+    record = read_record(out)
+    notes, skipped = set(record.get("notes", [])), set(record.get("skipped", []))
+    for line in journal.read(folder / journal.NAME):
+        text, name = line.get("text"), line.get("name")
+        if line["event"] == "Warned" and isinstance(text, str) and not {text, prefix + text} & notes:
+            notes.add(text)
+            emit(Warned(prefix + text))
+        elif line["event"] == "PhotoSkipped" and isinstance(name, str) and name not in skipped:
+            skipped.add(name)
+            emit(PhotoSkipped(name, str(line.get("reason"))))

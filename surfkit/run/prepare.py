@@ -1,4 +1,4 @@
-"""Depth maps for a run that wants some and whose data set has none."""
+"""Depth maps for a run that needs them and whose data set has none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.lock import used
+from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
 from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, torch_device
@@ -52,20 +52,20 @@ def with_maps(
     if not run.wants_priors or prior_files(run.data, scene) or (begun and before is None):
         yield run
     elif before is not None and is_finished(run):
-        yield given(run, before)
+        yield with_priors(run, before)
     elif before is not None and caches.maps is None and is_there(before):
-        with used(located(before)):
-            yield given(run, before)
+        with mark_used(located(before)):
+            yield with_priors(run, before)
     elif run.recipe.depth is None or caches.maps is None:
         if begun:
             raise BadInput(f"{run.out}: the depth maps of the run are gone; leave out --no-prepare to make them again")
         yield run
     else:
         with ExitStack() as use:
-            folder = use.enter_context(made_for(run, scene, prints, caches, device))
+            folder = use.enter_context(made_maps(run, scene, prints, caches, device))
             if begun and folder is not None and folder.name != before.name:
                 emit(Warned("what depth maps are made from, or how, has changed: the steps to come look at other maps"))
-            yield run if folder is None else given(run, folder)
+            yield run if folder is None else with_priors(run, folder)
 
 
 @contextmanager
@@ -82,7 +82,7 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
     if not mesher.needs_prior:
         yield run
     elif before is not None and is_there(before):
-        with used(located(before)):
+        with mark_used(located(before)):
             yield run
     elif prior_files(own.data, scene) or run.recipe.depth is None:
         yield own
@@ -93,12 +93,12 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
         )
     else:
         prints = fingerprint(scene, read_json(run.inputs, Fingerprint) if run.inputs.exists() else None)
-        with made_for(own, scene, prints, caches, device) as folder:
-            yield own if folder is None else given(own, folder)
+        with made_maps(own, scene, prints, caches, device) as folder:
+            yield own if folder is None else with_priors(own, folder)
 
 
 @contextmanager
-def made_for(
+def made_maps(
     run: Run, scene: Scene, prints: Fingerprint, caches: CacheSettings, device: Device
 ) -> Iterator[Path | None]:
     """Within, there are maps as the recipe makes them: their folder, or None where the data do not allow any."""
@@ -124,16 +124,15 @@ def made_for(
         yield folder
 
 
-def given(run: Run, folder: Path) -> Run:
+def with_priors(run: Run, folder: Path) -> Run:
     """The run with depth maps of a folder of the cache."""
     return replace(run, data=replace(run.data, priors=folder))
 
 
 def is_finished(run: Run) -> bool:
-    """Whether nothing is left to do that looks at depth maps."""
-    final = replace(run, part=run.parts[-1])
-    if not run.metrics.exists() or (found := open_last(final.checkpoint)) is None:
+    """Whether nothing is left to do that needs depth maps."""
+    if not run.metrics.exists() or (found := open_last(run.last.checkpoint)) is None:
         return False
     index = found[0].state.index
     needs_mesh = run.recipe.mesh is not None and run.recipe.mesh.needs_prior
-    return index >= final.stage.steps and (not needs_mesh or has_mesh(run, index))
+    return index >= run.last.stage.steps and (not needs_mesh or has_mesh(run, index))

@@ -1,7 +1,8 @@
-"""The whole model gone through what its recipe wants of it after the blocks are merged."""
+"""The refinements of a recipe, applied to the whole model after the blocks are merged."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import torch
@@ -9,10 +10,10 @@ from torch import Tensor
 
 from surfkit.raster.api import Rasterizer
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, discard_results
-from surfkit.run.journal import kept
-from surfkit.run.notes import naming
-from surfkit.run.stage import InitialModel, Job, drawing, load_state, optimise
+from surfkit.run.folder import Run, RunStage, discard_results
+from surfkit.run.journal import record_events
+from surfkit.run.notes import prefix_notes
+from surfkit.run.stage import InitialModel, StageJob, drawing, load_state, optimise
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import Scene
 from surfkit.train.material import TrainingData, read_ahead
@@ -20,51 +21,50 @@ from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
 
 DRAWN_AHEAD = 2
-"""Pictures of the model that are kept: each is drawn when its turn comes."""
+"""Rendered pictures that are cached: each is needed once."""
 
 
-def refine_model(ctx: RunContext, state: StageState) -> tuple[Run, StageState]:
-    """The run and its state after all that the recipe refines; what is done already is not done again.
+def refine_model(ctx: RunContext, state: StageState) -> StageState:
+    """The state after all refinements of the recipe; those that are done already are not done again.
 
     Args:
-        context: The run, as it stands before the first of them.
-        state: Its state then.
+        ctx: The run.
+        state: Its state before the first of them.
     """
-    run = ctx.run
-    for part in run.parts[run.parts.index(run.part) + 1 :]:
-        now = replace(run, part=part)
-        state = _gone_through(replace(ctx, run=now), run, state)
-        run = now
-    return run, state
+    for before, stage in itertools.pairwise(ctx.run.stages):
+        if stage.refine is not None:
+            state = _refine_once(ctx, before, state, stage)
+    return state
 
 
-def _gone_through(ctx: RunContext, before: Run, given: StageState) -> StageState:
-    """The state after one of them, from the state before it."""
-    run, refine, scene = ctx.run, ctx.run.refined[-1], seen_by(ctx.run, ctx.scene)
-    state = load_state(run, scene, repair=True)
-    if state is not None and state.index >= run.stage.steps:
+def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: RunStage) -> StageState:
+    """The state after one refinement, from the state of the stage before it."""
+    run, refine, scene = ctx.run, stage.refine, stage_scene(ctx.run, stage, ctx.scene)
+    state = load_state(run, stage, scene, repair=True)
+    if state is not None and state.index >= stage.stage.steps:
         return state
-    discard_results(run)
+    discard_results(run, stage)
 
     def start() -> InitialModel:
         params = refine.params(before.stage.finished(given))
         return InitialModel({name: value.clone() for name, value in params.items()}, given.sh_degree)
 
-    intervals, folder = replace(ctx.intervals, pictures=0), run.checkpoint.parent
-    folder.mkdir(exist_ok=True)
-    with kept(folder), naming(f"{run.title}: "):  # its steps are counted anew, and what is known is not told again
-        shown = _drawn(before, given, scene, ctx.rasterizer) if refine.taught else None
-        shown = shown or read_ahead(run.data, scene, run.stage.losses, ctx.caches)
-        return optimise(Job(run, scene, ctx.rasterizer, intervals, shown, Meter(), start, given), state)
+    intervals = replace(ctx.intervals, pictures=0)
+    stage.folder.mkdir(exist_ok=True)
+    with record_events(stage.folder), prefix_notes(f"{stage.title}: "):  # steps are counted from 1 again
+        shown = _rendered_data(before, given, scene, ctx.rasterizer) if refine.taught else None
+        shown = shown or read_ahead(run.data, scene, stage.stage.losses, ctx.caches)
+        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, Meter(), start, given)
+        return optimise(job, state)
 
 
-def seen_by(run: Run, scene: Scene) -> Scene:
-    """The scene with the views that the stage which is spoken of looks from."""
-    return replace(scene, train=run.refined[-1].views(scene.train, run.recipe.seed)) if run.refined else scene
+def stage_scene(run: Run, stage: RunStage, scene: Scene) -> Scene:
+    """The scene with the training views of a stage."""
+    return scene if stage.refine is None else replace(scene, train=stage.refine.views(scene.train, run.recipe.seed))
 
 
-def _drawn(before: Run, given: StageState, scene: Scene, rasterizer: Rasterizer) -> TrainingData:
-    """Pictures that the model before draws of the views of a scene."""
+def _rendered_data(before: RunStage, given: StageState, scene: Scene, rasterizer: Rasterizer) -> TrainingData:
+    """The views of a scene as the model of the stage before renders them, in place of photographs."""
     draw = drawing(before, given, rasterizer, geometry=False)
 
     def picture(at: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""One stage carried through: from its last state to its end, whatever happens on the way."""
+"""One stage of a run: from its last checkpoint to its end, also after memory or numbers have failed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select
-from surfkit.run.folder import Run
+from surfkit.run.folder import Run, RunStage
 from surfkit.scene.memory import free_bytes
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.train import checkpoint
@@ -32,18 +32,18 @@ from surfkit.train.stage import StageState, Trainer
 
 CHECKPOINT_EVERY = 500
 WATCH_EVERY = 10
-"""Steps between two looks at the free memory."""
+"""Steps between two checks of the free memory."""
 LEAST_FREE = 256 << 20
-"""Bytes of free memory; when there are fewer, the caches are lowered before the system ends the process."""
+"""Bytes of free memory; with less, the caches are made smaller before the system kills the process."""
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """Steps between what is written while a stage runs.
+    """Numbers of steps between what is written while a stage runs.
 
     Attributes:
-        checkpoint: States of the optimisation.
-        pictures: Pictures of a few held-out views; a fifth of the run if None, 0 for none.
+        checkpoint: Between checkpoints.
+        pictures: Between pictures of a few held-out views; a fifth of the run if None, 0 for none.
     """
 
     checkpoint: int = CHECKPOINT_EVERY
@@ -52,7 +52,7 @@ class Intervals:
 
 @dataclass(frozen=True)
 class InitialModel:
-    """What a stage begins with where it goes on from a model.
+    """The points that a stage begins with, where it continues a model.
 
     Attributes:
         params: Raw parameters of the points.
@@ -64,24 +64,26 @@ class InitialModel:
 
 
 @dataclass(frozen=True)
-class Job:
-    """What the steps of a run are made with.
+class StageJob:
+    """What a stage is optimised with.
 
     Attributes:
         run: The run.
+        stage: Its stage, or that of one of its blocks.
         scene: Its data.
         rasterizer: What draws.
-        intervals: When to write what.
-        given: What to look at.
-        meter: Sees what memory is taken by.
-        start: Gives the points to begin with; if None, those of the `cloud`.
-        cloud: Gives the points to begin at; the sparse ones of the scene if None.
-        before: The model that it goes on from, if its times count too.
-        frozen: Points that are drawn beside them and stay as they are; none if None.
+        intervals: Steps between checkpoints and between pictures.
+        given: Photographs, masks and depth priors.
+        meter: Records what the memory is used for.
+        start: Gives the initial parameters of the points; if None, they are made from the `cloud`.
+        cloud: Gives the initial points; the sparse ones of the scene if None.
+        before: The state of the stage before, if its times count too.
+        frozen: Gives points that are drawn with the others and never change; None for none.
         owns: As for `Trainer`.
     """
 
     run: Run
+    stage: RunStage
     scene: Scene
     rasterizer: Rasterizer
     intervals: Intervals
@@ -94,45 +96,47 @@ class Job:
     owns: Callable[[Tensor], Tensor] | None = None
 
 
-def load_state(run: Run, scene: Scene, repair: bool = False) -> StageState | None:
-    """The state of the last whole checkpoint, if there is one and the data is still what it was.
+def load_state(run: Run, stage: RunStage, scene: Scene, repair: bool = False) -> StageState | None:
+    """The state of the last whole checkpoint of a stage; None if there is none.
 
     `repair`: put it in the place of a damaged one.
+
+    Raises:
+        BadInput: It was trained on another number of photographs.
     """
-    found = checkpoint.load_last(run.checkpoint)
+    found = checkpoint.load_last(stage.checkpoint)
     if found is None:
         return None
     state, damage = found
     if damage is not None:
         emit(Warned(f"{damage.partition(';')[0]}; the one before it, of step {state.index}, is used instead"))
         if repair:
-            checkpoint.restore(run.checkpoint)
+            checkpoint.restore(stage.checkpoint)
     if state.order.count != len(scene.train):
         raise BadInput(
-            f"--out {run.out} was trained on {state.order.count} photographs and {run.data.path} now gives "
+            f"--out {stage.out} was trained on {state.order.count} photographs and {run.data.path} now gives "
             f"{len(scene.train)}; name another folder, or delete that one"
         )
     return state
 
 
-def optimise(job: Job, state: StageState | None) -> StageState:
+def optimise(job: StageJob, state: StageState | None) -> StageState:
     """Run the stage from its last state, or from its beginning, to its end.
 
-    After numbers that are not finite it goes back to its last checkpoint with half the learning rates, twice at most.
-    When memory gives out, it goes back with a smaller cache, until there is none.
+    On NaN or Inf it returns to its last checkpoint with half the learning rates, twice at most. When memory runs out,
+    it returns to its last checkpoint with a smaller cache, until there is no cache.
     """
-    run, given = job.run, job.given
-    stage, primitive = run.stage, run.primitive
+    at, given, stage, primitive = job.stage, job.given, job.stage.stage, job.stage.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
     trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
     along = (
-        ProgressPictures(run.out / "progress", job.scene.held_out)
+        ProgressPictures(at.out / "progress", job.scene.held_out)
         if job.intervals.pictures and job.scene.held_out
         else None
     )
 
     def begin() -> StageState:
-        generator = torch.Generator().manual_seed(run.recipe.seed)
+        generator = torch.Generator().manual_seed(job.run.recipe.seed)
         began = time.perf_counter(), time.process_time()
         cloud = job.cloud() if job.cloud else job.scene.cloud
         begun = job.start() if job.start else InitialModel(primitive.init(cloud, generator), 0)
@@ -148,58 +152,58 @@ def optimise(job: Job, state: StageState | None) -> StageState:
         return fresh
 
     if state is not None:
-        say(f"{run.out}: going on after step {state.index} of {stage.steps}")
+        say(f"{at.out}: going on after step {state.index} of {stage.steps}")
     state = state or begin()
     while True:
         try:
             return take_steps(job, trainer, state, along)
         except Diverged as error:
-            state = rolled_back(run, state.halvings, error, begin)
+            state = return_to_checkpoint(at, state.halvings, error, begin)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
-            if not lower(given, f"step {state.index + 1}: out of memory"):
-                raise out_of_memory(run.out, ", though photographs are no longer kept in it") from error
+            if not lower_caches(given, f"step {state.index + 1}: out of memory"):
+                raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
             state = None  # the error and all that it holds go first
-        state = state or last_good(run, begin)
+        state = state or load_last_state(at, begin)
 
 
-def take_steps(job: Job, trainer: Trainer, state: StageState, along: ProgressPictures | None) -> StageState:
-    """Take the steps that are left, and write checkpoints and pictures on the way."""
-    run, intervals, meter = job.run, job.intervals, job.meter
+def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: ProgressPictures | None) -> StageState:
+    """Take the remaining steps; write checkpoints and pictures meanwhile."""
+    at, intervals, meter = job.stage, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
-    emit(StageBegan(run.part, steps, len(state.points), state.index + 1, run.block))
-    with graceful() as request, Display(run.title, steps) as display:
+    emit(StageBegan(at.name, steps, len(state.points), state.index + 1, at.block))
+    with graceful() as request, Display(at.title, steps) as display:
         for done in trainer.run(state):
             display.show(done)
             meter.step(state, job.given)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
-                lower(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
+                lower_caches(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
             if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
-                    along.look(done.index, drawing(run, state, trainer.rasterizer))
+                    along.look(done.index, drawing(at, state, trainer.rasterizer))
             if request.asked or done.index % intervals.checkpoint == 0 or done.index == steps:
-                save(run, state, meter)
+                save(at, state, meter)
             if request.asked:
                 break
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
-    emit(StageEnded(run.part, steps, len(state.points), state.seconds - seconds))
+    emit(StageEnded(at.name, steps, len(state.points), state.seconds - seconds))
     return state
 
 
-def save(run: Run, state: StageState, meter: Meter) -> None:
-    """Write a checkpoint, and what the memory is taken by."""
+def save(stage: RunStage, state: StageState, meter: Meter) -> None:
+    """Write a checkpoint, and emit what the memory is used for."""
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
     with meter.adding("checkpoints"):
-        checkpoint.save(run.checkpoint, state)
-    emit(FileWritten(run.checkpoint, "checkpoint"))
+        checkpoint.save(stage.checkpoint, state)
+    emit(FileWritten(stage.checkpoint, "checkpoint"))
     emit(MemoryTaken(meter.report()))
 
 
-def lower(given: TrainingData, why: str) -> bool:
-    """Make the caches smaller, and say so; False if they are as small as can be."""
+def lower_caches(given: TrainingData, why: str) -> bool:
+    """Make the caches smaller, with a warning; False if they cannot be made smaller."""
     found = given.lower()
     if found is not None:
         before, after = (f"{count / 1e6:.3g} MB" for count in found)
@@ -207,44 +211,45 @@ def lower(given: TrainingData, why: str) -> bool:
     return found is not None
 
 
-def last_good(run: Run, begin: Callable[[], StageState]) -> StageState:
-    """The state of the last checkpoint, or a new beginning."""
-    found = checkpoint.load_last(run.checkpoint)
+def load_last_state(stage: RunStage, begin: Callable[[], StageState]) -> StageState:
+    """The state of the last checkpoint, or a new one."""
+    found = checkpoint.load_last(stage.checkpoint)
     state = found[0] if found else begin()
-    say(f"{run.out}: going on after step {state.index} of {run.stage.steps}")
+    say(f"{stage.out}: going on after step {state.index} of {stage.stage.steps}")
     return state
 
 
-def rolled_back(run: Run, halvings: int, error: Diverged, begin: Callable[[], StageState]) -> StageState:
-    """The last good state, or a new beginning, with half the learning rates; it is saved, so that nothing forgets it.
+def return_to_checkpoint(
+    stage: RunStage, halvings: int, error: Diverged, begin: Callable[[], StageState]
+) -> StageState:
+    """The state of the last checkpoint, or a new one, with half the learning rates; saved, so that they stay so.
 
     Raises:
         NotFinite: They have been halved often enough.
     """
     if halvings >= MOST_HALVINGS:
         raise NotFinite(
-            f"{run.out}: {error}, also after the learning rates were halved {halvings} times; look at that photograph "
-            f"and its camera, or lower {run.setting}.rates in another folder; the last checkpoint is whole"
+            f"{stage.out}: {error}, also after the learning rates were halved {halvings} times; look at that "
+            f"photograph and its camera, or lower {stage.setting}.rates in another folder; the last checkpoint is whole"
         ) from error
-    found = checkpoint.load_last(run.checkpoint)
+    found = checkpoint.load_last(stage.checkpoint)
     state = found[0] if found else begin()
     state.halvings = halvings + 1
     times = f"{state.halvings} of {MOST_HALVINGS} times"
     emit(Warned(f"{error}; back to step {state.index}, with learning rates halved ({times})"))
-    checkpoint.save(run.checkpoint, state)
+    checkpoint.save(stage.checkpoint, state)
     return state
 
 
-def drawing(run: Run, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
-    """What draws the points of a state, as they are to be looked at."""
-    stage = run.stage
-    splats = run.primitive.activate(stage.finished(state), state.sh_degree)
-    draws = drawn_by(run.primitive, rasterizer)
-    return lambda view: draws.render(splats, view.camera, stage.near, geometry).maps
+def drawing(stage: RunStage, state: StageState, rasterizer: Rasterizer, geometry: bool = True) -> Draw:
+    """A function that renders the points of a finished stage."""
+    splats, near = stage.primitive.activate(stage.stage.finished(state), state.sh_degree), stage.stage.near
+    draws = drawn_by(stage.primitive, rasterizer)
+    return lambda view: draws.render(splats, view.camera, near, geometry).maps
 
 
-def drawer(device: Device) -> tuple[Rasterizer, str]:
-    """The rasterizer for a device and its name; what is warned of on the way becomes a note."""
+def select_rasterizer(device: Device) -> tuple[Rasterizer, str]:
+    """The rasterizer for a device and its name; Python's warnings become warnings of the run."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rasterizer, name = select(device)

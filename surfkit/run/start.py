@@ -1,4 +1,4 @@
-"""What the points of pretraining begin at, as the recipe has it."""
+"""The initial points of pretraining."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AHEAD = 4
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Where a run begins.
+    """Makes the initial points of a run.
 
     Attributes:
         run: The run.
@@ -48,8 +48,8 @@ class InitialPoints:
                 priors.close()
 
 
-def priors_of(run: Run, scene: Scene, begun: bool) -> Alignment | None:
-    """How the depth priors of a run fit its scene, if pretraining needs any.
+def align_priors(run: Run, scene: Scene, begun: bool) -> Alignment | None:
+    """The alignment of the depth priors of a run with its scene, if pretraining needs any.
 
     Raises:
         BadInput: The run is still to begin, at depth maps, and there are none that can be used.

@@ -9,7 +9,7 @@ from PIL import Image
 
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.tree import evolve
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.losses import DepthRegression
@@ -66,7 +66,7 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
 
 def test_one_process_at_a_time_and_what_a_killed_one_left_half_written_goes(farm, capsys):
     left = farm / "estimated_depths/.view_001.png.npy.1.part"
-    with held(left.parent):
+    with locked(left.parent):
         left.touch()
         assert main(["prepare", "depth", str(farm), *SMALL]) == 2
         assert "works in it; wait for its end" in capsys.readouterr().err

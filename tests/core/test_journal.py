@@ -1,7 +1,7 @@
 import json
 
 from surfkit.core.events import FileWritten, StageBegan, StepDone, Warned, emit
-from surfkit.run.journal import kept, read
+from surfkit.run.journal import read, record_events
 
 
 def steps(path):
@@ -15,7 +15,7 @@ def take(folder, first, last):
 
 
 def test_events_are_lines_and_none_is_held_back(tmp_path):
-    with kept(tmp_path):
+    with record_events(tmp_path):
         take(tmp_path, 1, 2)
         emit(FileWritten(tmp_path / "pretrain" / "c", "checkpoint"))
         lines = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
@@ -27,12 +27,12 @@ def test_events_are_lines_and_none_is_held_back(tmp_path):
 
 def test_steps_that_come_again_are_there_once(tmp_path):
     path = tmp_path / "events.jsonl"
-    with kept(tmp_path):
+    with record_events(tmp_path):
         take(tmp_path, 1, 6)
         emit(Warned("stays"))
     with path.open("a") as file:
         file.write('{"event": "StepDone", "ind')  # the process died here
-    with kept(tmp_path):
+    with record_events(tmp_path):
         take(tmp_path, 4, 8)
         take(tmp_path, 6, 9)  # rolled back
     assert steps(path) == list(range(1, 10))
@@ -44,6 +44,6 @@ def test_steps_that_come_again_are_there_once(tmp_path):
 def test_an_event_after_a_torn_line_is_whole(tmp_path):
     path = tmp_path / "events.jsonl"
     path.write_text('{"time": 1, "event": "StepDone", "index": 1}\n{"event": "War')
-    with kept(tmp_path):
+    with record_events(tmp_path):
         emit(Warned("next"))
     assert [line["event"] for line in read(path)] == ["StepDone", "Warned"]

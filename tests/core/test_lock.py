@@ -8,13 +8,13 @@ import pytest
 
 from surfkit.core import lock
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held, holder
+from surfkit.core.lock import lock_holder, locked
 
 WAITS = """
 import sys
 from pathlib import Path
-from surfkit.core.lock import held
-with held(Path(sys.argv[1])):
+from surfkit.core.lock import locked
+with locked(Path(sys.argv[1])):
     print("has it", flush=True)
     sys.stdin.read()
 """
@@ -32,22 +32,22 @@ def other(tmp_path):
 
 def test_a_second_process_is_refused_until_the_first_is_dead(other, tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "PATIENCE_S", 0.05)
-    with pytest.raises(BadInput, match=rf"run: process {other.pid} on \S+ works in it; wait"), held(tmp_path / "run"):
+    with pytest.raises(BadInput, match=rf"run: process {other.pid} on \S+ works in it; wait"), locked(tmp_path / "run"):
         pass
-    assert holder(tmp_path / "run").startswith(f"process {other.pid} on ")
+    assert lock_holder(tmp_path / "run").startswith(f"process {other.pid} on ")
     other.kill()
     other.wait()
-    assert holder(tmp_path / "run") is None and (tmp_path / "run" / "lock").exists(), "killed, it leaves the file"
-    with held(tmp_path / "run"):
+    assert lock_holder(tmp_path / "run") is None and (tmp_path / "run" / "lock").exists(), "killed, it leaves the file"
+    with locked(tmp_path / "run"):
         assert json.loads((tmp_path / "run" / "lock").read_text())["pid"] == os.getpid()
 
 
 def test_an_empty_folder_does_not_stay(tmp_path):
-    with pytest.raises(ValueError, match="on the way"), held(tmp_path / "a" / "b"):
+    with pytest.raises(ValueError, match="on the way"), locked(tmp_path / "a" / "b"):
         assert (tmp_path / "a" / "b" / "lock").exists()
         raise ValueError("on the way")
     assert not (tmp_path / "a").exists()
-    with held(tmp_path / "a" / "b"):
+    with locked(tmp_path / "a" / "b"):
         (tmp_path / "a" / "b" / "result").touch()
     assert [path.name for path in (tmp_path / "a" / "b").iterdir()] == ["result"]
 
@@ -62,7 +62,7 @@ def test_a_lock_that_was_deleted_meanwhile_is_none(tmp_path, monkeypatch):
         flock(file, how)
 
     monkeypatch.setattr(fcntl, "flock", slow)
-    with held(tmp_path):
+    with locked(tmp_path):
         assert len(calls) == 2 and path.exists()
 
 
@@ -74,5 +74,5 @@ def test_without_locks_there_is_a_note(tmp_path, monkeypatch):
         raise OSError(37, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with held(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         assert len(said) == 1 and "cannot be locked" in said[0]

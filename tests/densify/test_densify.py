@@ -95,12 +95,12 @@ def test_edits_happen_between_start_and_until():
 @pytest.mark.parametrize("steps", [15, 60, 100, 700])
 def test_the_steps_of_edits_are_known_beforehand(policy, steps):
     edited = [i for i in range(1, steps + 1) if (edit := watched(policy, scene(), [i])) and edit.clone is not None]
-    assert list(policy.edit_steps(steps)) == edited
+    assert list(policy.edits(steps)) == edited
 
 
 @pytest.mark.parametrize("steps", [*range(20, 80), 100, 300, 500, 700, 1_000, 1_499])
 def test_short_runs_have_some_edits(steps):
-    assert len(rescale(ADC(), steps / 30_000).edit_steps(steps)) >= 2
+    assert len(rescale(ADC(), steps / 30_000).edits(steps)) >= 2
 
 
 def test_the_first_window_begins_at_the_first_step_and_each_edit_begins_another():

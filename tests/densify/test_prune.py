@@ -85,7 +85,7 @@ def test_trims_end_epochs_and_leave_reset_points_alone(crowd):
 def schedule(recipe_steps, epoch):
     """Steps that add points and steps that trim, of a run of so many steps with so many views."""
     adc, trim = (rescale(policy, recipe_steps / 30_000) for policy in (ADC(), Trim()))
-    edits, trims, reset = list(adc.edit_steps(recipe_steps)), [], 0
+    edits, trims, reset = list(adc.edits(recipe_steps)), [], 0
     for index in range(2, recipe_steps + 1):
         if index in trim.trims(epoch) and index - reset >= trim.recovery:
             trims.append(index)

@@ -69,7 +69,7 @@ def parts(*points):
 
 
 def rising(last, known=True):
-    return Growth(1_000_000, last, 0.0, 0.5, 100, known)
+    return Growth(1_000_000, last, [at / 200 for at in range(1, 101)], known)
 
 
 def test_what_was_measured_is_added_up():

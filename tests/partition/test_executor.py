@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.execute import base as executor
 from surfkit.execute.base import LOG, Inline, Job, Pool
-from surfkit.execute.state import STALE_S, BlockState, read_state, worked_on, write_state
+from surfkit.execute.state import STALE_S, BlockState, find_worker, read_state, write_state
 
 
 def job(folder: Path, index: int, code: str = "", **more) -> Job:
@@ -32,6 +32,19 @@ def test_pool_tells_how_each_ended_and_keeps_what_it_printed(tmp_path):
     jobs = [job(tmp_path, 0, "print('hello')"), job(tmp_path, 1, "raise SystemExit(1)"), job(tmp_path, 2, killed)]
     assert {end.job.index: end.status for end in Pool().run(jobs)} == {0: 0, 1: 1, 2: -9}
     assert (tmp_path / "00" / LOG).read_text() == "hello\n"
+
+
+def test_pool_reports_what_the_kernel_killed_for_lack_of_memory(tmp_path, monkeypatch):
+    kills = iter([2, 3, 3])
+    monkeypatch.setattr(executor, "oom_kills", lambda: next(kills))
+    killed = "import os; os.kill(os.getpid(), 9)"
+    jobs = [job(tmp_path, at, killed, cost=3 - at) for at in range(2)] + [job(tmp_path, 2, "raise SystemExit(3)")]
+    ends = list(Pool(workers=1).run(jobs))
+    assert [(end.status, end.kind) for end in ends] == [(-9, "oom"), (-9, None), (3, None)]
+
+
+def test_who_shows_progress():
+    assert Inline().in_process and not Pool().in_process
 
 
 def test_pool_divides_the_processors(tmp_path):
@@ -95,21 +108,21 @@ def test_leaving_stops_the_workers(tmp_path):
 
 def test_a_state_is_read_as_it_was_written(tmp_path):
     assert read_state(tmp_path) == BlockState()
-    write_state(tmp_path, status="running", step=3, steps=10, attempts=1)
+    write_state(tmp_path, read_state(tmp_path), status="running", step=3, steps=10, attempts=1)
     state = read_state(tmp_path)
     assert (state.status, state.step, state.steps, state.attempts, state.pid) == ("running", 3, 10, 1, os.getpid())
 
 
 def test_who_is_still_at_work(tmp_path):
     """Here the lock tells, whatever pid is written down; elsewhere, when it was heard of."""
-    write_state(tmp_path, status="running")
-    assert not worked_on(tmp_path)
-    with held(tmp_path):
-        assert worked_on(tmp_path)
-    write_state(tmp_path, host="another")
-    assert worked_on(tmp_path)
-    write_state(tmp_path, host="another", heard=time.time() - STALE_S - 1)
-    assert not worked_on(tmp_path)
+    write_state(tmp_path, read_state(tmp_path), status="running")
+    assert not find_worker(tmp_path)
+    with locked(tmp_path):
+        assert find_worker(tmp_path)
+    write_state(tmp_path, read_state(tmp_path), host="another")
+    assert find_worker(tmp_path)
+    write_state(tmp_path, read_state(tmp_path), host="another", heard=time.time() - STALE_S - 1)
+    assert not find_worker(tmp_path)
 
 
 @pytest.mark.parametrize("settings", [{"workers": 0}, {"threads": -1}, {"memory_share": 0.0}])

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from surfkit.execute import remote
 from surfkit.execute.base import LOG, Job
-from surfkit.execute.remote import Outcome, attend
-from surfkit.execute.shared import MARK, marked, remote_job
+from surfkit.execute.remote import Outcome, run_remote_job
+from surfkit.execute.shared import MARK, mark_folder, remote_job
 
 HOST = socket.gethostname()
 
@@ -27,7 +28,7 @@ def test_an_errand_is_run(tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     seen = "import json, os\nnames = 'OMP_NUM_THREADS', 'CUDA_VISIBLE_DEVICES'\n"
     seen += "print(json.dumps([os.environ[name] for name in names]))"
-    with marked([job(tmp_path, "")]) as mark:
+    with mark_folder([job(tmp_path, "")]) as mark:
         assert remote_job(job(tmp_path, seen), mark, 2, gpu=False)() == Outcome(0, HOST)
         assert remote_job(job(tmp_path, f"{seen}\nraise SystemExit(3)"), mark, 1, gpu=True)() == Outcome(3, HOST)
     lines = (tmp_path / "000" / LOG).read_text().splitlines()
@@ -37,7 +38,7 @@ def test_an_errand_is_run(tmp_path, monkeypatch):
 def test_another_disk(tmp_path):
     """The folders are there, but the mark is not: they are others of the same name."""
     (tmp_path / f"{MARK}of-a-driver-that-was-killed").touch()
-    with marked([job(tmp_path, "")]) as mark:
+    with mark_folder([job(tmp_path, "")]) as mark:
         assert [path.name for path in tmp_path.iterdir()] == [mark.name]
         made = remote_job(job(tmp_path, ""), mark, 1, gpu=False)
     found = made()
@@ -46,15 +47,25 @@ def test_another_disk(tmp_path):
     assert not list(tmp_path.glob(f"{MARK}*")) and not (tmp_path / "000" / LOG).exists()
 
 
+def test_killed_for_lack_of_memory(tmp_path, monkeypatch):
+    """The kernel of the machine where it ran counts one more; a process that someone else kills is none of those."""
+    kills = iter([3, 4, 7, 7])
+    monkeypatch.setattr(remote, "oom_kills", lambda: next(kills))
+    with mark_folder([job(tmp_path, "")]) as mark:
+        made = remote_job(job(tmp_path, "import os; os.kill(os.getpid(), 9)"), mark, 1, gpu=False)
+        assert made() == Outcome(-9, HOST, kind="oom")
+        assert replace(made, process=None)() == Outcome(-9, HOST)
+
+
 def test_another_version(tmp_path):
-    with marked([job(tmp_path, "")]) as mark:
+    with mark_folder([job(tmp_path, "")]) as mark:
         found = replace(remote_job(job(tmp_path, ""), mark, 1, gpu=False), version="0.0.7")()
     assert found.status == 2 and "and the run is of 0.0.7; install the same on all machines" in found.why
 
 
 def test_told_to_end_by_someone_else(tmp_path):
     """A cluster tells every process of a job; the one that minds it then waits for its own end."""
-    with marked([job(tmp_path, "")]) as mark:
+    with mark_folder([job(tmp_path, "")]) as mark:
         made = remote_job(job(tmp_path, "raise SystemExit(130)"), mark, 1, gpu=False)
         began = time.monotonic()
         assert replace(made, hold_s=0.7)().status == 130 and time.monotonic() - began > 0.7
@@ -78,6 +89,6 @@ def test_an_agent_hears_ctrl_c_also_where_the_shell_ignores_it():
         return "saved"
 
     try:
-        assert attend(interrupted) == "saved"
+        assert run_remote_job(interrupted) == "saved"
     finally:
         signal.signal(signal.SIGINT, before)

@@ -199,7 +199,7 @@ def test_a_network_goes_on_as_if_nothing_had_happened(source, tmp_path):
 def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
     assert train(source, tmp_path / "run", "recipe:3dgs", "primitive:fog") == 0
     run, state, _ = load_run(tmp_path / "run")
-    drawn = run.primitive.activate(state.points.params, 0).opacities
+    drawn = run.last.primitive.activate(state.points.params, 0).opacities
     table = read_splats(tmp_path / "run" / "point_cloud.ply")
     assert torch.allclose(table.opacity_logits.sigmoid(), drawn, atol=1e-6)
     points = Points.fresh({"means": torch.zeros(2, 3), "opacities": torch.zeros(2)})

@@ -11,7 +11,7 @@ from surfkit import pipeline
 from surfkit.appearance import Exposure
 from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
-from surfkit.core.lock import held
+from surfkit.core.lock import locked
 from surfkit.core.registry import components
 from surfkit.core.tree import evolve
 from surfkit.densify.prune import Importance
@@ -80,7 +80,7 @@ def test_what_is_left(finished):
     splats = read_splats(finished / "point_cloud.ply")
     assert splats.means.shape == (100, 3) and splats.sh_rest.shape == (100, 3, 3)
     loaded, state, _ = load_run(finished)
-    assert loaded.part == "refine1" and loaded.primitive.sh_degree == 1 and state.index == 6
+    assert loaded.last.name == "refine1" and loaded.last.primitive.sh_degree == 1 and state.index == 6
     for folder, steps in ((finished, 6), (finished / "refine0", 4), (finished / "refine1", 6)):
         lines = map(json.loads, (folder / "events.jsonl").read_text().splitlines())
         assert [line["index"] for line in lines if line["event"] == "StepDone"] == [*range(1, steps + 1)]
@@ -112,10 +112,10 @@ def test_distillation_learns_what_the_model_drew_before(finished, data):
     teacher = state_of(finished, "refine0")
     assert torch.equal(teacher.points.params["opacities"], student.points.params["opacities"]), "they are frozen"
     cut = replace(teacher.points, params=loaded.recipe.refine[1].params(teacher.points.params))
-    before, rasterizer = replace(loaded, part="refine0"), select("cpu")[0]
+    (*_, before, last), rasterizer = loaded.stages, select("cpu")[0]
     drawn = [
-        optimise.drawing(run, state, rasterizer, geometry=False)
-        for run, state in ((before, teacher), (loaded, student), (loaded, replace(teacher, points=cut, sh_degree=1)))
+        optimise.drawing(stage, state, rasterizer, geometry=False)
+        for stage, state in ((before, teacher), (last, student), (last, replace(teacher, points=cut, sh_degree=1)))
     ]
     views = loaded.recipe.refine[1].views(scene.train, 0)
     taught, learnt, plain = (torch.stack([draw(view).color for view in views]) for draw in drawn)
@@ -170,13 +170,13 @@ def test_the_time_left_is_that_of_the_refinement(finished, tmp_path):
     lines = [line | {"time": 10.0 * line["index"]} for line in lines if line["event"] == "StepDone"][:4]
     began = {"event": "StageBegan", "time": 0.0, "stage": "refine1", "steps": 6, "points": 100, "first": 1}
     journal.write_text("".join(json.dumps(line) + "\n" for line in [began, *lines]))
-    with held(out):
+    with locked(out):
         assert status(out).seconds_left == pytest.approx(20.0)
 
 
 def test_numbers_that_stay_infinite_name_the_rates_of_the_refinement(data, recipe, tmp_path):
     with pytest.raises(NotFinite, match=r"lower refine\.1\.stage\.rates in another folder"):
-        optimise.rolled_back(Run(tmp_path, recipe, data, "refine1"), 2, Diverged(3, "a.png", "infinite"), interrupt)
+        optimise.return_to_checkpoint(Run(tmp_path, recipe, data).last, 2, Diverged(3, "a.png", "infinite"), interrupt)
 
 
 def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):

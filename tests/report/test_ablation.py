@@ -16,7 +16,7 @@ from surfkit.recipe import Recipe, without_unused
 from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, SURFACE, TABLES
 from surfkit.recipes.surface import STEREO
 from surfkit.recipes.surface import SURFACE as BEST
-from surfkit.report.ablation import Row, Table, build, built_on, capped, pick, scaled
+from surfkit.report.ablation import Row, Table, build, built_on, limit_points, pick, scaled
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
 FALLBACKS = Table(
@@ -69,7 +69,7 @@ def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_w
     assert first.depth is None and "depth" not in first.pretrain.losses and first.pretrain.densify is not None
     assert all(recipe.depth is not None and recipe.mesh is not None for recipe in others)
     assert alone == replace(STEREO, about=alone.about) and scaled(alone, SURFACE, 2_000) == alone
-    assert capped(recipes[last], 500).start.most == 500
+    assert limit_points(recipes[last], 500).start.most == 500
 
 
 @pytest.mark.parametrize("name", ["model", "gradient"])

@@ -5,8 +5,8 @@ import pytest
 from surfkit.cli import main
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Measured, StageBegan, StepDone, emit
-from surfkit.core.lock import held
-from surfkit.run.journal import kept
+from surfkit.core.lock import locked
+from surfkit.run.journal import record_events
 
 TOTALS = {"points": 9, "steps": 40, "seconds": 2.0, "cpu_seconds": 3.0}
 
@@ -17,7 +17,7 @@ def folder(tmp_path):
     out = tmp_path / "run"
     write_json(out / "run.json", {"notes": ["the scene is odd"], "skipped": ["c.jpg"]})
     write_json(out / "recipe.json", {"pretrain": {"steps": 400}})
-    with kept(out):
+    with record_events(out):
         emit(StageBegan("pretrain", 400, 50))
         for index in range(1, 121):
             emit(StepDone(index, 400, {"l1": 0.5, "ssim": 0.25}, 50 + index, 10**9))
@@ -49,7 +49,7 @@ def test_a_stopped_run(folder, capsys):
 
 
 def test_a_running_run_names_its_process_and_the_time_left(folder, capsys):
-    with held(folder):
+    with locked(folder):
         assert main(["status", str(folder), "--json"]) == 3
         found = json.loads(capsys.readouterr().out)
         assert found["state"] == "running" and found["process"].startswith("process ")
@@ -63,13 +63,13 @@ def test_a_finished_run(folder, capsys):
     (folder / "point_cloud.ply").touch()
     assert main(["status", str(folder)]) == 0
     assert "23.46 dB of 1 views\n" in capsys.readouterr().out
-    with held(folder):
+    with locked(folder):
         assert main(["status", str(folder)]) == 3, "someone is at it again"
 
 
 def test_no_run_is_2(tmp_path, capsys):
     assert main(["status", str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
-    with held(tmp_path / "run"):
+    with locked(tmp_path / "run"):
         assert main(["status", str(tmp_path / "run")]) == 2
         assert "is about to begin one" in capsys.readouterr().err

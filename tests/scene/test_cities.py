@@ -13,7 +13,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.read import RANDOM_POINTS, read
 from surfkit.readers.split import GauUScene
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.testing.synthetic import SURFACES, Flight, look, photograph, write_colmap
 
 from .folders import DEPTHS, FLIGHT, city, nerfstudio, renumbered, squarely, with_tests_apart
@@ -39,7 +39,7 @@ def test_matrixcity_with_depth(tmp_path, truth, kind):
     pose = scene.frame.input_pose(scene.train[0].camera.world_to_camera)  # the points of the first come first
     _, colors = look(FLIGHT, pose, xyz[:1165] @ pose[:3, :3].T + pose[:3, 3])
     assert np.abs(scene.cloud.rgb[:1165].numpy() - colors * 255).mean() < 1
-    with noted() as notes:
+    with collect_notes() as notes:
         priors = read_priors(data, scene)
     assert priors is not None and not notes.texts
     for at, view in enumerate(truth.scene.train):
@@ -78,12 +78,12 @@ def test_depth_without_its_package_or_of_another_kind_is_said(tmp_path, truth, m
     scene = read(data)
     path = tmp_path / "city_depth_float32/aerial/train/block_1_depth/0002.exr"
     path.write_bytes(path.read_bytes()[:200])
-    with noted() as notes:
+    with collect_notes() as notes:
         assert read_priors(data, scene)[2] is None and len(read(data).cloud.xyz) == 3 * 1165
     assert "1 of 4 photographs train without a depth prior: cannot be read" in notes.texts[0]
     assert f"1 of 4 depth maps give no points to start from, first {path}: cannot be read" in notes.texts[1]
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with noted() as notes:
+    with collect_notes() as notes:
         assert read_priors(data, scene) is None
     assert "needs the package OpenEXR, which is not installed: pip install 'surfkit[exr]'" in notes.texts[0]
     assert len(read(data).cloud.xyz) == RANDOM_POINTS

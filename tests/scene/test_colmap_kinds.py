@@ -13,7 +13,7 @@ from surfkit.readers import undistort
 from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene import copies
 from surfkit.scene.photos import read_photo, view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -47,7 +47,7 @@ def farm(made, tmp_path):
 
 def noticed(data):
     """The scene, and what was said of it."""
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         return read(data), notes
 

@@ -17,7 +17,7 @@ from surfkit.readers.depth_files import confidence_path, map_path, normal_path, 
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_prior import read_priors, resized
 from surfkit.readers.read import observations
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.align import align, sample
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -43,7 +43,7 @@ def farm(made, tmp_path):
 
 def read(data, scene, normals=False):
     """The priors, and what was warned of."""
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         return read_priors(data, scene, normals=normals), notes
 

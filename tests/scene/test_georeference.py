@@ -11,7 +11,7 @@ from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_spl
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth, utm
 from surfkit.readers.read import read
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph
 
@@ -78,7 +78,7 @@ def test_moving_changes_no_pixel(tmp_path):
     ],
 )
 def test_zones_as_opendronemap_writes_them(tmp_path, text, longitude, crs):
-    with noted() as notes:
+    with collect_notes() as notes:
         assert project(tmp_path, text, REFERENCE | {"longitude": longitude}).crs == crs
     assert ("is no zone of UTM" in "".join(notes.texts)) == text.startswith("EPSG:2056")
 
@@ -110,7 +110,7 @@ def test_damaged_georeferences(tmp_path, coords, reference, text):
 def test_survey_coordinates_keep_their_precision(tmp_path):
     move = np.array([432_123.25, 5_412_345.5, 312.0])
     plain = read(Data(surveyed(tmp_path / "plain", np.zeros(3))))
-    with noted() as notes:
+    with collect_notes() as notes:
         scene = read(Data(surveyed(tmp_path / "far", move), metres_per_unit=1))
     frame = scene.frame
     assert frame.shift == (432120.0, 5412350.0, 0.0) and "offset 432120 5412350 0" in notes.texts[0]

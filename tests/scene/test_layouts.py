@@ -10,7 +10,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
 from surfkit.readers.read import RANDOM_POINTS, observations, read
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import photograph
 
@@ -61,7 +61,7 @@ def test_nerfstudio_with_its_own_split_intrinsics_by_frame_masks_and_points_as_t
     head += "".join(f"property uint8 {color}\n" for color in ("red", "green", "blue"))
     text = f"ply\nformat ascii 1.0\nelement vertex {len(xyz)}\n{head}end_header\n{rows}\n"
     (tmp_path / "sparse_pc.ply").write_text(text)
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         scene = read(Data(tmp_path))
     same(scene, truth)
@@ -82,7 +82,7 @@ def test_distorted_nerfstudio(tmp_path, truth):
 @pytest.mark.parametrize("white", [False, True])
 def test_blender(tmp_path, truth, white):
     blender(tmp_path, truth)
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         scene = read(Data(tmp_path, white=white))
     assert [view.name for view in scene.held_out] == ["test/view_000.png", "test/view_003.png"]
@@ -116,7 +116,7 @@ def test_matrixcity(tmp_path, truth):
 
 
 def test_opendronemap(tmp_path, truth):
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         scene = read(Data(odm(tmp_path, truth), test_every=3))
     same(scene, truth)
@@ -168,7 +168,7 @@ def test_a_folder_of_two_layouts_needs_a_choice_unless_one_is_colmap(tmp_path, t
         read(Data(tmp_path))
     assert len(read(Data(tmp_path, layout="nerfstudio", test_every=0)).train) == 6
     write_colmap(tmp_path, truth)
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         assert observations(Data(tmp_path), read(Data(tmp_path))).seen
     assert len(notes) == 1 and "read as colmap; it could also be read with --layout nerfstudio, odm" in notes[0]

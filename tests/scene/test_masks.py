@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
 from surfkit.readers.masks import mask_cache, read_mask, view_mask
 from surfkit.readers.read import read
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -41,7 +41,7 @@ def put(path, pixels=None):
 
 
 def scene_of(farm, **settings):
-    with noted() as kept:
+    with collect_notes() as kept:
         notes = kept.texts
         return read(Data(farm, test_every=0, **settings)), notes
 

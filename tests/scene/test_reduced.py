@@ -10,7 +10,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import read_photo, view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -33,7 +33,7 @@ def shrink(farm, by, end=".png"):
 
 
 def noticed(data):
-    with noted() as notes:
+    with collect_notes() as notes:
         scene = read(data)
     return scene, [text for text in notes.texts if "spelt" not in text]
 

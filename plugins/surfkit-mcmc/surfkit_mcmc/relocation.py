@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -56,9 +56,18 @@ class Relocation(Densify):
                 "(0 or more); these do not fit"
             )
 
-    def edit_steps(self, steps: int) -> range:
-        """See `Densify.edit_steps`."""
+    def edits(self, steps: int) -> range:
+        """See `Densify.edits`."""
         return range((self.start // self.every + 1) * self.every, min(self.until, steps) + 1, self.every)
+
+    @property
+    def most_points(self) -> int:
+        """See `Densify.most_points`."""
+        return self.cap
+
+    def limited(self, points: int) -> Relocation:
+        """See `Densify.limited`."""
+        return replace(self, cap=min(self.cap, points))
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Noise at every step, and moves every so often."""

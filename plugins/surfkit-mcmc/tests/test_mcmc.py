@@ -142,7 +142,7 @@ def test_needles_are_not_moved_onto():
 def test_points_move_in_runs_of_any_length_at_the_steps_that_are_foretold(steps):
     policy, (points, step) = replace(rescale(Relocation(), steps / 30_000), noise=0.0), crowd()
     moved = [i for i in range(1, steps + 1) if policy.edit(points, replace(step, index=i)) is not None]
-    assert list(policy.edit_steps(steps)) == moved and len(moved) >= 2
+    assert list(policy.edits(steps)) == moved and len(moved) >= 2
 
 
 def test_without_a_live_point_nothing_moves():

@@ -1,0 +1,167 @@
+"""Whether a run may go on in a folder, and what is written down when it does."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import platform
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, load, read_json, write_json
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import records
+from surfkit.core.schedule import rescale_like
+from surfkit.core.version import own_version
+from surfkit.readers.depth_prior import prior_files
+from surfkit.readers.fingerprint import Fingerprint, changed, fingerprint
+from surfkit.readers.made_maps import is_there, located, read_made
+from surfkit.recipe import Recipe
+from surfkit.run.folder import Run, read_data, read_record
+from surfkit.run.notes import Notes
+from surfkit.scene.scene import Frame, Scene
+
+
+def refuse_other_run(run: Run) -> None:
+    """BadInput if the folder holds a run that this one does not continue; a warning if this one makes it longer."""
+    there = read_recipe_before(run.out / "recipe.json", run.recipe)
+    now = dump(run.recipe)
+    remesh = isinstance(there, dict) and there.get("mesh") != now["mesh"]
+    if isinstance(there, dict):
+        there |= {"mesh": now["mesh"]}  # training is the same
+        before = there.get("refine")
+        prefix = isinstance(before, list) and first_difference(before, now["refine"][: len(before)]) is None
+        if prefix and there.get("pretrain") == now["pretrain"]:
+            there |= {"refine": now["refine"]}  # the model that is there can be refined further
+    found = None if there is None else first_difference(there, now)
+    if found and not (found := difference_but_length(run, there)):
+        emit(
+            Warned(
+                f"the run is made longer, from {there['pretrain']['steps']} steps to {run.recipe.pretrain.steps}: "
+                "steps still to come follow the schedules of the new length, those already made followed the old ones, "
+                "so the result is not that of a run of this length from the start"
+            )
+        )
+    if not found and run.record.exists():
+        before = dump(read_data(run.out))  # with defaults of newer settings
+        found = first_difference(before | {"priors": None}, dump(run.data) | {"priors": None}, "data")
+    if found:
+        at, old, new = found
+        raise BadInput(
+            f"--out {run.out} holds a run with {at} {abbreviate(old)}, and this one has {abbreviate(new)}; "
+            "name another folder, or delete that one"
+        )
+    if remesh:
+        run.mesh_record.unlink(missing_ok=True)
+
+
+def read_recipe_before(path: Path, now: Recipe) -> Any:
+    """Content of a recipe.json, with the defaults of newer settings if it is still a recipe; None if there is no file.
+
+    Runs of older versions made no depth maps: they continue as they began, however the recipe makes them `now`.
+    """
+    there = read_json(path, dict[str, Any]) if path.exists() else None
+    if there is not None:
+        there = {"depth": dump(now.depth)} | there
+    try:
+        return dump(load(Recipe, there)) if there is not None else None
+    except BadInput:
+        return there  # the difference will tell
+
+
+def difference_but_length(run: Run, there: Any) -> tuple[str, Any, Any] | None:
+    """The first difference beside the length between a recipe and a shorter one in the folder; None if there is none.
+
+    The recipe may be longer with all schedules scaled (`--steps`), or with none scaled (`--pretrain.steps`).
+    """
+    plain = first_difference(there, dump(run.recipe))
+    now = run.recipe.pretrain.steps
+    stage = there.get("pretrain") if isinstance(there, dict) else None
+    before = stage.get("steps") if isinstance(stage, dict) else None
+    if not isinstance(before, int) or not 0 < before < now:
+        return plain
+    old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
+    if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
+        return None
+    return first_difference(dump(rescale_like(old, now / before, run.recipe)), dump(run.recipe))
+
+
+def first_difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:
+    """Path and both values of the first difference between plain data; `about` of a recipe does not count."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            path = f"{at}.{key}" if at else key
+            if path != "about" and (found := first_difference(old.get(key), new.get(key), path)):
+                return found
+        return None
+    if isinstance(old, list) and isinstance(new, list):  # where one is longer, its first item too many tells
+        pairs = enumerate(itertools.zip_longest(old, new))
+        first = next((found for i, (a, b) in pairs if (found := first_difference(a, b, f"{at}.{i}"))), None)
+        return first or (None if len(old) == len(new) else (at, old, new))
+    return None if old == new else (at, old, new)
+
+
+def refuse_changed(run: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
+    """The fingerprint of the data, or BadInput if it is not that of the data which the run began with.
+
+    Args:
+        run: The run.
+        scene: Its data.
+        skipped: Names of photographs that the run has found damaged; they do not count.
+    """
+    before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
+    own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
+    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None)
+    if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
+        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+        raise BadInput(
+            f"--out {run.out}: the data in {run.data.path} are not those that the run began with: {found[0].what}"
+            f"{more}; put them back, name another folder, or delete that one"
+        )
+    return now
+
+
+def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:
+    """Write run.json, inputs.json and recipe.json; the recipe last, as it makes the folder a run."""
+    before = read_record(run.out)
+    notes.begin(
+        run.record,
+        {
+            "versions": {"surfkit": own_version(), "python": platform.python_version(), "torch": torch.__version__},
+            "plugins": [str(plugin) for plugin in records() if plugin.distribution],
+            "device": backend,
+            "threads": torch.get_num_threads(),
+            "seed": run.recipe.seed,
+            "data": run.data,
+            "prepare_cpu_seconds": depth_maps_cpu_seconds(run, before),
+            "frame": {
+                "origin": frame.origin.tolist(),
+                "scale": frame.scale,
+                "offset": frame.shift,
+                "crs": frame.crs,
+                "metres_per_unit": frame.metres,
+            },
+        },
+        before,
+    )
+    write_json(run.inputs, prints)
+    write_json(run.out / "recipe.json", run.recipe)
+
+
+def depth_maps_cpu_seconds(run: Run, before: dict[str, Any]) -> float | None:
+    """CPU time of the depth maps made for a run; None where it uses those of the data set, or none."""
+    if run.data.priors is None:
+        return None
+    if not is_there(run.data.priors):
+        return before.get("prepare_cpu_seconds")
+    return round(read_made(located(run.data.priors)).cpu_seconds, 2)
+
+
+def abbreviate(value: Any) -> str:
+    """A value in a few words."""
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."
