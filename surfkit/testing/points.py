@@ -40,20 +40,23 @@ def check_policy(policy: Policy, points: Points | None = None, step: Step | None
 
 
 def check_densify(densify: Densify) -> None:
-    """A densifier keeps to `check_policy`, adds points, and only at steps that it told before.
+    """A densifier keeps to `check_policy`, adds points, only at steps that it told before, and none beyond a limit.
 
     Args:
         densify: With settings as for `check_policy`.
     """
-    name, foretold = type(densify).__name__, densify.edit_steps(STEPS)
+    name, foretold = type(densify).__name__, densify.edits(STEPS)
     if foretold is not None:
         steps = list(foretold)
-        assert steps == sorted(set(steps)), f"{name}.edit_steps: steps must be in order, each of them once"
-        assert not steps or 1 <= steps[0] <= steps[-1] <= STEPS, f"{name}.edit_steps: steps must lie in 1 to {STEPS}"
+        assert steps == sorted(set(steps)), f"{name}.edits: steps must be in order, each of them once"
+        assert not steps or 1 <= steps[0] <= steps[-1] <= STEPS, f"{name}.edits: steps must lie in 1 to {STEPS}"
     added = [index for index, edit in _taken_through(densify) if edit is not None and _adds(edit)]
     assert added, _idle(densify, "neither clones nor splits a point")
+    most = 205  # five more than there are
+    over = [index for index, edit in _taken_through(densify.limited(most)) if edit is not None and _after(edit) > most]
+    assert not over, f"{name}.limited({most}) adds points beyond {most} after step {over[0]}"
     late = [index for index in added if foretold is not None and index not in foretold]
-    assert not late, f"{name} adds points after step {late[0]}, which edit_steps({STEPS}) does not name"
+    assert not late, f"{name} adds points after step {late[0]}, which edits({STEPS}) does not name"
 
 
 def check_prune(prune: Prune) -> None:
@@ -126,6 +129,13 @@ def _idle(policy: Policy, does: str) -> str:
         f"{type(policy).__name__} {does} at any of the steps that were tried, of 1 to {STEPS}; give it settings with "
         "which it acts on points in the unit cube, or the check says nothing"
     )
+
+
+def _after(edit: Edit) -> int:
+    """How many points there are after an edit of the 200 through which policies are taken."""
+    nobody = torch.zeros(200, dtype=torch.bool)
+    drop, clone, split = (nobody if mask is None else mask for mask in (edit.drop, edit.clone, edit.split))
+    return int(torch.where(drop, 0, torch.where(split, 2, 1 + clone.long())).sum())
 
 
 def _adds(edit: Edit) -> bool:

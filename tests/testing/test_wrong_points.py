@@ -155,19 +155,25 @@ class Doubles(Densify):
     at: int = 500
     told: tuple[int, ...] | None = (500,)
 
-    def edit_steps(self, steps):
+    def edits(self, steps):
         return self.told
 
     def edit(self, points, step):
         return Edit(clone=torch.ones(len(points), dtype=torch.bool)) if step.index == self.at else None
 
 
+class Unlimited(Doubles):
+    def limited(self, points):
+        return self
+
+
 @pytest.mark.parametrize(
     ("densify", "message"),
     [
-        (Doubles(at=600), r"Doubles adds points after step 600, which edit_steps\(30000\) does not name"),
-        (Doubles(told=(500, 500)), "Doubles.edit_steps: steps must be in order, each of them once"),
-        (Doubles(told=(0, 500)), "Doubles.edit_steps: steps must lie in 1 to 30000"),
+        (Doubles(at=600), r"Doubles adds points after step 600, which edits\(30000\) does not name"),
+        (Doubles(told=(500, 500)), "Doubles.edits: steps must be in order, each of them once"),
+        (Doubles(told=(0, 500)), "Doubles.edits: steps must lie in 1 to 30000"),
+        (Unlimited(), r"Unlimited.limited\(205\) adds points beyond 205 after step 500"),
         (Doubles(at=0), "Doubles neither clones nor splits a point at any of the steps that were tried"),
     ],
 )
