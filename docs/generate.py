@@ -1,4 +1,4 @@
-"""Writes the pages that follow from the code: components.md, commands.md and floors.svg.
+"""Writes the pages that follow from the code: components.md, kinds.md, commands.md and floors.svg.
 
 python docs/generate.py
 
@@ -10,8 +10,11 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
+import inspect
 import io
 import os
+import re
+import textwrap
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -21,6 +24,11 @@ from xml.sax.saxutils import escape
 HERE = Path(__file__).parent
 ROOT = HERE.parent
 REGENERATE = "Written by `python docs/generate.py`."
+KINDS_INTRODUCTION = (
+    "A part is a frozen dataclass that extends the base class of its kind. [Write a plugin](plugins.md) makes one,",
+    "step by step, and [Components](components.md) lists those that there are. What must be written comes first.",
+    "Arguments, shapes and units are in the docstrings of the base classes.",
+)
 INTRODUCTION = (
     "`surfkit COMMAND --help` shows the same, and the options of the parts that are chosen with `FIELD:NAME`;",
     "[Components](components.md) lists those. What stands in brackets may be left out. An option that is on or off",
@@ -38,7 +46,7 @@ def main() -> None:
 
 def pages() -> dict[str, str]:
     """The text of every generated file, by name."""
-    return {"components.md": components(), "commands.md": commands(), "floors.svg": floors()}
+    return {"components.md": components(), "kinds.md": kinds(), "commands.md": commands(), "floors.svg": floors()}
 
 
 def components() -> str:
@@ -56,6 +64,65 @@ def components() -> str:
         os.environ.pop("SURFKIT_PLUGINS") if before is None else os.environ.update(SURFKIT_PLUGINS=before)
         registry.reload()
     return out.getvalue()
+
+
+def kinds() -> str:
+    """The page of what a plugin writes for a part of each kind: the base classes with their methods."""
+    from surfkit.core.registry import kebab, kind_of, offered
+
+    bases = {kind_of(cls) for owner, _, cls in offered("surfkit_components") if owner.startswith("surfkit.")}
+    lines = ["# Kinds of parts", "", REGENERATE, "", *KINDS_INTRODUCTION]
+    for base in sorted(bases, key=lambda base: base.__name__):
+        about, _, _ = inspect.cleandoc(base.__doc__ or "").partition("\nAttributes:\n")
+        lines += ["", f"## {kebab(base.__name__)}", "", about.strip(), "", _home(base), ""]
+        lines += [f"- {line}" for line in _contract(base)]
+    return "\n".join(lines) + "\n"
+
+
+def _home(base: type) -> str:
+    """Where a base class is imported from and stands, and what checks its parts."""
+    import surfkit
+    from surfkit import testing
+    from surfkit.core.registry import kebab
+
+    shown = f"surfkit.{base.__name__}" if base.__name__ in surfkit.__all__ else f"{base.__module__}.{base.__name__}"
+    names = (f"check_{kebab(cls.__name__).replace('-', '_')}" for cls in base.__mro__)
+    check = next((f", checked by `surfkit.testing.{name}`" for name in names if name in testing.__all__), "")
+    return f"`{shown}`, in `{base.__module__.replace('.', '/')}.py`{check}."
+
+
+def _contract(base: type) -> Iterator[str]:
+    """What a part of a kind must have, may replace and may set, each with the first sentence about it."""
+    lines: dict[str, list[str]] = {"write": [], "may replace": [], "may set": []}
+    for cls in reversed([cls for cls in base.__mro__ if cls.__module__.startswith("surfkit.")]):
+        for name, found in vars(cls).items():
+            function = found.fget if isinstance(found, property) else found
+            if inspect.isfunction(function) and (name == "__call__" or not name.startswith("_")):
+                names = ", ".join(list(inspect.signature(function).parameters)[1:])
+                shown = f"`{name}`" if isinstance(found, property) else f"`{name}({names})`"
+                what = "write" if name in base.__abstractmethods__ else "may replace"
+                lines[what].append(f"{shown}: {_sentence(function.__doc__)}")
+        lines["may set"] += [f"`{name}`{text and ': '}{text}" for name, text in _class_variables(cls)]
+    for what, texts in lines.items():
+        yield from (f"{what} {text}" for text in texts)
+
+
+def _class_variables(cls: type) -> Iterator[tuple[str, str]]:
+    """Class variables that a class declares, with their values, and what it says of each."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    _, _, listed = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
+    told = {found[1]: _sentence(found[2]) for found in re.finditer(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", listed, re.M)}
+    for field, text in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if isinstance(field, ast.AnnAssign) and "ClassVar" in ast.unparse(field.annotation):
+            name, value = field.target.id, f" = {ast.unparse(field.value)}" if field.value else ""
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                told[name] = _sentence(str(text.value.value))
+            yield f"{name}{value}", told.get(name, "")
+
+
+def _sentence(text: str | None) -> str:
+    """The first paragraph of a docstring in one line."""
+    return " ".join((text or "").strip().split("\n\n")[0].split())
 
 
 def commands() -> str:
