@@ -1,4 +1,4 @@
-"""The plugin tutorial, docs/plugins.md, step by step: files written, package installed, commands given."""
+"""What the pages show is so: the plugin tutorial, docs/plugins.md, step by step; the output of doctor; a run folder."""
 
 import json
 import re
@@ -106,3 +106,15 @@ def every_file_is_explained(run):
         above = {parent.as_posix() for parent in [name, *name.parents]}
         if path.is_file():
             assert above & known, f"run_folder.md does not explain {name}"
+
+
+def test_what_doctor_prints(monkeypatch, capsys):
+    page = ROOT / "docs" / "own_photographs.md"
+    command = next(span for span in spans(page) if span.startswith("surfkit doctor examples/"))
+    shown = next(block for block in code(page) if block.text.startswith("examples/boruszyn"))
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("COLUMNS", "400")
+    assert main(command.split()[1:]) == 0
+    printed = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    for line in shown.text.splitlines():
+        assert any(there.startswith(line.removesuffix("...")) for there in printed), f"{line!r} is not printed"
