@@ -15,7 +15,7 @@ from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
 from surfkit.cli.tables import tables
 from surfkit.core.codec import dump, write_json
-from surfkit.core.registry import kebab, kind_of, offered, records
+from surfkit.core.registry import HOOKS, kebab, kind_of, offered, records
 
 SLOTS = {
     "mesh": "mesher",
@@ -178,6 +178,11 @@ def test_every_folder_is_explained():
     tops = {path.relative_to(test_layering.ROOT).with_suffix("").parts[0] for path in test_layering.FILES}
     for folder in tops - {"__init__"}:
         assert f"| `{folder}` |" in page, f"architecture.md does not say what is in {folder}"
+
+
+def test_every_hook_is_explained():
+    for hook in HOOKS:
+        assert re.search(rf"^\| `{hook}\(.*\)` \|", TUTORIAL.read_text(), re.M), f"plugins.md does not explain {hook}"
 
 
 def test_every_page_can_be_found():
