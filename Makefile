@@ -6,7 +6,7 @@ STEPS ?= 1000
 SCALE ?= 1.5
 OUT ?= runs/demo
 
-.PHONY: demo test lint bench fuzz clean
+.PHONY: demo test lint docs bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/surfkit train recipe:surface --scale $(SCALE) --steps $(STEPS) --out $(OUT)
@@ -16,6 +16,11 @@ test: $(VENV)/.installed
 
 lint: $(VENV)/.installed
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
+
+# The site of docs/, in site/; a link or an anchor that leads nowhere is an error.
+docs: $(VENV)/.installed
+	$(PY) docs/generate.py
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
 
 bench: $(VENV)/.installed
 	OMP_WAIT_POLICY=PASSIVE $(PY) bench/raster.py
@@ -32,9 +37,9 @@ fuzz: $(VENV)/.installed
 $(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard surfkit/native/*.h surfkit/native/*.cpp surfkit/raster/*.h surfkit/*/cpu/*.h surfkit/*/cpu/*.cpp)
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
-	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev]"
+	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev,docs]"
 	$(PY) -m pip install --quiet --no-deps -e plugins/surfkit-ceiling -e plugins/surfkit-mcmc
 	touch $@
 
 clean:
-	rm -rf build $(VENV)
+	rm -rf build site $(VENV)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from surfkit.raster.api import Kind, Splats
+from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
 
 
 def city(
-    kind: Kind = "surfel", count: int = 200_000, width: int = 800, height: int = 608, seed: int = 0
+    kind: str = "surfel", count: int = 200_000, width: int = 800, height: int = 608, seed: int = 0
 ) -> tuple[Splats, Camera]:
     """Splats between depth 2 and 12 with a median size of 3.6 px, opacity uniform in 0.05 to 0.95; and their camera."""
     rng = np.random.default_rng(seed)
