@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from surfkit.core.registry import Component
+from surfkit.core.registry import Component, find
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
@@ -117,9 +117,7 @@ class Densify(Policy):
         It is used where memory has run out and where an ablation limits all rows alike, so the limit must hold. This
         default wraps the densifier; one with a limit of its own, which knows whom to prefer, lowers that.
         """
-        from surfkit.densify.limited import Limited
-
-        return Limited(self, points)
+        return find(Densify, "limited")(self, points)
 
 
 class Prune(Policy):

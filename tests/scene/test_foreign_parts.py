@@ -22,7 +22,7 @@ from surfkit.readers.fingerprint import changed, fingerprint
 from surfkit.readers.read import read
 from surfkit.readers.split import GauUScene, Split
 from surfkit.run.folder import read_data
-from surfkit.run.notes import noted
+from surfkit.run.notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
@@ -129,13 +129,13 @@ def test_a_layout_of_depth_maps_in_a_format_of_its_own(farm):
     with_lidar(root, exact, unit=0.25)
     data = Data(root, depth_layout=Lidar(unit=0.25))
     scene = read(data)
-    with noted() as notes:
+    with collect_notes() as notes:
         priors = read_priors(data, scene)
     assert not notes.texts
     for prior, view in zip(priors, scene.train, strict=True):
         wanted = exact[view.name] / scene.frame.scale
         np.testing.assert_allclose(prior.inverse.numpy()[wanted > 0], wanted[wanted > 0], rtol=1e-5)
-    with noted() as notes:
+    with collect_notes() as notes:
         assert read_priors(Data(root), scene) is None, "found, but in units that it does not say"
     assert "its depths are not those of the sparse points" in notes.texts[0]
 
@@ -175,7 +175,7 @@ def test_a_reader_of_higher_priority_than_colmap(farm):
     root, _ = farm
     assert read(Data(root)).frame.metres is None
     (root / "marked.txt").touch()
-    with noted() as notes:
+    with collect_notes() as notes:
         assert read(Data(root)).frame.metres == 7
     assert notes.texts == [f"{root}: read as marked; it could also be read with --layout colmap"]
     with pytest.raises(BadInput, match="--model sparse/0: a data set of layout marked has no such model; leave it out"):
