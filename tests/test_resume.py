@@ -298,7 +298,7 @@ def spoilt(recipe, at, above, monkeypatch):
 
 def test_numbers_that_are_not_finite_take_the_run_back_with_half_the_rates(data, recipe, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    rate = recipe.pretrain.rates["scales"].start
+    rate = complete(recipe).pretrain.rates["scales"].start
     metrics = run(spoilt(recipe, 13, 0.3 * rate, monkeypatch), data, out, intervals=Intervals(10))
     assert metrics["steps"] == STEPS and checkpoint.load(out / "pretrain" / "checkpoint.safetensors").halvings == 2
     assert [("(1 of 2" in text, "(2 of 2" in text) for text in notes(out)] == [(True, False), (False, True)]
