@@ -38,7 +38,7 @@ class StepDone:
     """One optimisation step is done.
 
     Attributes:
-        index: ViewCounts from 1.
+        index: Counts from 1.
         steps: How many the stage has.
         losses: Weighted value of each loss, by its name in the recipe.
         points: After the step; 0 for a method without points.

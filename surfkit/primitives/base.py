@@ -128,7 +128,7 @@ class Primitive(Component):
             if not self.in_ply or splats.kind not in KINDS:
                 raise BadInput(
                     f"primitive {kebab(type(self).__name__)}: PLY files of splats have no place for it, only for "
-                    f"{' and '.join(KINDS)}s; the checkpoint in the run folder holds the model"
+                    f"{'s and '.join(KINDS)}s; the checkpoint in the run folder holds the model"
                 )
             exact = "opacities" in params and self._activation("opacities") is SIGMOID
             return SplatTable(

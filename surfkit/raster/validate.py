@@ -18,7 +18,7 @@ def validate(splats: Splats, values: bool = True) -> None:
     """
     if splats.kind not in KINDS:
         raise BadInput(
-            f"splats of kind {splats.kind!r}: the rasterizers draw {' and '.join(KINDS)}s; the primitive needs a "
+            f"splats of kind {splats.kind!r}: the rasterizers draw {'s and '.join(KINDS)}s; the primitive needs a "
             "`render` of its own, a `contribution` for blocks and trimming, and an `opacity_before` for mesh:tetra"
         )
     count = len(splats)

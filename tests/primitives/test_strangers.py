@@ -240,7 +240,7 @@ def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
     )
     camera = Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 8.0, 8.0, 16, 16)
     for name in ("native", "reference"):
-        with pytest.raises(BadInput, match="splats of kind 'anchor': the rasterizers draw surfel and gaussians"):
+        with pytest.raises(BadInput, match="splats of kind 'anchor': the rasterizers draw surfels and gaussians"):
             select(name)[0].render(splats, camera, 0.01)
 
 
