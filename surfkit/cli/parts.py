@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-from surfkit.core.registry import Component, components
+from surfkit.core.registry import Component, components, find
 from surfkit.core.tree import evolve
 
 
@@ -40,8 +40,8 @@ class Place:
         """The container with a new default part of that name at the place, or without what is there."""
         if isinstance(self.inside, dict):
             left = {key: part for key, part in self.inside.items() if key != self.key}
-            return left if name == "none" else self.inside | {self.key: components(self.base)[name]()}
-        part = () if name == "none" else (components(self.base)[name](),)
+            return left if name == "none" else self.inside | {self.key: find(self.base, name)()}
+        part = () if name == "none" else (find(self.base, name)(),)
         return (*self.inside[: self.key], *part, *self.inside[self.key + 1 :])
 
 

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from surfkit.core.check import BadInput
+from surfkit.core.registry import name_of
 from surfkit.primitives.base import Primitive
-from surfkit.raster.api import Rasterizer, Render, Splats
+from surfkit.raster.api import Maps, Rasterizer, Render, Splats
 from surfkit.scene.camera import Camera
 
 
@@ -37,6 +39,18 @@ class PrimitiveRasterizer(Rasterizer):
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         """See `Rasterizer.opacity_before`."""
         return self.primitive.opacity_before(splats, camera, self.inner, near, points)
+
+
+def refuse_wrong_maps(primitive: Primitive, maps: Maps, camera: Camera) -> None:
+    """BadInput for maps of another size than the view, which a `render` of the primitive's own may give."""
+    size = (camera.height, camera.width)
+    for name, value in maps.present().items():
+        wanted = (3, *size) if name in ("color", "normal") else size
+        if value.shape != wanted:
+            raise BadInput(
+                f"primitive {name_of(primitive)}: its render gives {name} of shape {tuple(value.shape)} for a view of "
+                f"{wanted}; see `surfkit.raster.api.Maps`"
+            )
 
 
 def drawn_by(primitive: Primitive, rasterizer: Rasterizer) -> Rasterizer:

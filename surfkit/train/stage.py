@@ -23,7 +23,7 @@ from surfkit.densify.signal import LossGradient
 from surfkit.losses.base import Loss, Neighbour, Regularizer, Target, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive
-from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.drawing import drawn_by, refuse_wrong_maps
 from surfkit.primitives.edit import Edit, apply, merge, withheld
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
@@ -231,6 +231,7 @@ class Trainer:
         paired = stage.is_paired(index)
         geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
         render = self.draws.render(splats, target.view.camera, stage.near, geometry, distortion)
+        refuse_wrong_maps(self.primitive, render.maps, target.view.camera)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
         losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))

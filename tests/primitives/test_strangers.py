@@ -1,7 +1,7 @@
 """Primitives of a stranger's package: other columns, another activation, a way of their own to draw, a network."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -261,3 +261,21 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     seen = a.signal.norm(dim=1) > 1e-4
     ratio = b.signal.norm(dim=1)[seen] / a.signal.norm(dim=1)[seen]
     assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
+
+
+@dataclass(frozen=True)
+class Small(Balls):
+    """Draws half a picture."""
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
+
+
+def test_pictures_of_another_size_are_refused_in_one_line(source, monkeypatch):
+    scene = read(Data(source))
+    trainer = Trainer(Stage(steps=2), Small(), scene.train, photo_cache(scene.train), select("cpu")[0])
+    draw = torch.Generator().manual_seed(0)
+    state = trainer.begin(Points.fresh(Small().init(scene.cloud, draw)), draw)
+    monkeypatch.setattr("surfkit.primitives.drawing.name_of", lambda part: "small")
+    with pytest.raises(BadInput, match=r"primitive small: its render gives color of shape \(3, 30, 20\) for a view of"):
+        trainer.step(state)
