@@ -31,7 +31,7 @@ SURFACE = Recipe(
             "depth": DepthRegression(start=10.0, end=1.0),
         },
         # F1 at 0.5 m on shibuya-synth and PSNR on boruszyn, 1,000 steps: 0.787 and 20.6 dB as it is; with a weight that
-        # stays 0.781 and 20.7, that falls to 0.1 0.789 and 20.4 (fields and roofs get rough), and that stays, with normal
+        # stays 0.781 and 20.7, that falls to 0.1 0.789 and 20.4 (fields and roofs get rough), that stays, with normal
         # consistency, 0.773 and 21.0. What keeps surfaces smooth keeps errors of stereo in place too.
         # Stereo leaves holes, where few views see or nothing has texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
