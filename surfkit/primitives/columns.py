@@ -28,10 +28,6 @@ class Activation:
         """The raw numbers whose activated values are `factor` times as large."""
         return self.inverse(self.value(raw) * factor)
 
-    def at_most(self, raw: Tensor, most: float) -> Tensor:
-        """The raw numbers with activated values of at most `most`."""
-        return raw.clamp_max(float(self.inverse(torch.tensor(most, dtype=torch.float64))))
-
 
 class Exponential(Activation):
     """The exponential: raw numbers are natural logarithms."""
@@ -41,9 +37,22 @@ class Exponential(Activation):
         return raw + (factor.log() if isinstance(factor, Tensor) else math.log(factor))
 
 
+def sigmoid(raw: Tensor) -> Tensor:
+    """The logistic function, with the same bits on any number of threads.
+
+    torch rounds the last elements of each thread's share in another way than those that fill a vector.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return torch.sigmoid(raw)
+    finally:
+        torch.set_num_threads(threads)
+
+
 IDENTITY = Activation(lambda raw: raw, lambda value: value)
 EXP = Exponential(torch.exp, torch.log)
-SIGMOID = Activation(torch.sigmoid, torch.logit)
+SIGMOID = Activation(sigmoid, torch.logit)
 
 
 RATES = {

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive, harmonics
-from surfkit.primitives.columns import Column, standard_columns
+from surfkit.primitives.columns import SIGMOID, Column, standard_columns
 from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
@@ -52,7 +52,7 @@ class Flat3D(Primitive):
             means=params["means"],
             quats=params["quats"],
             scales=self._three(params["scales"]),
-            opacities=params["opacities"].sigmoid(),
+            opacities=SIGMOID.value(params["opacities"]),
             sh=harmonics(params, degree),
             antialias=self.antialias,
         )

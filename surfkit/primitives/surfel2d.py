@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from surfkit.primitives.base import Primitive, harmonics
-from surfkit.primitives.columns import Column, standard_columns
+from surfkit.primitives.columns import SIGMOID, Column, standard_columns
 from surfkit.primitives.init import facing, seeds
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Splats
@@ -35,6 +35,6 @@ class Surfel2D(Primitive):
             means=params["means"],
             quats=params["quats"],
             scales=params["scales"].exp(),
-            opacities=params["opacities"].sigmoid(),
+            opacities=SIGMOID.value(params["opacities"]),
             sh=harmonics(params, degree),
         )

@@ -212,3 +212,26 @@ def test_max_opacity_caps_and_forgets():
     assert torch.allclose(after.params["opacities"].sigmoid(), before.params["opacities"].sigmoid().clamp_max(0.01))
     assert not after.exp_avg["opacities"].any() and not after.exp_avg_sq["opacities"].any()
     assert after.exp_avg["means"].any() and before.params["opacities"].max() == 9
+
+
+@pytest.mark.parametrize("primitive", [Surfel2D(), Gaussian3D(), Flat3D()])
+def test_activations_have_the_same_bits_on_any_number_of_threads(primitive):
+    """More points than one thread takes, and not a whole number of vectors for each of several."""
+    before, count = torch.get_num_threads(), 36_482
+    params = primitive.init(cloud(4), generator())
+    params = {name: value[:1].expand(count, *value.shape[1:]).clone() for name, value in params.items()}
+    params["opacities"] = 3 * torch.randn(count, generator=generator())
+    params["scales"] = torch.randn(count, params["scales"].shape[1], generator=generator())
+    found = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            raw = {name: value.clone().requires_grad_() for name, value in params.items()}
+            splats = primitive.activate(raw, 0)
+            loss = (splats.opacities * params["opacities"]).sum() + (splats.scales * 0.5).sum()
+            gradients = torch.autograd.grad(loss, [raw["opacities"], raw["scales"]])
+            found.append([splats.opacities.detach(), splats.scales.detach(), *gradients])
+    finally:
+        torch.set_num_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
