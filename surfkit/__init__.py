@@ -30,7 +30,7 @@ _HOME = {
     "surfkit.scene.camera": ("Camera",),
     "surfkit.scene.observations": ("Observations", "Seen"),
     "surfkit.scene.scene": ("Cloud", "Frame", "Scene", "View"),
-    "surfkit.export.ply": ("SplatTable",),
+    "surfkit.export.table": ("SplatTable",),
     "surfkit.readers.base": ("Reader",),
     "surfkit.readers.capture": ("Capture", "Shot", "Tracks", "camera_of"),
     "surfkit.readers.data": ("Data",),

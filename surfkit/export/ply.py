@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO, ClassVar
 
 import numpy as np
 import torch
@@ -16,6 +16,8 @@ from torch import Tensor
 from surfkit.core.check import BadInput, expect
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
+from surfkit.export.base import Format
+from surfkit.export.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
 THINNESS = 1e-3
@@ -37,51 +39,25 @@ NEEDED = (
 
 
 @dataclass(frozen=True)
-class SplatTable:
-    """N splats in raw values, as files hold them.
+class PLY(Format):
+    """The layout of 3DGS: all values float32, nothing lost but digits of positions."""
 
-    Attributes:
-        kind: "surfel" is a flat disc (2DGS), "gaussian" an ellipsoid (3DGS).
-        means: (N, 3) positions.
-        quats: (N, 4) wxyz of any length.
-        log_scales: (N, 2) for surfels, (N, 3) for gaussians; natural logarithm of lengths.
-        opacity_logits: (N,).
-        sh0: (N, 3) coefficients of degree 0.
-        sh_rest: (N, K - 1, 3) coefficients of degrees 1 to 3, K in {1, 4, 9, 16}.
-        antialias: Gaussians only: to be drawn dimmed by what the blur of the rasterizer adds to them (Mip-Splatting).
-    """
+    suffix: ClassVar[str] = ".ply"
 
-    kind: Literal["surfel", "gaussian"]
-    means: Tensor
-    quats: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
-    sh0: Tensor
-    sh_rest: Tensor
-    antialias: bool = False
+    strict_2dgs: bool = False
+    """Leave out the third scale of surfels, as programs written for 2DGS alone expect."""
 
-    def __post_init__(self) -> None:
-        sizes = expect("means", self.means, ("N", 3))
-        expect("quats", self.quats, ("N", 4), sizes)
-        expect("log_scales", self.log_scales, ("N", 2 if self.kind == "surfel" else 3), sizes)
-        expect("opacity_logits", self.opacity_logits, ("N",), sizes)
-        expect("sh0", self.sh0, ("N", 3), sizes)
-        rest = expect("sh_rest", self.sh_rest, ("N", "K - 1", 3), sizes)["K - 1"]
-        if rest not in (0, 3, 8, 15):
-            raise BadInput(f"sh_rest: {rest} coefficients; degrees 0 to 3 have 0, 3, 8 or 15")
+    def write(self, path: Path, table: SplatTable, frame: Frame | None = None, tree: Tile | None = None) -> None:
+        """See `Format.write`."""
+        write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=frame)
 
-    def __len__(self) -> int:
-        return len(self.means)
+    def read(self, path: Path) -> SplatTable:
+        """See `Format.read`."""
+        return read_splats(path)
 
-    @property
-    def sh_degree(self) -> int:
-        """Highest degree of the spherical harmonics."""
-        return math.isqrt(self.sh_rest.shape[1] + 1) - 1
-
-    def in_input_frame(self, frame: Frame) -> SplatTable:
-        """The same splats in the frame of the input; positions in float64. The frame does not turn, so nor does SH."""
-        means = torch.from_numpy(frame.to_input(self.means.detach().cpu().numpy()))
-        return replace(self, means=means, log_scales=self.log_scales - math.log(frame.scale))
+    def knows(self, path: Path, head: bytes) -> bool:
+        """See `Format.knows`."""
+        return head.startswith((b"ply\n", b"ply\r"))
 
 
 def write_splats(

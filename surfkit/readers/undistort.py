@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from surfkit.core.check import BadInput
-from surfkit.export.ply import replacing
+from surfkit.core.files import replacing
 from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.masks import read_mask
 from surfkit.scene.copies import digest, place

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_splats
+from surfkit.export.ply import read_splats, read_vertices, write_splats
+from surfkit.export.table import SplatTable
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth, utm
 from surfkit.readers.read import read

@@ -10,7 +10,8 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.export import ply
-from surfkit.export.ply import SplatTable, read_splats, read_vertices, write_points, write_splats
+from surfkit.export.ply import read_splats, read_vertices, write_points, write_splats
+from surfkit.export.table import SplatTable
 from surfkit.scene.scene import Frame
 
 

@@ -1,0 +1,85 @@
+"""Splats as files hold them: one table, or a tree of tiles with levels of detail."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput, expect
+from surfkit.scene.scene import Frame
+
+
+@dataclass(frozen=True)
+class SplatTable:
+    """N splats in raw values, as files hold them.
+
+    Attributes:
+        kind: "surfel" is a flat disc (2DGS), "gaussian" an ellipsoid (3DGS).
+        means: (N, 3) positions.
+        quats: (N, 4) wxyz of any length.
+        log_scales: (N, 2) for surfels, (N, 3) for gaussians; natural logarithm of lengths.
+        opacity_logits: (N,).
+        sh0: (N, 3) coefficients of degree 0.
+        sh_rest: (N, K - 1, 3) coefficients of degrees 1 to 3, K in {1, 4, 9, 16}.
+        antialias: Gaussians only: to be drawn dimmed by what the blur of the rasterizer adds to them (Mip-Splatting).
+    """
+
+    kind: Literal["surfel", "gaussian"]
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh0: Tensor
+    sh_rest: Tensor
+    antialias: bool = False
+
+    def __post_init__(self) -> None:
+        sizes = expect("means", self.means, ("N", 3))
+        expect("quats", self.quats, ("N", 4), sizes)
+        expect("log_scales", self.log_scales, ("N", 2 if self.kind == "surfel" else 3), sizes)
+        expect("opacity_logits", self.opacity_logits, ("N",), sizes)
+        expect("sh0", self.sh0, ("N", 3), sizes)
+        rest = expect("sh_rest", self.sh_rest, ("N", "K - 1", 3), sizes)["K - 1"]
+        if rest not in (0, 3, 8, 15):
+            raise BadInput(f"sh_rest: {rest} coefficients; degrees 0 to 3 have 0, 3, 8 or 15")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of the spherical harmonics."""
+        return math.isqrt(self.sh_rest.shape[1] + 1) - 1
+
+    def in_input_frame(self, frame: Frame) -> SplatTable:
+        """The same splats in the frame of the input; positions in float64. The frame does not turn, so nor does SH."""
+        means = torch.from_numpy(frame.to_input(self.means.detach().cpu().numpy()))
+        return replace(self, means=means, log_scales=self.log_scales - math.log(frame.scale))
+
+    def take(self, rows: Tensor | slice) -> SplatTable:
+        """The splats of a mask, of indices or of a slice."""
+        columns = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A box of a scene, drawn by some splats from far away and by its children from near.
+
+    Attributes:
+        splats: What is drawn in place of all that lies below.
+        low, high: (3,) float64 corners of a box with the centres of all splats here and below, same frame.
+        error: How far, in the units of `splats`, what is drawn lies from the full model: 0 for leaves.
+        children: Smaller boxes that together replace this tile; none for a leaf, which has the model itself.
+    """
+
+    splats: SplatTable
+    low: np.ndarray
+    high: np.ndarray
+    error: float = 0.0
+    children: tuple[Tile, ...] = ()
