@@ -24,7 +24,8 @@ from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
 from surfkit.evaluate.metrics import read_metrics
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
-from surfkit.method.base import Reconstruction, SplatModel
+from surfkit.method.base import Reconstruction
+from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data

@@ -12,8 +12,8 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.export.ply import write_splats
-from surfkit.method.base import SplatModel
 from surfkit.pipeline import loaded
+from surfkit.primitives.model import SplatModel
 from surfkit.run.folder import Run, refuse_no_run
 from surfkit.run.method import splats_of
 from surfkit.scene.scene import Scene

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,39 +13,10 @@ from torch import Tensor
 
 from surfkit.core.registry import Component
 from surfkit.mesh.base import Mesh
-from surfkit.primitives.base import Primitive
-from surfkit.primitives.points import Columns
-from surfkit.raster.api import Maps, Rasterizer, Splats
+from surfkit.primitives.model import SplatModel
+from surfkit.raster.api import Maps, Rasterizer
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Scene, View
-
-NEAR = 0.005
-"""Nothing nearer to a camera is drawn, local units, where a method says nothing else."""
-
-
-@dataclass(frozen=True)
-class SplatModel:
-    """Splats, as the raw parameters of a primitive.
-
-    Attributes:
-        primitive: What the parameters are of.
-        params: Raw columns of N points in the local frame, and the shared ones, as `Primitive.init` gives them.
-        sh_degree: Of the spherical harmonics in use.
-        near: Nothing nearer to a camera is drawn; local units.
-    """
-
-    primitive: Primitive
-    params: Columns
-    sh_degree: int = 0
-    near: float = NEAR
-
-    def __len__(self) -> int:
-        return len(self.params["means"])
-
-    @cached_property
-    def splats(self) -> Splats:
-        """Activated values."""
-        return self.primitive.activate(self.params, self.sh_degree)
 
 
 @dataclass(frozen=True)

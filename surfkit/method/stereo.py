@@ -8,7 +8,8 @@ from typing import ClassVar
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.stereo import Stereo, points
-from surfkit.method.base import NEAR, Method, MethodInput, Reconstruction
+from surfkit.method.base import Method, MethodInput, Reconstruction
+from surfkit.primitives.model import NEAR
 from surfkit.raster.api import Maps
 
 

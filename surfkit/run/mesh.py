@@ -23,8 +23,9 @@ from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require_open3d, simplify
 from surfkit.mesh.stereo import points
-from surfkit.method.base import NEAR, Reconstruction
+from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.model import NEAR
 from surfkit.raster.api import Maps, Rasterizer
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache

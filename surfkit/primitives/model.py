@@ -1,0 +1,38 @@
+"""Splats as raw parameters, with what it takes to draw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Splats
+
+NEAR = 0.005
+"""Nothing nearer to a camera is drawn, local units, where a method says nothing else."""
+
+
+@dataclass(frozen=True)
+class SplatModel:
+    """Splats, as the raw parameters of a primitive.
+
+    Attributes:
+        primitive: What the parameters are of.
+        params: Raw columns of N points in the local frame, and the shared ones, as `Primitive.init` gives them.
+        sh_degree: Of the spherical harmonics in use.
+        near: Nothing nearer to a camera is drawn; local units.
+    """
+
+    primitive: Primitive
+    params: Columns
+    sh_degree: int = 0
+    near: float = NEAR
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
+
+    @cached_property
+    def splats(self) -> Splats:
+        """Activated values."""
+        return self.primitive.activate(self.params, self.sh_degree)
