@@ -1,1 +1,16 @@
-"""Files that other programs read."""
+"""Files that other programs read: formats of splats, points and cameras."""
+
+from collections.abc import Mapping
+
+from surfkit.core.registry import Component, hookimpl
+
+
+@hookimpl
+def surfkit_components() -> Mapping[str, type[Component]]:
+    """What this folder offers."""
+    from surfkit.export.compressed_ply import CompressedPLY
+    from surfkit.export.ply import PLY
+    from surfkit.export.splat import Splat
+    from surfkit.export.spz import SPZ
+
+    return {"compressed-ply": CompressedPLY, "ply": PLY, "splat": Splat, "spz": SPZ}

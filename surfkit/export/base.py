@@ -11,9 +11,16 @@ from surfkit.core.registry import Component, name_of
 from surfkit.export.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
+HEAD = 4096
+"""Bytes at the beginning of a file by which formats know it."""
+
 
 class Format(Component):
-    """A file format of splats, by the name that `surfkit export --format` takes."""
+    """A file format of splats, by the name that `surfkit export --format` takes.
+
+    Programs that know ellipsoids only are given surfels as thin ellipsoids (`SplatTable.ellipsoid_log_scales`); `read`
+    makes surfels of them again (`as_surfels`, `as_surfels_if_thin`).
+    """
 
     suffix: ClassVar[str] = ""
     """How file names end, such as ".spz"; "" for a folder."""
@@ -22,21 +29,24 @@ class Format(Component):
 
     @abstractmethod
     def write(self, path: Path, table: SplatTable, frame: Frame | None = None, tree: Tile | None = None) -> None:
-        """Write a file, which appears only when it is complete.
+        """Write a file, which appears only when it is complete. The same splats give the same bytes.
 
         Args:
             path: Of the file, or of the folder for a format without suffix.
-            table: In the frame that the file shall have, positions in float64 or float32.
+            table: In the frame that the file shall have, positions in float64 or float32; any number of splats.
             frame: That of the input, if the table is in it. Its shift is left out of the coordinates of formats of
-                float32 or less; those that have a place for it name the shift, the coordinate system and the unit.
+                float32 or less (`SplatTable.file_means`); those that have a place for it name the shift, the coordinate
+                system and the unit.
             tree: The same splats as tiles with levels of detail, in the same frame; for formats that want one.
 
         Raises:
-            BadInput: The format has no place for such splats.
+            BadInput: A value is NaN or Inf (`SplatTable.refuse_unsound`), or the format has no place for such splats.
         """
 
     def read(self, path: Path) -> SplatTable:
-        """The splats of a file, as `write` was given them but for the rounding of the format.
+        """The splats of a file, in any order, as `write` was given them but for the rounding of the format.
+
+        What is allocated is in proportion to the size of the file, whatever its header says.
 
         Raises:
             BadInput: Not such a file, damaged, or the format can be written only.
@@ -44,5 +54,9 @@ class Format(Component):
         raise BadInput(f"{path}: files of the format {name_of(self)} are written, and not read")
 
     def knows(self, path: Path, head: bytes) -> bool:
-        """Whether a file is of this format; `head` is what it begins with, up to 4,096 bytes."""
+        """Whether a file is of this format; `head` is what it begins with, up to HEAD bytes."""
         return False
+
+    def rounding(self, table: SplatTable) -> str:
+        """What a file does not keep of such splats as it is, in one line for the user."""
+        return ""

@@ -13,6 +13,16 @@ from torch import Tensor
 from surfkit.core.check import BadInput, expect
 from surfkit.scene.scene import Frame
 
+THINNESS = 1e-3
+"""Thickness of a surfel where ellipsoids are needed, as a share of its smaller radius: flat in every viewer, and free
+of units."""
+THIN = 10.0
+"""Where a file does not say so, splats are surfels only if their third scale is this many times smaller than the
+others."""
+
+COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
+"""Tensors of a table, a row for each splat."""
+
 
 @dataclass(frozen=True)
 class SplatTable:
@@ -61,10 +71,58 @@ class SplatTable:
         means = torch.from_numpy(frame.to_input(self.means.detach().cpu().numpy()))
         return replace(self, means=means, log_scales=self.log_scales - math.log(frame.scale))
 
+    def ellipsoid_log_scales(self) -> Tensor:
+        """(N, 3) scales for programs that know ellipsoids only: surfels get a third one, THINNESS x the smaller one."""
+        if self.log_scales.shape[1] == 3:
+            return self.log_scales
+        return torch.cat([self.log_scales, self.log_scales.amin(1, keepdim=True) + math.log(THINNESS)], dim=1)
+
+    def as_surfels(self) -> SplatTable:
+        """The same ellipsoids as surfels, without their third scale."""
+        return self if self.kind == "surfel" else replace(self, kind="surfel", log_scales=self.log_scales[:, :2])
+
+    def as_surfels_if_thin(self, rounding: float, least: float = -math.inf) -> SplatTable:
+        """As surfels, if that is what `ellipsoid_log_scales` made all of them from; ellipsoids otherwise.
+
+        Args:
+            rounding: Largest difference between a scale in the file and what was written, in logarithms.
+            least: Smallest logarithm that the file has a place for; thinner splats have it.
+        """
+        if not len(self) or self.kind == "surfel":
+            return self
+        smaller, third = self.log_scales[:, :2].amin(1), self.log_scales[:, 2]
+        expected = (smaller + math.log(THINNESS)).clamp_min(least)
+        thin = (third - expected).abs().max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
+        return self.as_surfels() if thin else self
+
+    def file_means(self, frame: Frame | None) -> Tensor:
+        """(N, 3) positions for a file of few bits: float64 without the shift of the frame, where there is one."""
+        means = self.means.detach().cpu()
+        if frame is None or not any(frame.shift):
+            return means
+        return means.double() - torch.tensor(frame.shift, dtype=torch.float64)
+
+    def refuse_unsound(self, where: object) -> None:
+        """BadInput if a value is NaN or Inf; `where` is the file or the format that the message names."""
+        for name in COLUMNS:
+            column = getattr(self, name)
+            if not column.numel():
+                continue
+            least, most = torch.aminmax(column)  # NaN wins, and no mask of the whole column is made
+            if not torch.isfinite(least + most * 0):
+                row = int((~torch.isfinite(column)).nonzero()[0, 0])
+                raise BadInput(
+                    f"{where}: {name} of splat {row} of {len(self)} has NaN or Inf; remove such splats first"
+                )
+
+    def on_cpu(self) -> SplatTable:
+        """The same splats on the CPU and without gradients: positions as they are, all else in float32."""
+        columns = {name: getattr(self, name).detach().to("cpu", torch.float32) for name in COLUMNS[1:]}
+        return replace(self, means=self.means.detach().cpu(), **columns)
+
     def take(self, rows: Tensor | slice) -> SplatTable:
         """The splats of a mask, of indices or of a slice."""
-        columns = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,84 @@
+"""Values of splats in a few bits, as several formats hold them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+SH_C0 = 0.28209479177387814
+"""The spherical harmonic of degree 0."""
+QUARTER = 0.25 / 255
+"""Least opacity that a byte of 0 stands for: it becomes the same byte again, and has a logit."""
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Components beside the largest."""
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities in [0, 1] of logits, float32."""
+    return 1 / (1 + np.exp(-logits.clip(-80, 80)))
+
+
+def logits(opacities: np.ndarray) -> np.ndarray:
+    """Float32 logits of opacities in [0, 1] that were bytes."""
+    inside = opacities.astype(np.float64).clip(QUARTER, 1 - QUARTER)
+    return np.log(inside / (1 - inside)).astype(np.float32)
+
+
+def to_bytes(values: np.ndarray) -> np.ndarray:
+    """The nearest uint8 of values on the scale of 0 to 255; what lies outside is clipped."""
+    return (values + 0.5).clip(0, 255).astype(np.uint8)
+
+
+def unit(quats: np.ndarray) -> np.ndarray:
+    """(N, 4) float64 quaternions of length 1; one of length 0 turns nothing."""
+    wide = quats.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    return np.where(length > 0, wide, [1.0, 0, 0, 0]) / np.where(length > 0, length, 1)
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations without their largest component, which the others imply.
+
+    Args:
+        quats: (N, 4) of length 1, components in any order.
+
+    Returns:
+        (N,) which component is the largest, and the (N, 3) others in their order, times the square root of 2 so that
+        they span [-1, 1]; of the two quaternions of a rotation, that whose largest component is positive.
+    """
+    largest = np.abs(quats).argmax(1)
+    sign = np.where(np.take_along_axis(quats, largest[:, None], 1) < 0, -1.0, 1.0)
+    return largest, np.take_along_axis(quats, OTHERS[largest], 1) * (sign * np.sqrt(2))
+
+
+def from_smallest_three(largest: np.ndarray, three: np.ndarray) -> np.ndarray:
+    """(N, 4) float32 quaternions that `smallest_three` gives for these."""
+    quats = np.empty((len(three), 4), np.float32)
+    np.put_along_axis(quats, OTHERS[largest], (three / np.sqrt(2)).astype(np.float32), 1)
+    rest = np.sqrt((1 - (three.astype(np.float64) ** 2).sum(1) / 2).clip(0))
+    np.put_along_axis(quats, largest[:, None], rest[:, None].astype(np.float32), 1)
+    return quats
+
+
+def morton_order(means: np.ndarray) -> np.ndarray:
+    """(N,) indices that sort (N, 3) positions along a Z-order curve: neighbours in space are near one another."""
+    if not len(means):
+        return np.zeros(0, np.int64)
+    low, high = means.min(0), means.max(0)
+    cells = ((means - low) / np.where(high > low, high - low, 1) * (2**21 - 1)).astype(np.uint64)
+    code = np.zeros(len(means), np.uint64)
+    for axis in range(3):
+        code |= _spread(cells[:, axis]) << np.uint64(axis)
+    return np.argsort(code, kind="stable")
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """21 bits of uint64 with two zeros after each."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << np.uint64(shift)) & np.uint64(mask)
+    return values

@@ -1,0 +1,63 @@
+"""Files of splats of any format: which one it is, and what is in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from surfkit.core.check import BadInput
+from surfkit.core.registry import components, find, name_of
+from surfkit.export.base import HEAD, Format
+from surfkit.export.table import SplatTable
+
+
+def read_splat_file(path: Path) -> SplatTable:
+    """The splats of a file of any format, which its content tells, or its name where the content does not.
+
+    Raises:
+        BadInput: No such file, of no known format, or damaged.
+    """
+    return format_of(path).read(path)
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file that is there.
+
+    Raises:
+        BadInput: No such file, or of no known format.
+    """
+    path = Path(path)
+    head = b""
+    try:
+        if not path.is_dir():
+            with path.open("rb") as file:
+                head = file.read(HEAD)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    known = [cls() for cls in components(Format).values()]
+    found = [form for form in known if form.knows(path, head)]
+    if not found:
+        raise BadInput(f"{path}: no file of splats of a known format; known: {_listed(known)}")
+    return max(found, key=lambda form: _has_suffix(path, form))
+
+
+def format_for(path: Path, name: str | None = None) -> Format:
+    """The format to write a file in: that of a name, or else that of the file name.
+
+    Raises:
+        BadInput: No format has this name or this suffix.
+    """
+    if name is not None:
+        return find(Format, name)()
+    known = [cls() for cls in components(Format).values()]
+    found = [form for form in known if form.suffix and _has_suffix(path, form)]
+    if not found:
+        raise BadInput(f"{path}: no format of splats has this suffix; known: {_listed(known)}; or give --format NAME")
+    return max(found, key=lambda form: len(form.suffix))  # .compressed.ply ends in .ply too
+
+
+def _has_suffix(path: Path, form: Format) -> bool:
+    return path.name.lower().endswith(form.suffix)
+
+
+def _listed(known: list[Format]) -> str:
+    return ", ".join(f"{name_of(form)} ({form.suffix or 'a folder'})" for form in known)

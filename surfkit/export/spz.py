@@ -1,0 +1,329 @@
+"""The .spz files of Niantic: about a tenth of a PLY file.
+
+All values of one attribute follow one another: positions as fixed-point numbers of 24 bits, opacities as bytes, colours
+as bytes of 255 (0.15 f + 1/2), scales as bytes of 16 (log s + 10), rotations xyzw as the index of the largest component
+in 2 bits and the others in a sign and 9 bits each (version 2: x, y, z in a byte each), coefficients of higher degree as
+bytes of 128 f + 128. Versions 1 to 3 are one gzip stream with a header of 16 bytes; version 4 is a header of 32 bytes,
+a table of sizes and a zstd stream for each attribute. Source: README.md and src/cc/load-spz.cc of nianticlabs/spz.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+import zstandard
+from torch import Tensor
+
+from surfkit.core.check import BadInput, require_within
+from surfkit.core.events import Warned, emit
+from surfkit.core.files import replacing
+from surfkit.export.base import Format
+from surfkit.export.bits import from_smallest_three, logits, morton_order, sigmoid, smallest_three, to_bytes, unit
+from surfkit.export.ply import CHUNK
+from surfkit.export.table import SplatTable, Tile
+from surfkit.export.unpack import inflated, unpacked_zstd
+from surfkit.scene.scene import Frame
+
+MAGIC = b"NGSP"
+COLOR = 0.15
+"""What a coefficient of degree 0 is multiplied by: colours beyond [0, 1] have a place too."""
+SMALLEST, LARGEST = -10.0, 255 / 16 - 10
+"""Logarithms of the smallest and largest scale."""
+STEP = 1 / 16
+"""Between logarithms of scales."""
+FINE = 64
+"""Positions are rounded to no less than this share of the median scale: finer bits are noise that takes space."""
+COARSE = 4
+"""A share of the median scale by which positions may be rounded without a warning."""
+TURNED = [(-1) ** ((m < 0) + (degree - abs(m)) % 2) for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
+"""Signs of spherical harmonics after half a turn about x: orders m < 0 are odd in y, odd degree - |m| is odd in z."""
+HEADER = 32
+"""Bytes of the header of version 4."""
+LEVEL = 12
+"""Of zstd, as in the library of Niantic."""
+
+
+@dataclass(frozen=True)
+class SPZ(Format):
+    """The layout of Niantic, which most viewers open: 8 bits for most values, 24 for each coordinate, compressed."""
+
+    suffix: ClassVar[str] = ".spz"
+
+    version: Literal[2, 3, 4] = 3
+    """Version of the layout. 3 is what most viewers open; 4 is smaller and newer, 2 has coarser rotations."""
+
+    fractional_bits: int | None = None
+    """Binary digits of positions after the point; None takes what the size of the scene leaves of 24, but no more than
+    a 64th of the median scale needs."""
+
+    sh1_bits: int = 5
+    """Bits to which spherical harmonics of degree 1 are rounded: fewer make a smaller file."""
+
+    sh_rest_bits: int = 4
+    """Bits to which spherical harmonics of degrees 2 and 3 are rounded."""
+
+    axes: Literal["same", "rub"] = "same"
+    """same keeps the axes, as the converters of PLY files do; rub turns by 180 degrees about x, for programs that take
+    files to be right-up-back as the specification has it. Files do not tell; reading turns back."""
+
+    def __post_init__(self) -> None:
+        require_within({"sh1_bits": (1, 8), "sh_rest_bits": (1, 8)}, self)
+        if self.fractional_bits is not None:
+            require_within({"fractional_bits": (0, 23)}, self)
+
+    def write(self, path: Path, table: SplatTable, frame: Frame | None = None, tree: Tile | None = None) -> None:
+        """See `Format.write`."""
+        table.refuse_unsound(path)
+        table = replace(table, means=table.file_means(frame))
+        if self.axes == "rub":
+            table = half_turn(table)
+        bits = self._bits(path, table)
+        order = torch.from_numpy(morton_order(table.means.double().numpy()))
+        head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, int(table.antialias))
+        streams = [_parts(table, order, encode) for encode in self._encoders(table, bits)]
+        with replacing(path) as file:
+            if self.version < 4:
+                squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
+                file.write(squeeze.compress(head + b"\0"))
+                for stream in streams:
+                    for part in stream:
+                        file.write(squeeze.compress(part))
+                file.write(squeeze.flush())
+            else:
+                file.write(_container(head, streams, len(table)))
+
+    def _bits(self, path: Path, table: SplatTable) -> int:
+        """Digits after the point; BadInput if the positions have no place, a warning if they are rounded much."""
+        reach = float(table.means.abs().max()) if len(table) else 1.0
+        most = min(23, math.floor(math.log2((2**23 - 1) / max(reach, 2.0**-23))))
+        scale = math.exp(float(table.log_scales[:, :2].float().median())) if len(table) else 1.0
+        wanted = math.ceil(math.log2(FINE / max(scale, 1e-30)))
+        bits = self.fractional_bits if self.fractional_bits is not None else max(0, min(most, wanted))
+        if bits > most:
+            raise BadInput(
+                f"{path}: coordinates up to {reach:.6g} have no place in 24 bits with {bits} after the point; "
+                + (f"at most {most} leave room" if most >= 0 else "move the splats towards 0, or take another format")
+            )
+        if len(table) and 2.0**-bits > scale / COARSE:
+            rounded = f"{2.0**-bits:.3g} apart, {2.0**-bits / scale:.2g} x the median scale of the splats"
+            emit(Warned(f"{path}: positions are {rounded}; --format ply or sog keeps more of such a large scene"))
+        return bits
+
+    def _encoders(self, table: SplatTable, bits: int) -> list[Callable[[SplatTable], np.ndarray]]:
+        """What makes the bytes of each attribute, in the order of the file."""
+        rest = [] if not table.sh_degree else [lambda part: _harmonics(part, self.sh1_bits, self.sh_rest_bits)]
+        return [
+            lambda part: _positions(part, bits),
+            lambda part: to_bytes(255 * sigmoid(part.opacity_logits.numpy())),
+            lambda part: to_bytes(255 * (COLOR * part.sh0.numpy() + 0.5)),
+            lambda part: to_bytes((part.ellipsoid_log_scales().numpy() - SMALLEST) / STEP),
+            _rotations if self.version > 2 else _short_rotations,
+            *rest,
+        ]
+
+    def read(self, path: Path) -> SplatTable:
+        """See `Format.read`."""
+        try:
+            data = Path(path).read_bytes()
+        except OSError as error:
+            raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+        table = _decoded(path, *_streams(path, data))
+        table.refuse_unsound(path)
+        if self.axes == "rub":
+            table = half_turn(table)
+        return table.as_surfels_if_thin(STEP / 2 + 1e-4, SMALLEST)
+
+    def knows(self, path: Path, head: bytes) -> bool:
+        """See `Format.knows`."""
+        if head[:2] == b"\x1f\x8b":
+            try:
+                head = zlib.decompressobj(31).decompress(head, 4)
+            except zlib.error:
+                return path.suffix.lower() == self.suffix
+        return head.startswith(MAGIC)
+
+    def rounding(self, table: SplatTable) -> str:
+        """See `Format.rounding`."""
+        scales = table.log_scales[:, :2]
+        outside = float(((scales < SMALLEST) | (scales > LARGEST)).any(1).float().mean()) if len(table) else 0.0
+        clipped = f"; {outside:.2%} of the splats are smaller or larger than it has a place for" if outside else ""
+        harmonics = f", spherical harmonics to {self.sh1_bits} and {self.sh_rest_bits} bits" if table.sh_degree else ""
+        return f"scales are rounded to 6 %, colours and opacities to 8 bits{harmonics}{clipped}"
+
+
+def half_turn(table: SplatTable) -> SplatTable:
+    """The same splats after half a turn about x, which is also the way back."""
+    w, x, y, z = table.quats.unbind(1)
+    signs = torch.tensor(TURNED[: table.sh_rest.shape[1]], dtype=table.sh_rest.dtype)
+    return replace(
+        table,
+        means=table.means * torch.tensor([1, -1, -1]),
+        quats=torch.stack([-x, w, -z, y], 1),  # the quaternion of the turn, (0, 1, 0, 0), times each
+        sh_rest=table.sh_rest * signs[:, None],
+    )
+
+
+def _parts(table: SplatTable, order: Tensor, encode: Callable[[SplatTable], np.ndarray]) -> Iterator[bytes]:
+    """The bytes of one attribute, in pieces."""
+    for start in range(0, len(table), CHUNK):
+        yield encode(table.take(order[start : start + CHUNK]).on_cpu()).tobytes()
+
+
+def _container(head: bytes, streams: list[Iterator[bytes]], count: int) -> bytes:
+    """A file of version 4."""
+    packed, sizes = [], []
+    for stream in streams if count else ():
+        squeeze, size, pieces = zstandard.ZstdCompressor(level=LEVEL).compressobj(), 0, []
+        for part in stream:
+            size += len(part)
+            pieces.append(squeeze.compress(part))
+        packed.append(b"".join([*pieces, squeeze.flush()]))
+        sizes.append(struct.pack("<QQ", len(packed[-1]), size))
+    start = head + struct.pack("<BI12x", len(packed), HEADER)
+    return b"".join([start, *sizes, *packed])
+
+
+def _positions(part: SplatTable, bits: int) -> np.ndarray:
+    """(n, 3, 3) bytes of numbers of 24 bits, the lowest first."""
+    fixed = np.rint(part.means.double().numpy() * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    return fixed[..., None].view(np.uint8)[..., :3]
+
+
+def _rotations(part: SplatTable) -> np.ndarray:
+    """(n,) words: the largest of x, y, z, w, and a sign and 9 bits of each other one."""
+    largest, three = smallest_three(np.roll(unit(part.quats.numpy()), -1, 1))
+    size = (np.abs(three) * 511 + 0.5).astype(np.uint32)
+    word = largest.astype(np.uint32)
+    for column in range(3):
+        word = word << 10 | (three[:, column] < 0).astype(np.uint32) << 9 | size[:, column]
+    return word.astype("<u4")
+
+
+def _short_rotations(part: SplatTable) -> np.ndarray:
+    """(n, 3) bytes of x, y and z of the quaternion whose w is not negative."""
+    quats = unit(part.quats.numpy())
+    return to_bytes(np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] * 127.5 + 127.5)
+
+
+def _harmonics(part: SplatTable, first: int, others: int) -> np.ndarray:
+    """(n, K - 1, 3) bytes, rounded to the middle of steps that leave some bits."""
+    whole = np.rint(part.sh_rest.numpy().clip(-2, 2) * 128).astype(np.int32) + 128
+    step = np.where(np.arange(whole.shape[1]) < 3, 2 ** (8 - first), 2 ** (8 - others))[:, None]
+    return ((whole + step // 2) // step * step).clip(0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the header of a file says."""
+
+    version: int
+    count: int
+    degree: int
+    bits: int
+    antialias: bool
+
+    @property
+    def widths(self) -> list[int]:
+        """Bytes of each attribute of one splat, those of none left out."""
+        widths = [6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3]
+        return widths + [3 * ((self.degree + 1) ** 2 - 1)] * (self.degree > 0)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of each attribute."""
+        return [width * self.count for width in self.widths]
+
+
+def _streams(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
+    """The header of a file, and the bytes of each attribute."""
+    if data.startswith(MAGIC):
+        header = _header(path, data, (4,))
+        return header, _unpacked(path, data, header)
+    if not data.startswith(b"\x1f\x8b"):
+        raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {MAGIC.decode()}")
+    header = _header(path, inflated(path, data, 16, part=True), (1, 2, 3))
+    body, streams, at = inflated(path, data, 16 + sum(header.sizes), part=True), [], 16
+    for size in header.sizes:
+        streams.append(body[at : at + size])
+        at += size
+    return header, streams
+
+
+def _header(path: Path, data: bytes, versions: tuple[int, ...]) -> Header:
+    if len(data) < 16 or not data.startswith(MAGIC):
+        raise BadInput(f"{path}: no .spz file, or cut off: it has no header")
+    version, count, degree, bits, flags = struct.unpack_from("<IIBBB", data, 4)
+    if version not in versions:
+        raise BadInput(f"{path}: version {version} of .spz; versions 1 to 4 are read")
+    if degree > 4 or bits > 30:
+        raise BadInput(f"{path}: damaged: degree {degree} of spherical harmonics, {bits} fractional bits")
+    return Header(version, count, degree, bits, bool(flags & 1))
+
+
+def _unpacked(path: Path, data: bytes, header: Header) -> list[bytes]:
+    """The attributes of a file of version 4."""
+    if len(data) < HEADER:
+        raise BadInput(f"{path}: cut off within the header; write or copy it again")
+    number, table = struct.unpack_from("<BI", data, 15)
+    sizes = header.sizes if header.count else []
+    at = table + 16 * number
+    if number != len(sizes) or table < HEADER or at > len(data):
+        raise BadInput(f"{path}: damaged: {number} attributes, {len(sizes)} expected; write or copy it again")
+    streams = []
+    for i, wanted in enumerate(sizes):
+        packed, size = struct.unpack_from("<QQ", data, table + 16 * i)
+        if size != wanted or packed > len(data) - at:
+            raise BadInput(f"{path}: damaged or cut off: attribute {i + 1} of {number} has another size than it should")
+        streams.append(unpacked_zstd(path, data[at : at + packed], size))
+        at += packed
+    return streams or [b""] * len(header.sizes)
+
+
+def _decoded(path: Path, header: Header, streams: list[bytes]) -> SplatTable:
+    """The splats of the attributes; harmonics of degree 4 are left out."""
+    raw = [
+        np.frombuffer(stream, np.uint8).reshape(header.count, width)
+        for stream, width in zip(streams, header.widths, strict=True)
+    ]
+    means, alphas, colors, scales, turns = raw[:5]
+    rest = raw[5] if header.degree else np.zeros((header.count, 0), np.uint8)
+    coefficients = rest.reshape(header.count, (header.degree + 1) ** 2 - 1, 3)[:, :15]
+    return SplatTable(
+        kind="gaussian",
+        means=torch.from_numpy(_decoded_positions(means, header)),
+        quats=torch.from_numpy(_decoded_rotations(turns, header)),
+        log_scales=torch.from_numpy(scales.astype(np.float32) * STEP + SMALLEST),
+        opacity_logits=torch.from_numpy(logits(alphas.reshape(-1) / 255)),
+        sh0=torch.from_numpy((colors.astype(np.float32) / 255 - 0.5) / COLOR),
+        sh_rest=torch.from_numpy((coefficients.astype(np.float32) - 128) / 128),
+        antialias=header.antialias,
+    )
+
+
+def _decoded_positions(raw: np.ndarray, header: Header) -> np.ndarray:
+    """(N, 3) float32 of halves or of numbers of 24 bits."""
+    if header.version == 1:
+        return np.ascontiguousarray(raw).view("<f2").reshape(-1, 3).astype(np.float32)
+    wide = np.zeros((header.count, 3, 4), np.uint8)
+    wide[..., 1:] = raw.reshape(-1, 3, 3)
+    return ((wide.view("<i4")[..., 0] >> 8) / 2.0**header.bits).astype(np.float32)
+
+
+def _decoded_rotations(raw: np.ndarray, header: Header) -> np.ndarray:
+    """(N, 4) float32 wxyz."""
+    if header.version < 3:
+        xyz = raw.reshape(-1, 3) / 127.5 - 1
+        w = np.sqrt((1 - (xyz**2).sum(1, keepdims=True)).clip(0))
+        return np.concatenate([w, xyz], 1).astype(np.float32)
+    word = np.ascontiguousarray(raw).view("<u4").reshape(-1)
+    fields = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1)
+    three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / 511
+    return np.roll(from_smallest_three(word >> 30, three), 1, 1)

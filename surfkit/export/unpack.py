@@ -1,0 +1,51 @@
+"""Compressed bytes of files that may be damaged or made to harm: nothing is allocated that they do not hold."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import zstandard
+
+from surfkit.core.check import BadInput
+
+MOST = 1024
+"""Times that compressed bytes may grow: about what gzip can do, far more than splats do."""
+SMALL = 1 << 22
+"""Bytes that may be allocated whatever the size of the file."""
+
+
+def refuse_implausible(path: Path, packed: int, size: int) -> None:
+    """BadInput if a file says that some of its bytes become more than they can."""
+    if size > MOST * packed + SMALL:
+        raise BadInput(f"{path}: damaged: {packed:,} bytes cannot hold {size:,}; write or copy it again")
+
+
+def inflated(path: Path, data: bytes, size: int, part: bool = False) -> bytes:
+    """The first `size` bytes of a gzip stream; `part` leaves out the check that nothing follows."""
+    refuse_implausible(path, len(data), size)
+    stream = zlib.decompressobj(31)
+    try:
+        found = stream.decompress(data, size) if size else b""
+    except zlib.error as error:
+        raise BadInput(f"{path}: damaged: {error}; write or copy it again") from error
+    if len(found) < size:
+        raise BadInput(f"{path}: cut off: {len(found):,} of {size:,} bytes; write or copy it again")
+    if not part and (stream.unconsumed_tail or not stream.eof):
+        raise BadInput(f"{path}: damaged: more than {size:,} bytes; write or copy it again")
+    return found
+
+
+def unpacked_zstd(path: Path, data: bytes, size: int) -> bytes:
+    """The `size` bytes of a zstd frame."""
+    refuse_implausible(path, len(data), size)
+    try:
+        known = zstandard.frame_content_size(data)
+        if known not in (-1, size):
+            raise BadInput(f"{path}: damaged: {known:,} bytes in place of {size:,}; write or copy it again")
+        found = zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
+    except zstandard.ZstdError as error:
+        raise BadInput(f"{path}: damaged: {error}; write or copy it again") from error
+    if len(found) != size:
+        raise BadInput(f"{path}: cut off: {len(found):,} of {size:,} bytes; write or copy it again")
+    return found
