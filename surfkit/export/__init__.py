@@ -10,7 +10,8 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     """What this folder offers."""
     from surfkit.export.compressed_ply import CompressedPLY
     from surfkit.export.ply import PLY
+    from surfkit.export.sog import SOG
     from surfkit.export.splat import Splat
     from surfkit.export.spz import SPZ
 
-    return {"compressed-ply": CompressedPLY, "ply": PLY, "splat": Splat, "spz": SPZ}
+    return {"compressed-ply": CompressedPLY, "ply": PLY, "sog": SOG, "splat": Splat, "spz": SPZ}

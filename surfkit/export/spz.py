@@ -50,6 +50,9 @@ HEADER = 32
 LEVEL = 12
 """Of zstd, as in the library of Niantic."""
 
+Encode = Callable[[np.ndarray], np.ndarray]
+"""Makes the bytes of an attribute from rows of its column."""
+
 
 @dataclass(frozen=True)
 class SPZ(Format):
@@ -70,9 +73,9 @@ class SPZ(Format):
     sh_rest_bits: int = 4
     """Bits to which spherical harmonics of degrees 2 and 3 are rounded."""
 
-    axes: Literal["same", "rub"] = "same"
-    """same keeps the axes, as the converters of PLY files do; rub turns by 180 degrees about x, for programs that take
-    files to be right-up-back as the specification has it. Files do not tell; reading turns back."""
+    axes: Literal["rub", "same"] = "rub"
+    """rub follows the specification, right-up-back: half a turn about x from the axes of PLY files. same keeps the axes
+    of PLY files, as splat-transform and SuperSplat do. Files do not tell which; reading turns back."""
 
     def __post_init__(self) -> None:
         require_within({"sh1_bits": (1, 8), "sh_rest_bits": (1, 8)}, self)
@@ -82,13 +85,13 @@ class SPZ(Format):
     def write(self, path: Path, table: SplatTable, frame: Frame | None = None, tree: Tile | None = None) -> None:
         """See `Format.write`."""
         table.refuse_unsound(path)
-        table = replace(table, means=table.file_means(frame))
+        table = replace(table.on_cpu(), means=table.file_means(frame))
         if self.axes == "rub":
             table = half_turn(table)
         bits = self._bits(path, table)
         order = torch.from_numpy(morton_order(table.means.double().numpy()))
         head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, int(table.antialias))
-        streams = [_parts(table, order, encode) for encode in self._encoders(table, bits)]
+        streams = [_parts(column, order, encode) for column, encode in self._attributes(table, bits)]
         with replacing(path) as file:
             if self.version < 4:
                 squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
@@ -117,16 +120,18 @@ class SPZ(Format):
             emit(Warned(f"{path}: positions are {rounded}; --format ply or sog keeps more of such a large scene"))
         return bits
 
-    def _encoders(self, table: SplatTable, bits: int) -> list[Callable[[SplatTable], np.ndarray]]:
-        """What makes the bytes of each attribute, in the order of the file."""
-        rest = [] if not table.sh_degree else [lambda part: _harmonics(part, self.sh1_bits, self.sh_rest_bits)]
+    def _attributes(self, table: SplatTable, bits: int) -> list[tuple[Tensor, Encode]]:
+        """The column of each attribute, in the order of the file, and what makes its bytes."""
         return [
-            lambda part: _positions(part, bits),
-            lambda part: to_bytes(255 * sigmoid(part.opacity_logits.numpy())),
-            lambda part: to_bytes(255 * (COLOR * part.sh0.numpy() + 0.5)),
-            lambda part: to_bytes((part.ellipsoid_log_scales().numpy() - SMALLEST) / STEP),
-            _rotations if self.version > 2 else _short_rotations,
-            *rest,
+            (table.means, lambda means: _positions(means, bits)),
+            (table.opacity_logits, lambda logits: to_bytes(255 * sigmoid(logits))),
+            (table.sh0, lambda sh0: to_bytes(255 * (COLOR * sh0 + 0.5))),
+            (table.ellipsoid_log_scales(), lambda scales: to_bytes((scales - SMALLEST) / STEP)),
+            (table.quats, _rotations if self.version > 2 else _short_rotations),
+            *(
+                [(table.sh_rest, lambda rest: _harmonics(rest, self.sh1_bits, self.sh_rest_bits))]
+                * (table.sh_degree > 0)
+            ),
         ]
 
     def read(self, path: Path) -> SplatTable:
@@ -171,10 +176,10 @@ def half_turn(table: SplatTable) -> SplatTable:
     )
 
 
-def _parts(table: SplatTable, order: Tensor, encode: Callable[[SplatTable], np.ndarray]) -> Iterator[bytes]:
+def _parts(column: Tensor, order: Tensor, encode: Encode) -> Iterator[bytes]:
     """The bytes of one attribute, in pieces."""
-    for start in range(0, len(table), CHUNK):
-        yield encode(table.take(order[start : start + CHUNK]).on_cpu()).tobytes()
+    for start in range(0, len(order), CHUNK):
+        yield encode(column[order[start : start + CHUNK]].numpy()).tobytes()
 
 
 def _container(head: bytes, streams: list[Iterator[bytes]], count: int) -> bytes:
@@ -191,15 +196,15 @@ def _container(head: bytes, streams: list[Iterator[bytes]], count: int) -> bytes
     return b"".join([start, *sizes, *packed])
 
 
-def _positions(part: SplatTable, bits: int) -> np.ndarray:
+def _positions(means: np.ndarray, bits: int) -> np.ndarray:
     """(n, 3, 3) bytes of numbers of 24 bits, the lowest first."""
-    fixed = np.rint(part.means.double().numpy() * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    fixed = np.rint(means.astype(np.float64) * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
     return fixed[..., None].view(np.uint8)[..., :3]
 
 
-def _rotations(part: SplatTable) -> np.ndarray:
+def _rotations(quats: np.ndarray) -> np.ndarray:
     """(n,) words: the largest of x, y, z, w, and a sign and 9 bits of each other one."""
-    largest, three = smallest_three(np.roll(unit(part.quats.numpy()), -1, 1))
+    largest, three = smallest_three(np.roll(unit(quats), -1, 1))
     size = (np.abs(three) * 511 + 0.5).astype(np.uint32)
     word = largest.astype(np.uint32)
     for column in range(3):
@@ -207,17 +212,17 @@ def _rotations(part: SplatTable) -> np.ndarray:
     return word.astype("<u4")
 
 
-def _short_rotations(part: SplatTable) -> np.ndarray:
+def _short_rotations(quats: np.ndarray) -> np.ndarray:
     """(n, 3) bytes of x, y and z of the quaternion whose w is not negative."""
-    quats = unit(part.quats.numpy())
+    quats = unit(quats)
     return to_bytes(np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] * 127.5 + 127.5)
 
 
-def _harmonics(part: SplatTable, first: int, others: int) -> np.ndarray:
+def _harmonics(rest: np.ndarray, first: int, others: int) -> np.ndarray:
     """(n, K - 1, 3) bytes, rounded to the middle of steps that leave some bits."""
-    whole = np.rint(part.sh_rest.numpy().clip(-2, 2) * 128).astype(np.int32) + 128
-    step = np.where(np.arange(whole.shape[1]) < 3, 2 ** (8 - first), 2 ** (8 - others))[:, None]
-    return ((whole + step // 2) // step * step).clip(0, 255).astype(np.uint8)
+    whole = np.rint(rest.clip(-2, 2) * np.float32(128)).astype(np.int16) + np.int16(128)
+    step = np.where(np.arange(whole.shape[1]) < 3, 2 ** (8 - first), 2 ** (8 - others)).astype(np.int16)[:, None]
+    return ((whole + step // 2) & -step).clip(0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)

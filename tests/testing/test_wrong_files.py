@@ -9,6 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.export.base import Format
+from surfkit.export.table import COLUMNS
 from surfkit.testing import check_format
 
 
@@ -21,7 +22,7 @@ class Saved(Format):
     def write(self, path, table, frame=None, tree=None):
         table.refuse_unsound(path)
         table = self.spoilt(replace(table, means=table.file_means(frame)))
-        values = (table.kind, table.means, table.quats, table.log_scales, table.opacity_logits, table.sh0, table.sh_rest)
+        values = [table.kind, *(getattr(table, name) for name in COLUMNS)]
         torch.save({"values": values}, path)
 
     def spoilt(self, table):
