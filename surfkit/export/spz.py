@@ -122,16 +122,14 @@ class SPZ(Format):
 
     def _attributes(self, table: SplatTable, bits: int) -> list[tuple[Tensor, Encode]]:
         """The column of each attribute, in the order of the file, and what makes its bytes."""
+        rest = [(table.sh_rest, lambda rest: _harmonics(rest, self.sh1_bits, self.sh_rest_bits))]
         return [
             (table.means, lambda means: _positions(means, bits)),
             (table.opacity_logits, lambda logits: to_bytes(255 * sigmoid(logits))),
             (table.sh0, lambda sh0: to_bytes(255 * (COLOR * sh0 + 0.5))),
             (table.ellipsoid_log_scales(), lambda scales: to_bytes((scales - SMALLEST) / STEP)),
             (table.quats, _rotations if self.version > 2 else _short_rotations),
-            *(
-                [(table.sh_rest, lambda rest: _harmonics(rest, self.sh1_bits, self.sh_rest_bits))]
-                * (table.sh_degree > 0)
-            ),
+            *(rest if table.sh_degree else ()),
         ]
 
     def read(self, path: Path) -> SplatTable:
@@ -166,12 +164,12 @@ class SPZ(Format):
 
 def half_turn(table: SplatTable) -> SplatTable:
     """The same splats after half a turn about x, which is also the way back."""
-    w, x, y, z = table.quats.unbind(1)
+    axes = torch.tensor([1, -1, -1])
     signs = torch.tensor(TURNED[: table.sh_rest.shape[1]], dtype=table.sh_rest.dtype)
     return replace(
         table,
-        means=table.means * torch.tensor([1, -1, -1]),
-        quats=torch.stack([-x, w, -z, y], 1),  # the quaternion of the turn, (0, 1, 0, 0), times each
+        means=table.means * axes,
+        quats=torch.cat([table.quats[:, :1], table.quats[:, 1:] * axes], 1),  # the axes of the ellipsoids turn too
         sh_rest=table.sh_rest * signs[:, None],
     )
 
