@@ -1,9 +1,9 @@
 """The `surfkit` command: finds the subcommand, runs it, and prints an error that a user can correct as one line.
 
-Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
-and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
-word. The module is imported only when its command
-is asked for, so `surfkit --help` loads neither torch nor tyro.
+Each command is a module of this folder (`import_` for `import`, a keyword) with a dataclass named `COMMAND`: its
+docstring and its fields are the help, and its `run()` does the work and returns an exit status, or None for 0; or
+`COMMAND` has several of these, by a second word. The module is imported only when its command is asked for, so
+`surfkit --help` loads neither torch nor tyro.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from keyword import iskeyword
 
 from surfkit.cli.streams import READER_LEFT, reopen_closed, silence_lost_streams
 from surfkit.core.check import BadInput, Fault
@@ -23,6 +24,7 @@ from surfkit.core.memory import is_out_of_memory, out_of_memory
 COMMANDS = {
     "train": "Train a model, and make its mesh, from photographs with known cameras.",
     "tune": "Train one block of a large scene, in its own process or on another machine.",
+    "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
@@ -38,6 +40,7 @@ COMMANDS = {
 """What there is to run, with the line that `surfkit --help` shows."""
 MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",
+    "import": "smaller photographs (--longest, --scale) or mesh:none need less",
     "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
@@ -149,7 +152,7 @@ def _dispatch(words: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise BadInput(f"no command {name!r}; {hint}commands: {', '.join(COMMANDS)}")
-    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
+    command = importlib.import_module(f"surfkit.cli.{name}{'_' * iskeyword(name)}").COMMAND
     from surfkit.cli.parse import parse
 
     if isinstance(command, dict):

@@ -61,6 +61,11 @@ class SplatTable:
         means = torch.from_numpy(frame.to_input(self.means.detach().cpu().numpy()))
         return replace(self, means=means, log_scales=self.log_scales - math.log(frame.scale))
 
+    def in_local_frame(self, frame: Frame) -> SplatTable:
+        """The same splats, of the frame of the input, in the local frame; positions in float32."""
+        means = torch.from_numpy(frame.to_local(self.means.detach().cpu().numpy()).astype(np.float32))
+        return replace(self, means=means, log_scales=self.log_scales + math.log(frame.scale))
+
     def take(self, rows: Tensor | slice) -> SplatTable:
         """The splats of a mask, of indices or of a slice."""
         columns = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
