@@ -78,7 +78,7 @@ LIGHT = Recipe(
 )
 
 IMPORTED = Recipe(
-    about="The splats of a file (--method.file) as they are, measured and meshed; `surfkit import FILE` is short for it",
+    about="The splats of a file as they are (--method.file, or `surfkit import FILE`), measured and meshed",
     method=SplatImport(),
     mesh=TSDF(),
 )

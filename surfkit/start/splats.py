@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.export.models import existing_model, model_file, read_any, read_local, warn_of_no_fit
