@@ -1,8 +1,8 @@
 """The `surfkit` command: finds the subcommand, runs it, and prints an error that a user can correct as one line.
 
-Each command is a module of this folder (`import_` for `import`, a keyword) with a dataclass named `COMMAND`: its
-docstring and its fields are the help, and its `run()` does the work and returns an exit status, or None for 0; or
-`COMMAND` has several of these, by a second word. The module is imported only when its command is asked for, so
+Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
+and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
+word. The module is imported by its name, which may be a keyword of Python, and only when its command is asked for, so
 `surfkit --help` loads neither torch nor tyro.
 """
 
@@ -14,7 +14,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from keyword import iskeyword
 
 from surfkit.cli.streams import READER_LEFT, reopen_closed, silence_lost_streams
 from surfkit.core.check import BadInput, Fault
@@ -24,13 +23,13 @@ from surfkit.core.memory import is_out_of_memory, out_of_memory
 COMMANDS = {
     "train": "Train a model, and make its mesh, from photographs with known cameras.",
     "tune": "Train one block of a large scene, in its own process or on another machine.",
-    "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
     "export": "Write the points of a run as PLY, for other programs.",
+    "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
@@ -152,7 +151,7 @@ def _dispatch(words: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise BadInput(f"no command {name!r}; {hint}commands: {', '.join(COMMANDS)}")
-    command = importlib.import_module(f"surfkit.cli.{name}{'_' * iskeyword(name)}").COMMAND
+    command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     from surfkit.cli.parse import parse
 
     if isinstance(command, dict):
