@@ -8,9 +8,10 @@ from typing import ClassVar
 
 from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
 from surfkit.export.table import SplatTable
-from surfkit.method.base import Method, MethodInput, Reconstruction, SplatModel
+from surfkit.method.base import Method, MethodInput, Reconstruction
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.gaussian3d import Gaussian3D
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.surfel2d import Surfel2D
 
 
