@@ -53,7 +53,7 @@ _HOME = {
     "surfkit.losses.base": ("Loss", "Neighbour", "Regularizer", "Target"),
     "surfkit.depth.base": ("DepthEstimator", "DepthInput", "Estimate"),
     "surfkit.appearance.base": ("Appearance",),
-    "surfkit.start.base": ("Start", "StartInput"),
+    "surfkit.start.base": ("InitialModel", "Start", "StartInput"),
     "surfkit.densify.base": (
         "Contribution",
         "Densify",

@@ -164,9 +164,7 @@ class Stages:
         self.start = self.state = None
         if start is not None:
             discard_results(run, run.pretrain)
-            job = StageJob(
-                run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, cloud=start
-            )
+            job = StageJob(run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start)
             state = optimise(job, state)
             del start, job  # to free the memory of the photographs
         if run.recipe.partition is not None:
@@ -190,6 +188,8 @@ def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageSt
     """The initial points of pretraining and its photographs, also if it is resumed; None if it has all its steps."""
     if state is not None and state.index >= run.recipe.pretrain.steps:
         return None
+    if state is None:
+        run.recipe.start.refuse_unfit(run.recipe.primitive, scene)
     known = align_priors(run, scene, begun=state is not None)
     return InitialPoints(run, scene, read_ahead(run.data, scene, run.recipe.pretrain.losses, caches, known), known)
 

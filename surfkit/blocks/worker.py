@@ -33,8 +33,9 @@ from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, refuse_file
 from surfkit.run.journal import record_events
 from surfkit.run.notes import prefix_notes
-from surfkit.run.stage import InitialModel, StageJob, load_state, optimise
+from surfkit.run.stage import StageJob, load_state, optimise
 from surfkit.scene.scene import View
+from surfkit.start.base import InitialModel
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.material import read_ahead
 from surfkit.train.meter import Meter
@@ -134,7 +135,7 @@ class Start:
     views: Sequence[View]
     part: Literal["both", "own", "around"] = "both"
 
-    def __call__(self) -> InitialModel:
+    def __call__(self, _: torch.Generator | None = None) -> InitialModel:
         """Their raw parameters, and the degree of spherical harmonics of the coarse model."""
         coarse = open_coarse_model(self.ctx.run)
         kept = [self.select(piece) for piece in coarse.pieces()]

@@ -2,8 +2,8 @@
 
 Each command is a module of this folder with a dataclass named `COMMAND`: its docstring and its fields are the help,
 and its `run()` does the work and returns an exit status, or None for 0; or `COMMAND` has several of these, by a second
-word. The module is imported only when its command
-is asked for, so `surfkit --help` loads neither torch nor tyro.
+word. The module is imported by its name, which may be a keyword of Python, and only when its command is asked for, so
+`surfkit --help` loads neither torch nor tyro.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ COMMANDS = {
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
     "export": "Write the points of a run as PLY, for other programs.",
+    "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
@@ -38,6 +39,7 @@ COMMANDS = {
 """What there is to run, with the line that `surfkit --help` shows."""
 MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",
+    "import": "smaller photographs (--longest, --scale) or mesh:none need less",
     "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",

@@ -120,6 +120,11 @@ class SplatTable:
         columns = {name: getattr(self, name).detach().to("cpu", torch.float32) for name in COLUMNS[1:]}
         return replace(self, means=self.means.detach().cpu(), **columns)
 
+    def in_local_frame(self, frame: Frame) -> SplatTable:
+        """The same splats, of the frame of the input, in the local frame; positions in float32."""
+        means = torch.from_numpy(frame.to_local(self.means.detach().cpu().numpy()).astype(np.float32))
+        return replace(self, means=means, log_scales=self.log_scales + math.log(frame.scale))
+
     def take(self, rows: Tensor | slice) -> SplatTable:
         """The splats of a mask, of indices or of a slice."""
         return replace(self, **{name: getattr(self, name)[rows] for name in COLUMNS})

@@ -109,6 +109,10 @@ class Method(Component):
         """Optimisation steps of a whole run, a setting marked as `Steps`; None for a method without any."""
         return None
 
+    def files(self) -> tuple[Path, ...]:
+        """Files that it reads beside the data set: a run that has begun is refused with one that has changed."""
+        return ()
+
     def refuse_unfit(self, given: MethodInput) -> None:
         """Look, before anything is written, whether it can work; `given.folder` may not be there yet.
 

@@ -15,6 +15,7 @@ from surfkit.core.registry import Component, kebab
 from surfkit.export.table import SplatTable
 from surfkit.primitives.columns import SIGMOID, Activation, Column
 from surfkit.primitives.points import Columns
+from surfkit.primitives.raw import cloud_of, raw_columns
 from surfkit.raster.api import KINDS, Rasterizer, Render, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud
@@ -141,6 +142,20 @@ class Primitive(Component):
                 sh_rest=splats.sh[:, 1:],
                 antialias=splats.antialias,
             )
+
+    def from_table(self, table: SplatTable, generator: torch.Generator) -> Columns:
+        """Raw parameters of splats in the local frame, and the shared ones: `table` the other way round.
+
+        By default those of `raw.raw_columns` for splats of any kind and degree; other columns begin as in `init`.
+
+        Raises:
+            BadInput: The primitive lacks a standard column.
+        """
+        columns, name = self.columns(), kebab(type(self).__name__)
+        params = raw_columns(f"primitive {name}", columns, table)
+        if params.keys() == columns.keys():
+            return params
+        return self.init(cloud_of(table), generator) | params
 
     def per_point(self, params: Columns) -> Columns:
         """The parameters that belong to points."""

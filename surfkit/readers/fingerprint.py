@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ class Stamp:
     Attributes:
         size: Bytes; -1 if it cannot be read.
         time_ns: When it was last written. While this and the size stay, its content is not read again.
-        content: Digest of three pieces of the file, or of all of it when it is not longer.
+        content: Digest of three pieces of the file, or of all of it when it is not longer or the recipe names it.
         meaning: Digest of what else decides what its numbers mean.
     """
 
@@ -64,11 +64,13 @@ class Fingerprint:
         points: Digest of the sparse points, in the local frame.
         photographs: By name.
         beside: Whether the files beside them are included; older runs did not include them.
+        files: Further files that the recipe names, by path.
     """
 
     points: str
     photographs: dict[str, Print]
     beside: bool = False
+    files: dict[str, Stamp] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,10 @@ class Change:
 
 
 def fingerprint(
-    scene: Scene, before: Fingerprint | None = None, maps: Mapping[str, DepthFile] | None = None
+    scene: Scene,
+    before: Fingerprint | None = None,
+    maps: Mapping[str, DepthFile] | None = None,
+    files: Sequence[Path] = (),
 ) -> Fingerprint:
     """The fingerprint of a scene.
 
@@ -88,11 +93,15 @@ def fingerprint(
         scene: The scene.
         before: Files that were not touched since then are not read again.
         maps: Depth maps by name of the photograph, if training uses them.
+        files: Further files. What was known `before` of one that is gone stays known.
     """
     known = before.photographs if before else {}
     views = [(view, False) for view in scene.train] + [(view, True) for view in scene.held_out]
     prints = {view.name: _print(view, out, known.get(view.name), maps or {}) for view, out in views}
-    return Fingerprint(digest(scene.cloud), prints, beside=True)
+    kept = before.files if before else {}
+    stamps = {str(path): _stamp(path, kept.get(str(path)), whole=True) for path in files}
+    stamps = {path: kept.get(path, stamp) if stamp.size < 0 else stamp for path, stamp in stamps.items()}
+    return Fingerprint(digest(scene.cloud), prints, beside=True, files=stamps)
 
 
 def changed(old: Fingerprint, new: Fingerprint) -> list[Change]:
@@ -113,6 +122,12 @@ def changed(old: Fingerprint, new: Fingerprint) -> list[Change]:
         elif old.beside and new.beside and (what := _beside_changed(a[name].beside, b[name].beside)):
             found.append(Change(f"the {what} of {name} has changed, come or gone", name))
     return found
+
+
+def changed_file(old: Fingerprint, new: Fingerprint) -> str | None:
+    """The path of a further file that has another content."""
+    both = [path for path in new.files if path in old.files]
+    return next((path for path in both if old.files[path].content != new.files[path].content), None)
 
 
 def _beside_changed(old: Mapping[str, Stamp], new: Mapping[str, Stamp]) -> str | None:
@@ -172,20 +187,21 @@ def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Pa
             yield "normal map", path, ""
 
 
-def _stamp(path: Path, before: Stamp | Print | None, meaning: str = "") -> Stamp:
+def _stamp(path: Path, before: Stamp | Print | None, meaning: str = "", whole: bool = False) -> Stamp:
     try:
         state = path.stat()
         same = before is not None and (before.size, before.time_ns) == (state.st_size, state.st_mtime_ns)
-        content = before.content if same else _content(path, state.st_size)
+        content = before.content if same else _content(path, state.st_size, whole)
     except OSError:
         return Stamp(-1, 0, "", meaning)
     return Stamp(state.st_size, state.st_mtime_ns, content, meaning)
 
 
-def _content(path: Path, size: int) -> str:
+def _content(path: Path, size: int, whole: bool) -> str:
     found = hashlib.sha256()
+    pieces = range(0, size, PIECE) if whole else sorted({0, max(0, (size - PIECE) // 2), max(0, size - PIECE)})
     with path.open("rb") as file:
-        for start in sorted({0, max(0, (size - PIECE) // 2), max(0, size - PIECE)}):
+        for start in pieces:
             file.seek(start)
             found.update(file.read(PIECE))
     return found.hexdigest()[:20]

@@ -11,6 +11,7 @@ from surfkit.densify.trim import Trim
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
+from surfkit.method.imported import SplatImport
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
@@ -76,6 +77,12 @@ LIGHT = Recipe(
     pretrain=Stage(steps=35_000, prune=(Importance(at=(30_000,), ratio=0.66),)),
 )
 
+IMPORTED = Recipe(
+    about="The splats of a file as they are (--method.file, or `surfkit import FILE`), measured and meshed",
+    method=SplatImport(),
+    mesh=TSDF(),
+)
+
 
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
@@ -90,6 +97,7 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "surface": SURFACE,
         "surface-blocks": SURFACE_BLOCKS,
         "stereo": STEREO,
+        "import": IMPORTED,
         "citygs": city.FIRST,
         "citygs2-coarse": city.COARSE,
         "citygs2": city.CITY,

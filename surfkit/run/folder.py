@@ -125,6 +125,11 @@ class Run:
         return needed or any(loss.needs_prior for loss in losses)
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that training reads beside the data set."""
+        return (*self.recipe.method.files(), *(self.recipe.start.files() if self.recipe.has_stages else ()))
+
+    @property
     def wants_priors(self) -> bool:
         """Whether anything looks at depth priors: training, or the mesher."""
         return self.needs_priors or (self.recipe.mesh is not None and self.recipe.mesh.needs_prior)

@@ -13,9 +13,10 @@ from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, RunStage, discard_results
 from surfkit.run.journal import record_events
 from surfkit.run.notes import prefix_notes
-from surfkit.run.stage import InitialModel, StageJob, drawing, load_state, optimise
+from surfkit.run.stage import StageJob, drawing, load_state, optimise
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import Scene
+from surfkit.start.base import InitialModel
 from surfkit.train.material import TrainingData, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import StageState
@@ -45,7 +46,7 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
         return state
     discard_results(run, stage)
 
-    def start() -> InitialModel:
+    def start(_: torch.Generator) -> InitialModel:
         params = refine.params(before.stage.finished(given))
         return InitialModel({name: value.clone() for name, value in params.items()}, given.sh_degree)
 

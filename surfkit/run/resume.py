@@ -18,7 +18,7 @@ from surfkit.core.registry import records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
 from surfkit.readers.depth_prior import prior_files
-from surfkit.readers.fingerprint import Fingerprint, changed, fingerprint
+from surfkit.readers.fingerprint import Fingerprint, changed, changed_file, fingerprint
 from surfkit.readers.made_maps import is_there, located, read_made
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run, read_data, read_record
@@ -115,7 +115,12 @@ def refuse_changed(run: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
     """
     before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
     own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
-    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None)
+    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None, run.files)
+    if before is not None and (path := changed_file(before, now)) is not None:
+        raise BadInput(
+            f"--out {run.out}: {path} has changed since the run began; put the old file back, name another folder, or "
+            "delete that one"
+        )
     if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
         raise BadInput(

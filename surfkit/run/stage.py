@@ -16,12 +16,13 @@ from surfkit.core.memory import peak_memory_bytes
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
-from surfkit.primitives.points import Columns, Points
+from surfkit.primitives.points import Points
 from surfkit.raster.api import Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.run.folder import Run, RunStage
 from surfkit.scene.memory import free_bytes
-from surfkit.scene.scene import Cloud, Scene
+from surfkit.scene.scene import Scene
+from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
 from surfkit.train.interrupt import graceful
@@ -51,19 +52,6 @@ class Intervals:
 
 
 @dataclass(frozen=True)
-class InitialModel:
-    """The points that a stage begins with, where it continues a model.
-
-    Attributes:
-        params: Raw parameters of the points.
-        sh_degree: Of the spherical harmonics that they have learnt so far.
-    """
-
-    params: Columns
-    sh_degree: int
-
-
-@dataclass(frozen=True)
 class StageJob:
     """What a stage is optimised with.
 
@@ -89,9 +77,8 @@ class StageJob:
     intervals: Intervals
     given: TrainingData
     meter: Meter
-    start: Callable[[], InitialModel] | None = None
+    start: Callable[[torch.Generator], InitialModel]
     before: StageState | None = None
-    cloud: Callable[[], Cloud] | None = None
     frozen: Callable[[], InitialModel] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
 
@@ -138,17 +125,16 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
     def begin() -> StageState:
         generator = torch.Generator().manual_seed(job.run.recipe.seed)
         began = time.perf_counter(), time.process_time()
-        cloud = job.cloud() if job.cloud else job.scene.cloud
-        begun = job.start() if job.start else InitialModel(primitive.init(cloud, generator), 0)
+        begun = job.start(generator)
         fresh = trainer.begin(
             Points.fresh(begun.params, primitive.shared()), generator, job.frozen().params if job.frozen else None
         )
         fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
-        if job.cloud:
-            fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
+        fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
         if job.before is not None:
-            for name in ("seconds", "cpu_seconds", "peak_memory_bytes"):
-                setattr(fresh, name, getattr(job.before, name))
+            fresh.seconds += job.before.seconds
+            fresh.cpu_seconds += job.before.cpu_seconds
+            fresh.peak_memory_bytes = job.before.peak_memory_bytes
         return fresh
 
     if state is not None:

@@ -9,8 +9,8 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.readers.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.run.folder import Run
-from surfkit.scene.scene import Cloud, Scene
-from surfkit.start.base import StartInput
+from surfkit.scene.scene import Scene
+from surfkit.start.base import InitialModel, StartInput
 from surfkit.train.material import TrainingData, needs_normals, needs_priors
 
 AHEAD = 4
@@ -33,16 +33,17 @@ class InitialPoints:
     given: TrainingData
     known: Alignment | None
 
-    def __call__(self) -> Cloud:
-        """The points."""
+    def __call__(self, generator: torch.Generator) -> InitialModel:
+        """The points; the generator is that of the stage."""
         start, scene, given = self.run.recipe.start, self.scene, self.given
         priors = None
         if start.needs_prior:
             largest = max(view.camera.width * view.camera.height for view in scene.train)
             priors = read_priors(self.run.data, scene, AHEAD * prior_bytes(True) * largest, self.known, normals=True)
-        generator = torch.Generator().manual_seed(self.run.recipe.seed)
+        own = torch.Generator().manual_seed(self.run.recipe.seed)
         try:
-            return start.cloud(StartInput(scene, given.photos, given.masks, priors, generator))
+            known = StartInput(scene, given.photos, given.masks, priors, own)
+            return start.model(self.run.recipe.primitive, known, generator)
         finally:
             if priors is not None:
                 priors.close()

@@ -5,11 +5,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from surfkit.core.registry import Component
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud, Scene
 
@@ -33,6 +36,19 @@ class StartInput:
     generator: torch.Generator
 
 
+@dataclass(frozen=True)
+class InitialModel:
+    """The points that a stage begins with.
+
+    Attributes:
+        params: Their raw parameters, and the shared ones, as `Primitive.init` gives them.
+        sh_degree: Of the spherical harmonics that they have learnt so far.
+    """
+
+    params: Columns
+    sh_degree: int = 0
+
+
 class Start(Component):
     """A way to find the points that the optimisation starts from."""
 
@@ -44,6 +60,26 @@ class Start(Component):
     def limited(self, points: int) -> Start:
         """The same start, limited to a number of points where it has a setting for that; for comparisons."""
         return self
+
+    def files(self) -> tuple[Path, ...]:
+        """Files that it reads beside the data set: a run that has begun is refused with one that has changed."""
+        return ()
+
+    def refuse_unfit(self, primitive: Primitive, scene: Scene) -> None:  # noqa: B027 (most fit all)
+        """BadInput if the run cannot begin so; asked before anything is written, of a run that is still to begin."""
+
+    def model(self, primitive: Primitive, known: StartInput, generator: torch.Generator) -> InitialModel:
+        """The points as raw parameters of the primitive; by default those that it begins with at `cloud`.
+
+        Args:
+            primitive: What the points are to be.
+            known: As for `cloud`.
+            generator: Of every random draw of the primitive.
+
+        Raises:
+            BadInput: There is nothing to start from.
+        """
+        return InitialModel(primitive.init(self.cloud(known), generator))
 
     @abstractmethod
     def cloud(self, known: StartInput) -> Cloud:

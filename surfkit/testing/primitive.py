@@ -15,7 +15,8 @@ from surfkit.testing.inputs import cloud
 
 def check_primitive(primitive: Primitive, count: int = 50) -> None:
     """A primitive declares the columns that it begins with, its splats have the right shapes, edits change them as
-    asked, children are no larger than their parents, and the same seed gives the same.
+    asked, children are no larger than their parents, splats come back from the table of a file, and the same seed gives
+    the same.
 
     Args:
         primitive: To check.
@@ -26,7 +27,7 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
     with unchanged(f"{name}.init", cloud=given):
         params = primitive.init(given, torch.Generator().manual_seed(1))
     _check_same(f"{name}.init", params, primitive.init(given, torch.Generator().manual_seed(1)))
-    _check_columns(name, primitive, params, count)
+    _check_columns(f"{name}.init", primitive, params, count)
     for degree in range(primitive.sh_degree + 1):
         with unchanged(f"{name}.activate", params=params):
             splats = primitive.activate(params, degree)
@@ -34,23 +35,25 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
     assert torch.allclose(primitive.activate(params, 0).means, given.xyz, atol=1e-5), f"{name}: points begin elsewhere"
     _check_edits(name, primitive, params)
     _check_split(name, primitive, params, count // 2)
+    _check_table(name, primitive, params)
 
 
 def _check_columns(name: str, primitive: Primitive, params: Columns, count: int) -> None:
     """What begins is what is declared, and every activation has its inverse."""
     columns = primitive.columns()
-    assert "means" in columns and not columns["means"].shared, f"{name} needs a column 'means', (N, 3) positions"
-    assert set(params) == set(columns), f"{name}.init gives {sorted(params)}, and columns() declares {sorted(columns)}"
+    owner = name.partition(".")[0]
+    assert "means" in columns and not columns["means"].shared, f"{owner} needs a column 'means', (N, 3) positions"
+    assert set(params) == set(columns), f"{name} gives {sorted(params)}, and columns() declares {sorted(columns)}"
     for key, column in columns.items():
         value, wanted = params[key], column.shape if column.shared else (count, *column.shape)
-        assert tuple(value.shape) == tuple(wanted), f"{name}.init: {key!r} has shape {tuple(value.shape)}, not {wanted}"
-        assert value.dtype == torch.float32, f"{name}.init: {key!r} is {value.dtype}, not float32"
-        assert torch.isfinite(value).all(), f"{name}.init: {key!r} is not finite"
+        assert tuple(value.shape) == tuple(wanted), f"{name}: {key!r} has shape {tuple(value.shape)}, not {wanted}"
+        assert value.dtype == torch.float32, f"{name}: {key!r} is {value.dtype}, not float32"
+        assert torch.isfinite(value).all(), f"{name}: {key!r} is not finite"
         raw = torch.linspace(-2, 2, 9, dtype=torch.float64)
         there = column.activation.value(raw)
         back = column.activation.inverse(there)
-        assert torch.allclose(back, raw, atol=1e-6), f"{name}: the inverse of {key!r}'s activation does not lead back"
-        assert bool((there.diff() > 0).all()), f"{name}: the activation of {key!r} does not increase"
+        assert torch.allclose(back, raw, atol=1e-6), f"{owner}: the inverse of {key!r}'s activation does not lead back"
+        assert bool((there.diff() > 0).all()), f"{owner}: the activation of {key!r} does not increase"
 
 
 def _check_splats(name: str, splats: Splats, degree: int) -> None:
@@ -97,6 +100,21 @@ def _check_split(name: str, primitive: Primitive, params: Columns, count: int) -
     common = {key: params[key] for key in shared}
     parents, children = primitive.activate(rows, 0).scales, primitive.activate(twins | common, 0).scales
     assert (children <= torch.cat([parents, parents]) + 1e-6).all(), f"{name}.split: a child is larger than its parent"
+
+
+def _check_table(name: str, primitive: Primitive, params: Columns) -> None:
+    """Splats that files have a place for are drawn the same when they are read again, if they can be read at all."""
+    if not primitive.in_ply:
+        return
+    try:
+        again = primitive.from_table(primitive.table(params), torch.Generator().manual_seed(1))
+    except BadInput:
+        return  # from_table says what the primitive lacks
+    _check_columns(f"{name}.from_table", primitive, again, len(params["means"]))
+    before, after = (primitive.activate(each, primitive.sh_degree) for each in (params, again))
+    for field in ("means", "quats", "scales", "opacities", "sh"):
+        close = torch.allclose(getattr(before, field), getattr(after, field), rtol=1e-3, atol=1e-5)
+        assert close, f"{name}.from_table does not give back the {field} of its table"
 
 
 def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) -> None:

@@ -62,7 +62,8 @@ def check_reader(reader: Reader, folder: Path, truth: Synthetic | None = None) -
 
 def check_start(start: Start) -> None:
     """A start gives finite points with colours, about as many as it expects, the same again for the same state of its
-    generator; it changes nothing it was given, and does without the depth prior of a photograph.
+    generator; it changes nothing it was given, and does without the depth prior of a photograph. Its model has as many
+    points, with the columns of the primitive.
 
     Args:
         start: With settings for nine photographs of 64 x 48 pixels.
@@ -74,6 +75,7 @@ def check_start(start: Start) -> None:
     again = start.cloud(start_input(priors=start.needs_prior))
     assert_same(f"{name}.cloud", cloud, again, "draw from the generator")
     _check_expected(start, cloud, known)
+    _check_model(start, len(cloud.xyz))
 
 
 def check_partition(partition: Partition, sight: CoarseModel | None = None) -> None:
@@ -232,6 +234,21 @@ def _check_cloud(name: str, cloud: Cloud) -> None:
     if cloud.opacity is not None:
         assert ((cloud.opacity > 0) & (cloud.opacity < 1)).all(), f"{name}: opacity must lie between 0 and 1"
     assert cloud.size is None or (cloud.size > 0).all(), f"{name}: size must be above 0"
+
+
+def _check_model(start: Start, count: int) -> None:
+    name, primitive, known = f"{type(start).__name__}.model", Surfel2D(), start_input(priors=start.needs_prior)
+    with unchanged(name, known=known):
+        model = start.model(primitive, known, torch.Generator().manual_seed(1))
+    again = start.model(primitive, start_input(priors=start.needs_prior), torch.Generator().manual_seed(1))
+    assert_same(name, model, again, "draw from the generators")
+    shapes = {key: tuple(value.shape) for key, value in model.params.items()}
+    wanted = {key: (count, *column.shape) for key, column in primitive.columns().items()}
+    assert shapes == wanted, f"{name} has the columns {shapes}, and those of {count} points are {wanted}"
+    for key, value in model.params.items():
+        assert torch.isfinite(value).all(), f"{name}: {key} is not finite"
+    known_degrees = range(primitive.sh_degree + 1)
+    assert model.sh_degree in known_degrees, f"{name}: sh_degree is {model.sh_degree}, not 0 to {known_degrees[-1]}"
 
 
 def _check_expected(start: Start, cloud: Cloud, known: StartInput) -> None:

@@ -14,6 +14,7 @@ from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
 from surfkit.start.base import Start, StartInput
 from surfkit.start.plain import RandomStart, SparseStart
+from surfkit.start.splats import SplatStart
 from surfkit.start.stereo import StereoStart, normals_of, pixel_size
 from surfkit.start.voxels import Collected, Samples, apart, thin, thin_to
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
@@ -49,7 +50,8 @@ def metres(farm, local):
 
 
 def test_registered_names():
-    assert components(Start) == {"sparse": SparseStart, "stereo": StereoStart, "random": RandomStart}
+    known = {"sparse": SparseStart, "stereo": StereoStart, "random": RandomStart, "splats": SplatStart}
+    assert components(Start) == known
 
 
 def test_sparse_is_the_cloud_of_the_scene(farm):

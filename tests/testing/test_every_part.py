@@ -24,6 +24,8 @@ CANNOT = ("needs the package", "surfkit was installed without")
 ELSEWHERE = {
     "executor:ray": "tests/test_ray.py has a cluster for it",
     "method:splats": "tests/test_pipeline.py and most others train with it",
+    "method:import": "tests/method/test_imported.py has a file for it",
+    "start:splats": "tests/start/test_splats.py has a file for it",
     "method:stereo": "tests/method/test_method.py makes the depth maps for it",
     "depth-estimator:depth-anything-v2": "tests/depth/test_depth_anything.py has weights for it",
 }

@@ -103,12 +103,25 @@ class Thick(Surfel2D):
         return replace(splats, scales=torch.ones(len(splats), 3))
 
 
+class Swells(Surfel2D):
+    def from_table(self, table, generator):
+        params = Surfel2D.from_table(self, table, generator)
+        return params | {"scales": params["scales"] + 1}
+
+
+class Forgets(Surfel2D):
+    def from_table(self, table, generator):
+        return {"means": table.means}
+
+
 @pytest.mark.parametrize(
     ("primitive", "message"),
     [
         (Grows(), "Grows.split: a child is larger than its parent"),
         (OneChild(), "OneChild.split: 'means' is not 2 M rows"),
         (Unseeded(), "Unseeded.init: 'quats' differs for the same seed"),
+        (Swells(), "Swells.from_table does not give back the scales of its table"),
+        (Forgets(), r"Forgets.from_table gives \['means'\], and columns\(\) declares"),
         (Thick(), r"Thick.activate: scales: expected shape \(N, 2\)"),
     ],
 )

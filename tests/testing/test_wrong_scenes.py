@@ -9,7 +9,7 @@ from surfkit.partition.assign import Assign, PictureShare
 from surfkit.partition.base import Cells, Ground, Partition
 from surfkit.refine import PruneAndRecover
 from surfkit.refine.base import Refine
-from surfkit.start.base import Start
+from surfkit.start.base import InitialModel, Start
 from surfkit.start.plain import SparseStart
 from surfkit.testing import check_assign, check_partition, check_refine, check_start
 from surfkit.train.stage import Stage
@@ -67,6 +67,28 @@ class Guesses(Sparse):
         return 100 * sparse
 
 
+class Lacks(Sparse):
+    def model(self, primitive, known, generator):
+        params = primitive.init(self.cloud(known), generator)
+        return InitialModel({key: value for key, value in params.items() if key != "quats"})
+
+
+class Fewer(Sparse):
+    def model(self, primitive, known, generator):
+        params = primitive.init(self.cloud(known), generator)
+        return InitialModel({key: value[1:] for key, value in params.items()})
+
+
+class Learnt(Sparse):
+    def model(self, primitive, known, generator):
+        return InitialModel(primitive.init(self.cloud(known), generator), sh_degree=4)
+
+
+class Rolls(Sparse):
+    def model(self, primitive, known, generator):
+        return InitialModel(primitive.init(self.cloud(known), torch.Generator().manual_seed(torch.seed() % 2**31)))
+
+
 @pytest.mark.parametrize(
     ("start", "message"),
     [
@@ -77,6 +99,10 @@ class Guesses(Sparse):
         (Tosses(), "Tosses.cloud is not repeatable: xyz differs; draw from the generator"),
         (Shifts(), "Shifts.cloud changed its input known.scene.cloud.xyz; work on a copy"),
         (Guesses(), "Guesses.expected is 40000, and the start gives 400 points"),
+        (Lacks(), "Lacks.model has the columns .* and those of 400 points are .*quats"),
+        (Fewer(), r"Fewer.model has the columns .*\(399, 3\)"),
+        (Learnt(), "Learnt.model: sh_degree is 4, not 0 to 3"),
+        (Rolls(), r"Rolls.model is not repeatable: params\['quats'\] differs; draw from the generators"),
     ],
 )
 def test_starts_that_are_wrong(start, message):

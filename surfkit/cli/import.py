@@ -1,0 +1,66 @@
+"""`surfkit import`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.blocks.schedule import Compute
+from surfkit.cli.result import show
+from surfkit.core.registry import choice
+from surfkit.export.models import existing_model
+from surfkit.mesh.base import Mesher
+from surfkit.mesh.tsdf import TSDF
+from surfkit.method.imported import SplatImport
+from surfkit.pipeline import run
+from surfkit.raster.select import Device
+from surfkit.readers.data import Reading
+from surfkit.recipes import IMPORTED
+from surfkit.run.folder import Run
+from surfkit.train.material import CacheSettings
+
+
+@dataclass(frozen=True)
+class Import:
+    """Take splats from a file of any program into a run folder, and measure and mesh them on the photographs.
+
+    Nothing is optimised. `surfkit evaluate`, `mesh` and `export` work on the folder, and `surfkit train recipe:2dgs
+    start:splats --start.file FILE` trains the splats further. Coordinates must be those of the data set (its COLMAP
+    model).
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """File of splats, such as a PLY file of 3DGS or 2DGS, or the folder of a finished run."""
+
+    data: Path
+    """Data set that the splats were made from: images/ and a COLMAP model in sparse/0, or another layout."""
+
+    out: Path | None = None
+    """Run folder. Default: runs/DATA-FILE."""
+
+    mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = field(default_factory=TSDF)
+    """How the splats become triangles; none for no mesh."""
+
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = Reading()
+    """How the data set is read."""
+
+    device: Device = "auto"
+    """Device for rendering."""
+
+    cache: str = "auto"
+    """Memory for photographs and masks, such as 4GB or 500MB; auto is half of the free memory."""
+
+    def run(self) -> None:
+        """Import, and print the results."""
+        existing_model(self.file, "FILE")
+        data = self.reading.of(self.data)
+        out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.file.resolve().stem}"
+        recipe = replace(IMPORTED, method=SplatImport(self.file), mesh=self.mesh)
+        metrics = run(recipe, data, out, Compute(self.device), caches=CacheSettings(self.cache))
+        show(Run(out, recipe, data), metrics)
+
+
+COMMAND = Import

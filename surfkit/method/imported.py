@@ -1,0 +1,61 @@
+"""Splats from a file, as they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
+from surfkit.export.table import SplatTable
+from surfkit.method.base import Method, MethodInput, Reconstruction
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.gaussian3d import Gaussian3D
+from surfkit.primitives.model import SplatModel
+from surfkit.primitives.surfel2d import Surfel2D
+
+
+@dataclass(frozen=True)
+class SplatImport(Method):
+    """Take the splats of a file as they are, to measure, mesh or compress them; nothing is optimised.
+
+    Coordinates of files are those of the data set.
+    """
+
+    uses: ClassVar[tuple[str, ...]] = ("depth", "mesh")
+
+    file: Path | None = None
+    """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
+
+    def __post_init__(self) -> None:
+        if self.file is not None:
+            object.__setattr__(self, "file", self.file.resolve())
+
+    def files(self) -> tuple[Path, ...]:
+        """See `Method.files`."""
+        return () if self.file is None else (model_file(self.file),)
+
+    def refuse_unfit(self, given: MethodInput) -> None:
+        """See `Method.refuse_unfit`."""
+        if given.folder.exists():
+            return  # begun: the run has its own copy, or reads the file now
+        path = existing_model(self.file, "method.file")
+        warn_of_no_fit(path, read_local(path, given.scene.frame), given.scene)
+
+    def reconstruct(self, given: MethodInput) -> Reconstruction:
+        """See `Method.reconstruct`."""
+        path = existing_model(self.file, "method.file")
+        table = read_local(path, given.scene.frame)
+        primitive = primitive_of(table)
+        params = primitive.from_table(table, given.generator)
+        return Reconstruction(
+            splats=SplatModel(primitive, params, table.sh_degree),
+            facts={"file": str(path), "kind": table.kind, "sh_degree": table.sh_degree},
+        )
+
+
+def primitive_of(table: SplatTable) -> Primitive:
+    """What the splats of a file are."""
+    if table.kind == "surfel":
+        return Surfel2D(sh_degree=table.sh_degree)
+    return Gaussian3D(sh_degree=table.sh_degree, antialias=table.antialias)

@@ -1,0 +1,75 @@
+"""Start from splats that are there already."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import name_of
+from surfkit.export.models import existing_model, model_file, read_any, read_local, warn_of_no_fit
+from surfkit.export.table import SplatTable
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.raw import cloud_of
+from surfkit.scene.scene import Cloud, Scene
+from surfkit.start.base import InitialModel, Start, StartInput
+
+
+@dataclass(frozen=True)
+class SplatStart(Start):
+    """Start from the splats of a file or of another run, with all their values, to train them further.
+
+    The run begins at the degree of their spherical harmonics. Coordinates of files are those of the data set.
+    """
+
+    file: Path | None = None
+    """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
+
+    def __post_init__(self) -> None:
+        if self.file is not None:
+            object.__setattr__(self, "file", self.file.resolve())
+
+    def files(self) -> tuple[Path, ...]:
+        """See `Start.files`."""
+        return () if self.file is None else (model_file(self.file),)
+
+    def refuse_unfit(self, primitive: Primitive, scene: Scene) -> None:
+        """See `Start.refuse_unfit`."""
+        path = existing_model(self.file, "start.file")
+        table = read_local(path, scene.frame)
+        params = primitive.from_table(table.take(slice(0, 1)), torch.Generator().manual_seed(0))
+        warn_of_no_fit(path, table, scene)
+        splats = primitive.activate(params, 0)
+        what, name = f"{path}: its {table.kind}s", f"primitive:{name_of(primitive)}"
+        if splats.kind != table.kind:
+            thinner = " without their thinnest axis" if splats.kind == "surfel" else ""
+            emit(Warned(f"{what} become {splats.kind}s{thinner}, as the recipe has {name}; pictures will differ"))
+        elif splats.antialias != table.antialias:
+            flag = "--primitive.antialias" if table.antialias else "--primitive.no-antialias"
+            emit(Warned(f"{what} were trained {'with' if table.antialias else 'without'} antialias; add {flag}"))
+        if table.sh_degree > primitive.sh_degree:
+            emit(
+                Warned(
+                    f"{what} have spherical harmonics of degree {table.sh_degree}, which are cut to "
+                    f"{primitive.sh_degree}; --primitive.sh-degree {table.sh_degree} keeps them"
+                )
+            )
+
+    def model(self, primitive: Primitive, known: StartInput, generator: torch.Generator) -> InitialModel:
+        """See `Start.model`."""
+        table = self._table(known.scene)
+        return InitialModel(primitive.from_table(table, generator), min(table.sh_degree, primitive.sh_degree))
+
+    def cloud(self, known: StartInput) -> Cloud:
+        """See `Start.cloud`; only positions, colours, opacities and mean sizes."""
+        return cloud_of(self._table(known.scene))
+
+    def expected(self, sparse: int, pixels: int) -> int:
+        """See `Start.expected`."""
+        return len(read_any(existing_model(self.file, "start.file")))
+
+    def _table(self, scene: Scene) -> SplatTable:
+        path = existing_model(self.file, "start.file")
+        return read_local(path, scene.frame)
