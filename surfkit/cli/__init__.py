@@ -24,6 +24,7 @@ COMMANDS = {
     "train": "Train a model, and make its mesh, from photographs with known cameras.",
     "tune": "Train one block of a large scene, in its own process or on another machine.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
+    "lod": "Make levels of detail of a finished run, or make them again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
@@ -39,6 +40,7 @@ COMMANDS = {
 MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",
     "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
+    "lod": "a lower --memory or --lod.steps 0 need less",
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
     "prepare": "a lower --estimator.longest or smaller photographs (--longest, --scale) need less",

@@ -24,7 +24,9 @@ import tyro
 from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
-_PARTS = "readers raster primitives losses depth start appearance densify mesh partition execute refine method recipes"
+_PARTS = (
+    "readers raster primitives losses depth start appearance densify mesh partition execute refine lod method recipes"
+)
 BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS.split())
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from surfkit.core.registry import Component
 from surfkit.lod.tree import LodTree
-from surfkit.method.base import SplatModel
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Rasterizer
 from surfkit.scene.scene import Frame, View
 

@@ -17,8 +17,8 @@ from surfkit.lod.moments import alike, merged_model, refuse_unmergeable, rows_of
 from surfkit.lod.pairs import groups, summed
 from surfkit.lod.refine import contributions, refined
 from surfkit.lod.tree import Block, LodTree
-from surfkit.method.base import SplatModel
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.model import SplatModel
 
 AFAR = 2**0.5
 """A level with half the points is seen from so many times the distance: points of a surface are then as dense in the
@@ -71,7 +71,7 @@ class MergedLevels(LevelsOfDetail):
             levels.append(refined(given, level, number, self.steps, AFAR ** (number - 1)))
             errors.append(block_errors(known, ends))
             limits.append(ends)
-        return LodTree.of(levels, blocks(limits, errors))
+        return LodTree.of(order, levels, blocks(limits, errors))
 
 
 def halves(level: SplatModel, weights: np.ndarray, ends: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:

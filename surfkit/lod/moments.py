@@ -11,9 +11,9 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
 from surfkit.lod.pairs import Alike, summed
-from surfkit.method.base import SplatModel
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.init import SH_C0
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import ALPHA_MAX, KINDS, Splats
 from surfkit.scene.scene import Cloud

@@ -21,8 +21,8 @@ from surfkit.lod.cut import cut, depth_for
 from surfkit.lod.moments import rows_of
 from surfkit.lod.refine import refined
 from surfkit.lod.tree import Block, LodTree
-from surfkit.method.base import SplatModel
 from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.model import SplatModel
 from surfkit.train.views import ViewContributions
 
 
@@ -60,8 +60,8 @@ class PrunedLevels(LevelsOfDetail):
         rises = all(before < after for before, after in itertools.pairwise((0.0, *self.distances)))
         if self.distances and (len(self.distances) != len(self.keep) or not rises):
             raise BadInput(
-                f"lod.distances is {self.distances}; give one for each of the {len(self.keep)} shares of lod.keep, above "
-                "0 and rising, or none"
+                f"lod.distances is {self.distances}; give one for each of the {len(self.keep)} shares of lod.keep, "
+                "above 0 and rising, or none"
             )
         if self.tile_points < 1:
             raise BadInput(f"lod.tile_points is {self.tile_points}; it must be 1 or more")
@@ -82,8 +82,10 @@ class PrunedLevels(LevelsOfDetail):
             kept = kept_rows(scores, share, bounds[depth])
             levels.append(refined(given, rows_of(full, kept), number, self.steps, smaller=1.0))
             ends.append(np.searchsorted(kept.numpy(), bounds[depth]))
-        errors = [np.full(len(bounds[depth]) - 1, limit) for limit in limits] if self.distances else sights(levels, ends)
-        return LodTree.of(levels, list(chains(ends, errors)))
+        errors = (
+            [np.full(len(bounds[depth]) - 1, limit) for limit in limits] if self.distances else sights(levels, ends)
+        )
+        return LodTree.of(order, levels, list(chains(ends, errors)))
 
     def _local(self, given: LodInput, distance: float) -> float:
         """A distance in local units."""
@@ -117,12 +119,11 @@ def sights(levels: Sequence[SplatModel], ends: Sequence[np.ndarray]) -> list[np.
         levels: The finest first.
         ends: (B + 1,) bounds of the blocks in each.
     """
-    count, found = len(ends[0]) - 1, [np.zeros(len(ends[0]) - 1)]
+    found = [np.zeros(len(ends[0]) - 1)]
     for level, limits in zip(levels[:-1], ends[:-1], strict=True):
         scales = level.splats.scales.detach().double().cpu().numpy()
         mean = np.add.reduceat(scales, limits[:-1], axis=0) / np.diff(limits)[:, None]
         found.append(np.maximum(found[-1], mean.max(1) / 2))
-    assert all(len(errors) == count for errors in found)
     return found
 
 

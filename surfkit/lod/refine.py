@@ -17,9 +17,9 @@ from surfkit.core.files import replacing
 from surfkit.core.schedule import LearningRate
 from surfkit.densify.trim import summed
 from surfkit.lod.base import LodInput
-from surfkit.method.base import SplatModel
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns, Points
 from surfkit.scene.cache import Cache
 from surfkit.scene.scene import View
@@ -92,7 +92,9 @@ def renders(given: LodInput, views: Sequence[View]) -> Cache[Tensor]:
     draws, splats = drawn_by(model.primitive, given.rasterizer), model.splats.detached()
 
     def picture(at: int) -> Tensor:
-        drawn = draws.render(splats, given.views[at % len(given.views)].camera, model.near, False, False).maps.color.clamp(0, 1)
+        drawn = draws.render(
+            splats, given.views[at % len(given.views)].camera, model.near, False, False
+        ).maps.color.clamp(0, 1)
         size = (views[at].camera.height, views[at].camera.width)
         small = drawn if drawn.shape[1:] == size else interpolate(drawn[None], size, mode="area")[0]
         return (small * 255).round().to("cpu", dtype=torch.uint8)

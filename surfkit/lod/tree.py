@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from surfkit.export.table import Tile
-from surfkit.method.base import SplatModel
+from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import CUTOFF, Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame
@@ -84,7 +84,8 @@ class Blocks:
         local = middle @ pose[:3, :3].T + pose[:3, 3]
         extent = half @ np.abs(pose[2, :3])
         found = local[:, 2] + extent <= near
-        for axis, focal, centre, size in ((0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)):
+        sides = (0, camera.fx, camera.cx, camera.width), (1, camera.fy, camera.cy, camera.height)
+        for axis, focal, centre, size in sides:
             for sign, edge in ((1.0, -MARGIN_PX), (-1.0, size + MARGIN_PX)):
                 normal = np.zeros(3)  # of the plane through the camera centre and that edge, inwards
                 normal[axis], normal[2] = sign, -sign * (edge - centre) / focal
@@ -116,30 +117,36 @@ class LodTree:
     """Levels of detail of a model.
 
     Attributes:
-        levels: Splats of each level, all of the same primitive, local frame; the first is the full model.
+        order: (N,) int64, which point of the full model each row of the first level is.
+        levels: Splats of each level, all of the same primitive, local frame; the first is the full model, so ordered.
         blocks: Rows of them as a tree.
     """
 
+    order: np.ndarray
     levels: tuple[SplatModel, ...]
     blocks: Blocks
 
     @classmethod
-    def of(cls, levels: Sequence[SplatModel], blocks: Sequence[Block]) -> LodTree:
-        """The tree of a list of blocks, parents first; their boxes are found, and errors are raised to those below."""
+    def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[Block]) -> LodTree:
+        """The tree of a list of blocks, the root first and parents before children.
+
+        Boxes are found, and the errors of parents are raised to those of their children.
+        """
         count = len(blocks)
         low, high, reach = np.full((count, 3), np.inf), np.full((count, 3), -np.inf), np.zeros(count)
         error = np.array([block.error for block in blocks], dtype=np.float64)
         for at, block in enumerate(blocks):
             splats, rows = levels[block.level].splats, slice(block.first, block.last)
-            means = splats.means[rows].detach().double().cpu().numpy()
-            low[at], high[at] = means.min(0), means.max(0)
-            reach[at] = CUTOFF * float(splats.scales[rows].detach().max())
+            if block.first < block.last:
+                means = splats.means[rows].detach().double().cpu().numpy()
+                low[at], high[at] = means.min(0), means.max(0)
+                reach[at] = CUTOFF * float(splats.scales[rows].detach().max())
         for at in range(count - 1, 0, -1):
             up = blocks[at].parent
             low[up], high[up] = np.minimum(low[up], low[at]), np.maximum(high[up], high[at])
             reach[up], error[up] = max(reach[up], reach[at]), max(error[up], error[at])
-        named = {name: np.array([getattr(b, name) for b in blocks], np.int64) for name in ("level", "first", "last", "parent")}
-        return cls(tuple(levels), Blocks(**named, error=error, low=low, high=high, reach=reach))
+        rows = {n: np.array([getattr(b, n) for b in blocks], np.int64) for n in ("level", "first", "last", "parent")}
+        return cls(order, tuple(levels), Blocks(**rows, error=error, low=low, high=high, reach=reach))
 
     @cached_property
     def joined(self) -> Splats:
