@@ -75,6 +75,8 @@ _HOME = {
     "surfkit.execute.base": ("Executor", "Job", "JobResult"),
     "surfkit.train.stage": ("Stage",),
     "surfkit.refine.base": ("Refine",),
+    "surfkit.lod.base": ("LevelsOfDetail", "LodInput"),
+    "surfkit.lod.tree": ("Block", "LodTree"),
     "surfkit.recipe": ("Recipe",),
     "surfkit.report.ablation": ("Row", "Table"),
 }

@@ -35,6 +35,7 @@ from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results, note_metrics, read_data, read_record, refuse_file, refuse_no_run
 from surfkit.run.journal import record_events
+from surfkit.run.lod import has_levels, make_wanted_levels
 from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.run.method import (
     is_begun,
@@ -195,16 +196,19 @@ def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageSt
 
 
 def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter) -> dict[str, Any]:
-    """Write what is missing of points, mesh and measurements, which further steps have deleted; all the metrics."""
+    """Write the results that are missing, as further steps have deleted them, and return all the metrics."""
     run, scene = ctx.run, ctx.scene
     meshed = has_mesh(run, made.last_steps, made.mesh is not None)
-    if run.metrics.exists() and has_cloud(run, made) and meshed:
+    has_lod = has_levels(run, made.last_steps)
+    if run.metrics.exists() and has_cloud(run, made) and meshed and has_lod:
         say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
         return read_metrics(run.out)
     if not has_cloud(run, made):
         export(run, made.splats, scene)
     if not meshed:
         mesh(ctx, made, device)
+    if not has_lod:
+        make_wanted_levels(ctx, made)
     return evaluate(run, made, scene, meter, lpips_weights="gpu")
 
 

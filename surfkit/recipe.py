@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, components, name_of
 from surfkit.depth.base import DepthEstimator
+from surfkit.lod.base import LevelsOfDetail
 from surfkit.mesh.base import Mesher
 from surfkit.method.base import Method
 from surfkit.method.splats import SplatOptimisation
@@ -76,6 +77,9 @@ class Recipe:
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""
 
+    lod: Annotated[LevelsOfDetail | None, choice(LevelsOfDetail, optional=True)] = None
+    """How levels of detail are made of the model, for cameras that see it from afar; none makes none."""
+
     seed: int = 0
     """Of every random draw."""
 
@@ -108,6 +112,11 @@ class Recipe:
             except BadInput as error:
                 raise BadInput(f"refine.{at}: {error}") from error
             before = refine.primitive(before)
+        if self.lod is not None:
+            try:
+                self.lod.refuse_unfit(before)
+            except BadInput as error:
+                raise BadInput(f"lod: {error}") from error
         for path, stage, primitive in self.stages():
             columns = primitive.columns()
             lacking = [name for name in stage.rates if name not in columns]

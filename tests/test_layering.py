@@ -18,7 +18,7 @@ FLOORS = (
     "primitives losses depth",
     "densify appearance start",
     "train partition compress mesh evaluate execute",
-    "refine method",
+    "refine method lod",
     "recipe",
     "run",
     "blocks",

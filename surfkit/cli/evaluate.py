@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from surfkit.cli.result import show, show_geometry
+from surfkit.cli.result import show, show_geometry, show_levels
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
@@ -22,7 +22,8 @@ from surfkit.readers.read import read
 from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
-from surfkit.run.method import refuse_not_drawn
+from surfkit.run.lod import load_levels, measure_levels
+from surfkit.run.method import refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
@@ -37,7 +38,7 @@ class Evaluate:
     precision, recall, F1 and chamfer distances of RUN/mesh.ply, or of any mesh or point cloud that is given instead of
     a run, for the whole surface and for each class of places. They are written to metrics.json; the crop volume, the
     points coloured by error and the pictures are written to the folder geometry/ beside it. --seen and --seams also
-    measure parts of the photographs; --seams also measures parts of the geometry.
+    measure parts of the photographs; --seams also measures parts of the geometry. --lod also measures levels of detail.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
@@ -62,6 +63,13 @@ class Evaluate:
     """For a run with blocks: also compute PSNR, and with --gt precision, recall and F1, within this distance of the
     block borders, in metres, and elsewhere. `auto` is 2 % of the width of the scene."""
 
+    lod: bool = False
+    """Also measure the levels of detail of the run: size, frames per second, PSNR and SSIM of each, and of blocks that
+    are selected for each view by their error in pixels."""
+
+    lod_pixels: float = 1.0
+    """Largest error of the blocks that are selected, in pixels."""
+
     geometry: Annotated[Comparison, tyro.conf.arg(name="")] = Comparison()
     """How the geometry is compared."""
 
@@ -75,8 +83,12 @@ class Evaluate:
     def run(self) -> None:
         """Measure, and print the results."""
         zones = Zones(self.seen, self.seams)
+        if not 0 <= self.lod_pixels < float("inf"):
+            raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
         with collect_notes(), bars():
             if self.gt is not None:
+                if self.lod:
+                    raise BadInput("--lod is for photographs, and --gt for geometry: leave out one of the two")
                 return self._geometry(self.gt, zones)
             if (self.views, self.out, self.geometry) != (None, None, Comparison()):
                 raise BadInput("--views, --out and the options of the comparison are for geometry: give --gt, too")
@@ -92,11 +104,17 @@ class Evaluate:
         refuse_not_drawn(run)
         zones.refuse_too_many(scene)
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
+        tree = load_levels(run, splats_of(run, made)) if self.lod else None
         metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)
         if zones != Zones():
             found = measure_zones(scene, made.draw, zones, rendered_depths(made.draw), seams)
             metrics = note_metrics(run.metrics, {"images": metrics["images"] | found})
+        if tree is not None:
+            levels = measure_levels(tree, scene, ctx.rasterizer, self.lod_pixels)
+            metrics = note_metrics(run.metrics, {"lod": levels})
         show(run, metrics)
+        if tree is not None:
+            show_levels(metrics["lod"])
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):

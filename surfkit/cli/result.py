@@ -45,6 +45,7 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
         meshes = sorted(path for path in run.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
         written += [("mesh", path) for path in meshes]
         written += [("picture of the mesh", path) for path in sorted(run.mesh_pictures.glob("*.png"))]
+    written += [("levels of detail", run.lod_record)] * run.lod_record.exists()
     pictures = sorted(run.pictures.rglob("*.png")) if run.pictures.exists() else []
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
@@ -133,6 +134,32 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
         *((in_words(name.replace("_", " ")), in_words(value)) for name, value in facts.items()),
         ("seconds", f"{record['seconds']:.1f}"),
     ]
+
+
+def lod_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
+    """What lod.json says of levels of detail: the points of each."""
+    return [(str(number), f"{count:,}") for number, count in enumerate(record["points"])]
+
+
+def show_levels(found: dict[str, Any]) -> None:
+    """Print what metrics.json says of levels of detail: each one for all views, and blocks selected for each view."""
+    rows = [(f"{number}", one) for number, one in enumerate(found["levels"])]
+    rows.append((f"selected, {found['pixels']:g} px", found["selected"]))
+    print()
+    print_table(
+        ("level of detail", "points", "MB", "FPS", "PSNR", "SSIM"),
+        [
+            (
+                name,
+                f"{one['points']:,}",
+                f"{one['bytes'] / 1e6:.2f}",
+                "-" if one["fps"] is None else f"{one['fps']:.1f}",
+                "-" if one["psnr"] is None else f"{one['psnr']:.2f}",
+                "-" if one["ssim"] is None else f"{one['ssim']:.3f}",
+            )
+            for name, one in rows
+        ],
+    )
 
 
 def in_words(value: Any) -> str:

@@ -25,8 +25,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.version import own_version
 
 _PARTS = """
-export readers raster primitives losses depth start appearance densify mesh partition compress execute refine method
-recipes
+export readers raster primitives losses depth start appearance densify mesh partition compress execute refine lod
+method recipes
 """
 BUILTIN = tuple(f"surfkit.{name}" for name in _PARTS.split())
 hookspec, hookimpl = pluggy.HookspecMarker("surfkit"), pluggy.HookimplMarker("surfkit")

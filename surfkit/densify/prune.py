@@ -9,10 +9,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import StepCount, Steps
-from surfkit.densify.base import Prune, Step
+from surfkit.densify.base import Prune, Step, Views
 from surfkit.densify.trim import lowest
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
+from surfkit.raster.api import Splats
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,15 @@ class Importance(Prune):
         """Drop the least important at the given steps."""
         if step.index not in self.at and not (step.index == 1 and 0 in self.at):
             return None
-        return Edit(drop=lowest(self.importance(step), self.ratio))
+        return Edit(drop=lowest(importance(step.views, step.splats, self.power), self.ratio))
 
-    def importance(self, step: Step) -> Tensor:
-        """(N,) sum over views and pixels of the opacity, times (V / V90)^power."""
-        hits = step.views.contributions().hits
-        volume = step.splats.scales.prod(-1)
-        large = volume.sort(descending=True).values[int(0.9 * len(volume))]
-        return hits * step.splats.opacities * (volume / large) ** self.power
+
+def importance(views: Views, splats: Splats, power: float) -> Tensor:
+    """(N,) sum over views and pixels of the opacity, times (V / V90)^power."""
+    hits = views.contributions().hits
+    volume = splats.scales.prod(-1)
+    large = volume.sort(descending=True).values[int(0.9 * len(volume))]
+    return hits * splats.opacities * (volume / large) ** power
 
 
 @dataclass(frozen=True)

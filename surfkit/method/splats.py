@@ -10,7 +10,7 @@ from surfkit.method.base import Method, MethodInput, Reconstruction
 
 @dataclass(frozen=True)
 class SplatOptimisation(Method):
-    """Optimise splats as the other fields of the recipe say: pretraining, blocks, refinement, mesh."""
+    """Optimise splats as the other fields of the recipe say: pretraining, blocks, refinement, mesh, levels."""
 
     uses: ClassVar[tuple[str, ...]] = (
         "primitive",
@@ -24,6 +24,7 @@ class SplatOptimisation(Method):
         "context",
         "refine",
         "mesh",
+        "lod",
     )
 
     def reconstruct(self, given: MethodInput) -> Reconstruction:

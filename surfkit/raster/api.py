@@ -83,6 +83,10 @@ class Splats:
         """The first so many of them."""
         return self._with(lambda value, _: value[:count], self)
 
+    def take(self, rows: Tensor) -> Splats:
+        """Those of a mask or of indices."""
+        return self._with(lambda value, _: value[rows], self)
+
     def tensors(self) -> dict[str, Tensor]:
         """The five standard tensors by name, in the order of the fields."""
         return {name: getattr(self, name) for name in STANDARD}

@@ -19,7 +19,7 @@ from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
-FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result")
+FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result", "lod")
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,16 @@ class Run:
         return self.out / "mesh.ply"
 
     @property
+    def lod(self) -> Path:
+        """Folder of the levels of detail."""
+        return self.out / "lod"
+
+    @property
+    def lod_record(self) -> Path:
+        """How the levels of detail were made and what they are; written when their files are."""
+        return self.lod / "lod.json"
+
+    @property
     def pictures(self) -> Path:
         """Renders beside the photographs."""
         return self.out / "pictures"
@@ -239,7 +249,7 @@ def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
 
 def discard_results(run: Run, stage: RunStage) -> None:
     """Delete what further steps of a stage make wrong: results, and the states of the stages after it."""
-    for path in (run.metrics, run.cloud, run.mesh_record):
+    for path in (run.metrics, run.cloud, run.mesh_record, run.lod_record):
         path.unlink(missing_ok=True)
     names = [one.name for one in run.stages]
     for later in run.stages[names.index(stage.name) + 1 :]:

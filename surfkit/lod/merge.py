@@ -1,0 +1,122 @@
+"""Levels of detail by merging splats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.core.schedule import StepCount
+from surfkit.lod.base import LevelsOfDetail, LodInput
+from surfkit.lod.cut import cut, depth_for
+from surfkit.lod.moments import alike, merged_model, refuse_unmergeable, rows_of
+from surfkit.lod.pairs import groups, summed
+from surfkit.lod.refine import contributions, refined
+from surfkit.lod.tree import Block, LodTree
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.model import SplatModel
+
+AFAR = 2**0.5
+"""A level with half the points is seen from so many times the distance: points of a surface are then as dense in the
+image. The first level is drawn at about the distance of the photographs."""
+
+Moments = tuple[np.ndarray, np.ndarray]
+"""(N,) weight of each point of a level: the contribution of the points of the full model that it stands for; and (N,)
+their mean squared distance from it."""
+
+
+@dataclass(frozen=True)
+class MergedLevels(LevelsOfDetail):
+    """Merge splats that are near and alike, block by block: each level has half the points of the one below.
+
+    Blocks are the halves of the halves of the scene. Two neighbours become one of the next level with as many points
+    as each of them had. Merged splats keep the mean, the covariance and the opacity times area of those that they stand
+    for, weighted by what these contribute to the training views, and then learn from renders of the full model.
+    """
+
+    tile_points: int = 8_192
+    """Most points of a block; the scene is halved until no block has more, once for each level."""
+
+    steps: Annotated[int, StepCount(floor=100)] = 300
+    """Optimisation steps of each level, on renders of the full model by the training cameras; 0 for none. Short runs
+    keep at least 100."""
+
+    def __post_init__(self) -> None:
+        if self.tile_points < 2:
+            raise BadInput(f"lod.tile_points is {self.tile_points}; it must be 2 or more")
+        if self.steps < 0:
+            raise BadInput(f"lod.steps is {self.steps}; it must be 0 or more")
+
+    def refuse_unfit(self, primitive: Primitive) -> None:
+        """See `LevelsOfDetail.refuse_unfit`."""
+        refuse_unmergeable(primitive)
+
+    def build(self, given: LodInput) -> LodTree:
+        """See `LevelsOfDetail.build`."""
+        self.refuse_unfit(given.model.primitive)
+        depth = depth_for(len(given.model), self.tile_points)
+        order, bounds = cut(given.model.splats.means.detach().double().cpu().numpy(), depth)
+        levels = [rows_of(given.model, torch.from_numpy(order))]
+        known = contributions(given).numpy()[order], np.zeros(len(order))
+        ends = bounds[depth]
+        errors, limits = [np.zeros(len(ends) - 1)], [ends]
+        for number in range(1, depth + 1):
+            labels, ends = halves(levels[-1], known[0], ends[::2], number)
+            level = merged_model(levels[-1], labels, known[0])
+            known = carried(levels[-1], level, labels, known)
+            levels.append(refined(given, level, number, self.steps, AFAR ** (number - 1)))
+            errors.append(block_errors(known, ends))
+            limits.append(ends)
+        return LodTree.of(order, levels, blocks(limits, errors))
+
+
+def halves(level: SplatModel, weights: np.ndarray, ends: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) groups of the points of a level, half as many in each block, and the bounds of the blocks in the next level.
+
+    Args:
+        level: Its points.
+        weights: (N,) how much each counts.
+        ends: (B + 1,) bounds of the blocks of the next level in this one.
+        number: Of the next level.
+    """
+    known = alike(level.splats, weights)
+    labels, bounds = np.empty(len(level), np.int64), [0]
+    for at, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+        part = type(known)(*(value[first:last] for value in vars(known).values()))
+        target = (last - first + 1) // 2
+        labels[first:last] = bounds[-1] + groups(part, target)
+        bounds.append(bounds[-1] + target)
+        emit(Progress(f"merging to level {number} of detail", at + 1, len(ends) - 1))
+    return labels, np.array(bounds)
+
+
+def carried(before: SplatModel, after: SplatModel, labels: np.ndarray, known: Moments) -> Moments:
+    """What is known of the points of the next level."""
+    weights, spread = known
+    places, means = (each.splats.means.detach().double().cpu().numpy() for each in (before, after))
+    far = ((places - means[labels]) ** 2).sum(1)
+    total = summed(weights, labels)
+    return total, summed(weights * (spread + far), labels) / total
+
+
+def block_errors(known: Moments, ends: np.ndarray) -> np.ndarray:
+    """(B,) root mean square distance of the points of the full model from those that stand for them, weighted."""
+    weights, spread = known
+    return np.sqrt(np.add.reduceat(weights * spread, ends[:-1]) / np.add.reduceat(weights, ends[:-1]))
+
+
+def blocks(limits: list[np.ndarray], errors: list[np.ndarray]) -> list[Block]:
+    """The blocks of all levels, the root first; `limits` and `errors` of each level, the finest first."""
+    found: list[Block] = []
+    above = -1
+    for level in range(len(limits) - 1, -1, -1):
+        begin, ends = len(found), limits[level]
+        for at in range(len(ends) - 1):
+            parent = above + at // 2 if above >= 0 else -1
+            found.append(Block(level, int(ends[at]), int(ends[at + 1]), parent, float(errors[level][at])))
+        above = begin
+    return found
