@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.export.ply import THINNESS
+from surfkit.export.table import THINNESS
 from surfkit.export.table import SplatTable
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.columns import IDENTITY, Column
