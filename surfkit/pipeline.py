@@ -32,6 +32,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe, complete, refuse_unused
+from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results, note_metrics, read_data, read_record, refuse_file, refuse_no_run
 from surfkit.run.journal import record_events
@@ -199,8 +200,8 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter)
     """Write the results that are missing, as further steps have deleted them, and return all the metrics."""
     run, scene = ctx.run, ctx.scene
     meshed = has_mesh(run, made.last_steps, made.mesh is not None)
-    has_lod = has_levels(run, made.last_steps)
-    if run.metrics.exists() and has_cloud(run, made) and meshed and has_lod:
+    has_lod, has_file = has_levels(run, made.last_steps), has_compressed(run, made.last_steps)
+    if run.metrics.exists() and has_cloud(run, made) and meshed and has_lod and has_file:
         say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
         return read_metrics(run.out)
     if not has_cloud(run, made):
@@ -209,7 +210,10 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter)
         mesh(ctx, made, device)
     if not has_lod:
         make_wanted_levels(ctx, made)
-    return evaluate(run, made, scene, meter, lpips_weights="gpu")
+    if not has_file:
+        make_wanted_compressed(ctx, made)
+    metrics = evaluate(run, made, scene, meter, lpips_weights="gpu")
+    return measure_compressed(ctx, made) if run.recipe.compress and has_compressed(run, made.last_steps) else metrics
 
 
 def has_cloud(run: Run, made: Reconstruction) -> bool:
@@ -311,6 +315,27 @@ def evaluate(
     return note_metrics(run.metrics, metrics)
 
 
+def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str = "gpu") -> dict[str, Any]:
+    """Measure the compressed model of a run as the run itself, and return all the metrics of the run.
+
+    They lie in its folder; those of the run say in short what became of size, quality and speed.
+    """
+    run, (inner, small) = ctx.run, decompressed(ctx, made)
+    found = evaluate(inner.run, small, ctx.scene, lpips_weights=lpips_weights)
+    return note_compressed(run, found)
+
+
+def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
+    """Say in the metrics of a run in short what those of its compressed model say, and return them."""
+    record = read_json(run.compressed_record, dict[str, Any])
+    facts = {name: record[name] for name in ("compressor", "bytes", "ply_bytes")}
+    facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
+    facts["fps"] = found.get("fps")
+    if "geometry" in found:
+        facts["geometry"] = {name: found["geometry"][name] for name in ("precision", "recall", "f1")}
+    return note_metrics(run.metrics, {"compressed": facts})
+
+
 def opened(out: Path) -> Run:
     """A run folder and what it was made from, finished or not.
 
@@ -322,12 +347,23 @@ def opened(out: Path) -> Run:
 
 
 @contextmanager
-def loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstruction]]:
+def loaded(out: Path, device: Device, compressed: bool = False) -> Iterator[tuple[RunContext, Reconstruction]]:
     """Within, what a finished run has come to, and what it was made from.
 
+    Args:
+        out: Run folder.
+        device: For rendering.
+        compressed: Give its compressed model instead, and the folder of that one for results.
+
     Raises:
-        BadInput: The folder holds no run, or one that is not finished.
+        BadInput: The folder holds no run, or one that is not finished, or no compressed model.
     """
+    with _loaded(out, device) as (ctx, made):
+        yield decompressed(ctx, made) if compressed else (ctx, made)
+
+
+@contextmanager
+def _loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstruction]]:
     run = opened(out)
     if run.recipe.has_stages:
         run, state, scene = load_run(out)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from surfkit.compress.base import Compressor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, components, name_of
@@ -76,6 +77,9 @@ class Recipe:
 
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = None
     """How the splats become triangles when they are trained; none for splats alone."""
+
+    compress: Annotated[Compressor | None, choice(Compressor, optional=True)] = None
+    """How the trained model is compressed into compressed/model.surfkit; none makes no such file."""
 
     lod: Annotated[LevelsOfDetail | None, choice(LevelsOfDetail, optional=True)] = None
     """How levels of detail are made of the model, for cameras that see it from afar; none makes none."""

@@ -24,6 +24,7 @@ COMMANDS = {
     "train": "Train a model, and make its mesh, from photographs with known cameras.",
     "tune": "Train one block of a large scene, in its own process or on another machine.",
     "mesh": "Make the mesh of a finished run, or make it again with other settings.",
+    "compress": "Compress the model of a finished run, or a file of splats.",
     "lod": "Make levels of detail of a finished run, or make them again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",

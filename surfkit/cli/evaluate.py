@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.method.base import Reconstruction
-from surfkit.pipeline import evaluate, loaded, opened
+from surfkit.pipeline import evaluate, loaded, note_compressed, opened
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
@@ -63,6 +63,11 @@ class Evaluate:
     """For a run with blocks: also compute PSNR, and with --gt precision, recall and F1, within this distance of the
     block borders, in metres, and elsewhere. `auto` is 2 % of the width of the scene."""
 
+    compressed: bool = False
+    """Measure the compressed model of the run (`surfkit compress`), or with --gt the mesh that `surfkit mesh RUN
+    --compressed` made of it. Figures and pictures are written to RUN/compressed, and a summary to the run's
+    metrics.json."""
+
     lod: bool = False
     """Also measure the levels of detail of the run: size, frames per second, PSNR and SSIM of each, and of blocks that
     are selected for each view by their error in pixels."""
@@ -85,6 +90,8 @@ class Evaluate:
         zones = Zones(self.seen, self.seams)
         if not 0 <= self.lod_pixels < float("inf"):
             raise BadInput(f"--lod-pixels {self.lod_pixels:g}: give 0 or more")
+        if self.compressed and (zones != Zones() or self.lod or self.out is not None or not self.target.is_dir()):
+            raise BadInput("--compressed is for a run, without --seen, --seams, --lod and --out")
         with collect_notes(), bars():
             if self.gt is not None:
                 if self.lod:
@@ -96,7 +103,7 @@ class Evaluate:
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
             with locked(self.target), full_disk_in_one_line(self.target):
-                with loaded(self.target, self.device) as (ctx, made):
+                with loaded(self.target, self.device, self.compressed) as (ctx, made):
                     self._photographs(ctx, made, zones)
 
     def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
@@ -112,6 +119,8 @@ class Evaluate:
         if tree is not None:
             levels = measure_levels(tree, scene, ctx.rasterizer, self.lod_pixels)
             metrics = note_metrics(run.metrics, {"lod": levels})
+        if self.compressed:
+            note_compressed(opened(self.target), metrics)
         show(run, metrics)
         if tree is not None:
             show_levels(metrics["lod"])
@@ -122,11 +131,12 @@ class Evaluate:
         run = opened(self.target) if self.target.is_dir() else None
         if run is None and zones != Zones():
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")
+        shown = replace(run, out=run.compressed) if run is not None and self.compressed else run
         if run is not None:
-            refuse_no_mesh(run)
+            refuse_no_mesh(shown)
             if zones != Zones():
                 refuse_not_drawn(run)
-        out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else run.out)
+        out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else shown.out)
         scene = self._scene(run)
         if scene is not None:
             zones.refuse_too_many(scene)
@@ -135,7 +145,7 @@ class Evaluate:
             raise BadInput(f"{truth}: a cloud of points; --seen needs a mesh, or leave --gt out to use rendered depth")
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         found = measure_geometry(
-            (self.target if run is None else run.mesh, truth),
+            (self.target if run is None else shown.mesh, truth),
             self.geometry,
             out / "geometry",
             scene.train if scene else (),
@@ -147,6 +157,8 @@ class Evaluate:
             images = self._zones(zones, surface, found["alignments"][found["align"]]["matrix"])
             before = metrics.get("images")
             note_metrics(out / "metrics.json", {"images": (before if isinstance(before, dict) else {}) | images})
+        if self.compressed:
+            note_compressed(run, metrics)
         show_geometry(out, found, images)
 
     def _zones(self, zones: Zones, truth: Surface | None, matrix: list[list[float]]) -> dict[str, Any]:

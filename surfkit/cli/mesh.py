@@ -59,6 +59,9 @@ class MeshOf:
     delivery: Annotated[MeshOutput, tyro.conf.arg(name="")] = MeshOutput()
     """What is written."""
 
+    compressed: bool = False
+    """Mesh the compressed model of the run instead (`surfkit compress`), into RUN/compressed."""
+
     memory: str = "auto"
     """Memory to use, such as 4GB; auto is half of the free memory. Larger meshes are made in tiles."""
 
@@ -89,7 +92,7 @@ class MeshOf:
         caches = CacheSettings(maps=self.prepare_cache if self.prepare else None)
         caches.maps_bytes()  # or BadInput, before anything is done
         self.mesh.ready()
-        with collect_notes(), bars(), loaded(self.run_folder, self.device) as (ctx, made):
+        with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
             run, scene = ctx.run, ctx.scene
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))

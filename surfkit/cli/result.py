@@ -40,12 +40,17 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
         with refuse_damaged(run.mesh_record, "damaged; delete it, and surfkit mesh makes the mesh again"):
             print_table(("mesh", "value"), mesh_rows(read_json(run.mesh_record, dict[str, Any])))
         print()
+    if "compressed" in metrics and run.compressed_record.exists():
+        record = read_json(run.compressed_record, dict[str, Any])
+        print_table(("compressed", "before", "after"), compressed_rows(record, metrics))
+        print()
     written = [("metrics", run.metrics), *[("points", run.cloud)] * run.cloud.exists()]
     if run.mesh_record.exists():  # without it, what is there is of an earlier model
         meshes = sorted(path for path in run.out.glob("mesh.*") if path.suffix in (".ply", ".obj", ".glb"))
         written += [("mesh", path) for path in meshes]
         written += [("picture of the mesh", path) for path in sorted(run.mesh_pictures.glob("*.png"))]
     written += [("levels of detail", run.lod_record)] * run.lod_record.exists()
+    written += [("compressed model", run.compressed_model)] * run.compressed_record.exists()
     pictures = sorted(run.pictures.rglob("*.png")) if run.pictures.exists() else []
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
@@ -134,6 +139,29 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
         *((in_words(name.replace("_", " ")), in_words(value)) for name, value in facts.items()),
         ("seconds", f"{record['seconds']:.1f}"),
     ]
+
+
+def compressed_rows(record: dict[str, Any], metrics: dict[str, Any] | None) -> list[tuple[str, str, str]]:
+    """What became of size, quality and speed by compression: of the float32 PLY, and of the compressed model."""
+    before, after = record["ply_bytes"], record["bytes"]
+    size = "-" if before is None else f"{before / 1e6:.2f} MB"
+    share = "" if before is None else f", {before / after:.1f} times smaller"
+    rows = [("size", size, f"{after / 1e6:.2f} MB{share}"), ("a point", "", f"{after / record['points']:.1f} bytes")]
+    if metrics is None or "compressed" not in metrics:
+        return rows
+    small, own = metrics["compressed"], metrics["images"]
+    for name, label, digits in (("psnr", "PSNR", 3), ("ssim", "SSIM", 4)):
+        if own.get(name) is not None and name in small["images"]:
+            change = small["images"][name] - own[name]
+            rows.append(
+                (label, f"{own[name]:.{digits}f}", f"{small['images'][name]:.{digits}f} ({change:+.{digits}f})")
+            )
+    if metrics["fps"] and small["fps"]:
+        rows.append(("frames a second", f"{metrics['fps']:.1f}", f"{small['fps']:.1f}"))
+    if "geometry" in metrics and "geometry" in small:
+        own_f1, f1 = metrics["geometry"]["f1"], small["geometry"]["f1"]
+        rows.append(("F1", f"{own_f1:.4f}", f"{f1:.4f} ({f1 - own_f1:+.4f})"))
+    return rows
 
 
 def lod_rows(record: dict[str, Any]) -> list[tuple[str, str]]:

@@ -7,12 +7,15 @@ from surfkit.core.registry import hookimpl
 def surfkit_components():
     """Names of what this folder offers."""
     from surfkit.compress.colors import Codes, PrincipalComponents
+    from surfkit.compress.format import SurfkitFile
     from surfkit.compress.packed import Packed
     from surfkit.compress.plain import Float16, Lossless
     from surfkit.compress.scalars import Cells, Floats, Levels, LogSteps, SmallestThree
+    from surfkit.compress.vectree import Vectree
 
     encodings = {
         "cells": Cells, "codes": Codes, "floats": Floats, "levels": Levels, "log-steps": LogSteps,
         "principal-components": PrincipalComponents, "smallest-three": SmallestThree,
     }  # fmt: skip
-    return encodings | {"float16": Float16, "lossless": Lossless, "packed": Packed}
+    compressors = {"float16": Float16, "lossless": Lossless, "packed": Packed, "vectree": Vectree}
+    return encodings | compressors | {"surfkit": SurfkitFile}

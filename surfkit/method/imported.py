@@ -7,12 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
-from surfkit.export.table import SplatTable
 from surfkit.method.base import Method, MethodInput, Reconstruction
-from surfkit.primitives.base import Primitive
-from surfkit.primitives.gaussian3d import Gaussian3D
-from surfkit.primitives.model import SplatModel
-from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.primitives.model import SplatModel, primitive_of
 
 
 @dataclass(frozen=True)
@@ -22,7 +18,7 @@ class SplatImport(Method):
     Coordinates of files are those of the data set.
     """
 
-    uses: ClassVar[tuple[str, ...]] = ("depth", "mesh")
+    uses: ClassVar[tuple[str, ...]] = ("depth", "compress", "mesh", "lod")
 
     file: Path | None = None
     """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
@@ -52,10 +48,3 @@ class SplatImport(Method):
             splats=SplatModel(primitive, params, table.sh_degree),
             facts={"file": str(path), "kind": table.kind, "sh_degree": table.sh_degree},
         )
-
-
-def primitive_of(table: SplatTable) -> Primitive:
-    """What the splats of a file are."""
-    if table.kind == "surfel":
-        return Surfel2D(sh_degree=table.sh_degree)
-    return Gaussian3D(sh_degree=table.sh_degree, antialias=table.antialias)

@@ -10,7 +10,8 @@ from surfkit.method.base import Method, MethodInput, Reconstruction
 
 @dataclass(frozen=True)
 class SplatOptimisation(Method):
-    """Optimise splats as the other fields of the recipe say: pretraining, blocks, refinement, mesh, levels."""
+    """Optimise splats as the other fields of the recipe say: pretraining, blocks, refinement, compression, mesh,
+    levels of detail."""
 
     uses: ClassVar[tuple[str, ...]] = (
         "primitive",
@@ -23,6 +24,7 @@ class SplatOptimisation(Method):
         "tune",
         "context",
         "refine",
+        "compress",
         "mesh",
         "lod",
     )

@@ -10,6 +10,7 @@ namespace surfkit {
 void add_raster(nanobind::module_& m);
 void add_mesh(nanobind::module_& m);
 void add_stereo(nanobind::module_& m);
+void add_compress(nanobind::module_& m);
 
 namespace {
 
@@ -30,4 +31,5 @@ NB_MODULE(_native, m) {
     surfkit::add_raster(m);
     surfkit::add_mesh(m);
     surfkit::add_stereo(m);
+    surfkit::add_compress(m);
 }

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from surfkit.export.table import SplatTable
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.points import Columns
+from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Splats
 
 NEAR = 0.005
@@ -36,3 +39,10 @@ class SplatModel:
     def splats(self) -> Splats:
         """Activated values."""
         return self.primitive.activate(self.params, self.sh_degree)
+
+
+def primitive_of(table: SplatTable) -> Primitive:
+    """What the splats of a file are."""
+    if table.kind == "surfel":
+        return Surfel2D(sh_degree=table.sh_degree)
+    return Gaussian3D(sh_degree=table.sh_degree, antialias=table.antialias)

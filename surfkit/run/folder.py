@@ -19,7 +19,7 @@ from surfkit.train.stage import Stage
 
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
 """In a run folder."""
-FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result", "lod")
+FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
 
 
 @dataclass(frozen=True)
@@ -165,6 +165,21 @@ class Run:
         return self.out / "mesh.ply"
 
     @property
+    def compressed(self) -> Path:
+        """Folder of the compressed model, and of what is measured and made of it."""
+        return self.out / "compressed"
+
+    @property
+    def compressed_model(self) -> Path:
+        """The compressed model."""
+        return self.compressed / "model.surfkit"
+
+    @property
+    def compressed_record(self) -> Path:
+        """How the model was compressed; written when its file is."""
+        return self.compressed / "compressed.json"
+
+    @property
     def lod(self) -> Path:
         """Folder of the levels of detail."""
         return self.out / "lod"
@@ -249,7 +264,7 @@ def note_metrics(path: Path, found: dict[str, Any]) -> dict[str, Any]:
 
 def discard_results(run: Run, stage: RunStage) -> None:
     """Delete what further steps of a stage make wrong: results, and the states of the stages after it."""
-    for path in (run.metrics, run.cloud, run.mesh_record, run.lod_record):
+    for path in (run.metrics, run.cloud, run.mesh_record, run.lod_record, run.compressed_record):
         path.unlink(missing_ok=True)
     names = [one.name for one in run.stages]
     for later in run.stages[names.index(stage.name) + 1 :]:

@@ -30,9 +30,9 @@ def refuse_other_run(run: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a warning if this one makes it longer."""
     there = read_recipe_before(run.out / "recipe.json", run.recipe)
     now = dump(run.recipe)
-    other = [name for name in ("mesh", "lod") if isinstance(there, dict) and there.get(name) != now[name]]
+    other = [name for name in ("mesh", "lod", "compress") if isinstance(there, dict) and there.get(name) != now[name]]
     if isinstance(there, dict):
-        there |= {name: now[name] for name in ("mesh", "lod")}  # training is the same
+        there |= {name: now[name] for name in ("mesh", "lod", "compress")}  # training is the same
         before = there.get("refine")
         prefix = isinstance(before, list) and first_difference(before, now["refine"][: len(before)]) is None
         if prefix and there.get("pretrain") == now["pretrain"]:
@@ -56,7 +56,9 @@ def refuse_other_run(run: Run) -> None:
             "name another folder, or delete that one"
         )
     for name in other:
-        {"mesh": run.mesh_record, "lod": run.lod_record}[name].unlink(missing_ok=True)
+        {"mesh": run.mesh_record, "lod": run.lod_record, "compress": run.compressed_record}[name].unlink(
+            missing_ok=True
+        )
 
 
 def read_recipe_before(path: Path, now: Recipe) -> Any:

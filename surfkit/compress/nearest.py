@@ -1,0 +1,205 @@
+"""The nearest code of each vector, exactly and without a matrix of all distances.
+
+The squared distance is defined as the float64 sum of the squared differences in the order of the dimensions; among
+equal ones the lowest index counts. The compiled search and the one in torch both rule codes out within bounds of their
+rounding errors and then take this sum: both give the same bits, on any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.core.check import BadInput, expect
+from surfkit.native import module
+
+MOST = 1e15
+"""Greatest absolute value in a vector: its square must be far from the end of float32."""
+WORK = 1 << 31
+"""Multiplications in one call of the compiled search, for each thread: well below a second, so that Ctrl-C works."""
+ROWS = 1 << 15
+"""Vectors in one call of the compiled search, at most."""
+ENTRIES = 1 << 21
+"""Distances that the search in torch holds at once."""
+BLOCK = 16
+"""Codes that the compiled search rules out together: kBlock of cpu/nearest.h."""
+PROBES = 128
+"""Vectors on which the number of features is chosen."""
+FEATURES = (4, 6, 8, 10, 12, 16, 24, 32)
+"""Numbers of principal components among which it is chosen, besides all of them."""
+
+
+def nearest(vectors: Tensor, codebook: Tensor) -> tuple[Tensor, Tensor]:
+    """(N,) int32 index of the nearest code of each vector, and (N,) float32 squared distance to it.
+
+    The distance is the float64 sum of the squared differences in the order of the dimensions, rounded; among equal ones
+    the lowest index is taken. Memory is of the order of the arguments. No number of threads and no instruction set
+    changes a bit, nor does a missing compiler, without which it takes some fifty times longer.
+
+    Args:
+        vectors: (N, D) float32.
+        codebook: (K, D) float32; K may be 0 only where N is.
+
+    Raises:
+        BadInput: For another shape or type, and for values that are NaN, Inf or beyond 1e15.
+    """
+    vectors, codebook = checked("vectors", vectors), checked("codebook", codebook)
+    expect("codebook", codebook, ("K", "D"), expect("vectors", vectors, ("N", "D")))
+    if len(vectors) and not len(codebook):
+        raise BadInput(f"codebook: it has no codes, and there are {len(vectors)} vectors; give at least one code")
+    index, distance = torch.zeros(len(vectors), dtype=torch.int32), torch.zeros(len(vectors))
+    if len(vectors):
+        features = Features.of(codebook).fitted(vectors, codebook)
+        search = searching(codebook, features)
+        for rows in search.parts(len(vectors)):
+            index[rows], distance[rows] = search.nearest(vectors[rows], features(vectors[rows]))
+    return index, distance
+
+
+def checked(name: str, vectors: Tensor) -> Tensor:
+    """The matrix on the CPU, contiguous.
+
+    Raises:
+        BadInput: Unless it is a float32 matrix of finite values up to 1e15.
+    """
+    expect(name, vectors, ("N", "D"))
+    if vectors.dtype != torch.float32:
+        raise BadInput(f"{name}: expected float32, got {str(vectors.dtype).removeprefix('torch.')}; convert it first")
+    if vectors.shape[1] == 0:
+        raise BadInput(f"{name}: expected at least one column, got {tuple(vectors.shape)}")
+    vectors = vectors.detach().cpu().contiguous()
+    if len(vectors) and not max(-float(vectors.min()), float(vectors.max())) <= MOST:  # not so for NaN either
+        row = int((~(vectors.abs() <= MOST)).any(1).nonzero()[0])
+        value = next(value for value in vectors[row].tolist() if not abs(value) <= MOST)
+        raise BadInput(f"{name}: row {row} has the value {value:g}; values must be finite and at most {MOST:g}")
+    return vectors
+
+
+@dataclass(frozen=True)
+class Features:
+    """Fewer numbers than dimensions, whose distance is at most that of the vectors: they rule codes out.
+
+    Attributes:
+        mean: (D,) float64, subtracted; float32 numbers, so that the difference is nearly exact.
+        axes: (D, D) float64, principal directions in columns, orthogonal, the greatest first.
+        used: Leading components that are features, and one more is the norm of the others; or D, all of them.
+    """
+
+    mean: Tensor
+    axes: Tensor
+    used: int
+
+    @classmethod
+    def of(cls, vectors: Tensor) -> Features:
+        """All principal components of (N, D) vectors."""
+        mean = vectors.double().mean(0).float().double()
+        centred = vectors.double() - mean
+        return cls(mean, torch.linalg.eigh(centred.T @ centred).eigenvectors.flip(1), vectors.shape[1])
+
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """(N, F) float32 features of (N, D) vectors."""
+        return torch.cat([self._reduced(self._turned(part)).float() for part in vectors.split(ROWS)])
+
+    def _turned(self, vectors: Tensor) -> Tensor:
+        return (vectors.double() - self.mean) @ self.axes
+
+    def _reduced(self, turned: Tensor) -> Tensor:
+        if self.used == turned.shape[1]:
+            return turned
+        return torch.cat([turned[:, : self.used], turned[:, self.used :].norm(dim=1, keepdim=True)], 1)
+
+    def fitted(self, vectors: Tensor, codebook: Tensor) -> Features:
+        """With as many components as make the search fastest: with few, distances to many codes must be computed."""
+        dimensions, blocks = codebook.shape[1], len(codebook) // BLOCK
+        some = vectors[:: max(1, len(vectors) // min(PROBES, max(8, ENTRIES // len(codebook))))]
+        here, there = self._turned(some), self._turned(codebook[self.order(codebook)[: blocks * BLOCK]])
+        fastest, least = dimensions, blocks * (dimensions + 3.0)
+        nearest = torch.cdist(here, there).amin(1, keepdim=True) * (1 + 1e-6) if blocks else None
+        for used in FEATURES:
+            if used >= dimensions - 2 or nearest is None:
+                break
+            few = replace(self, used=used)
+            bound = torch.cdist(few._reduced(here), few._reduced(there)).view(len(some), blocks, BLOCK).amin(2)
+            hits = float((bound <= nearest).sum() / len(some))
+            cost = blocks * (used + 4) + hits * (2.5 * dimensions + 40)  # in vector instructions, about
+            if cost < least:
+                fastest, least = used, cost
+        return replace(self, used=fastest)
+
+    def order(self, codebook: Tensor) -> Tensor:
+        """(K,) int64: codes such that alike ones follow one another: in slices along three axes."""
+        turned = ((codebook.double() - self.mean) @ self.axes[:, :3]).numpy()
+        order = np.argsort(turned[:, 0], kind="stable")
+        slices = max(1, round((len(order) / BLOCK) ** (1 / 3)))
+        for axis in range(1, turned.shape[1]):
+            cell = np.arange(len(order)) // -(-len(order) // slices**axis)
+            order = order[np.lexsort((turned[order, axis], cell))]
+        return torch.from_numpy(order)
+
+
+class Search(Protocol):
+    """The codes of one codebook, prepared to be searched."""
+
+    def parts(self, rows: int) -> Iterator[slice]:
+        """Slices of so many vectors, each for one call that takes a fraction of a second."""
+
+    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """As `nearest` of the module, for (N, D) vectors whose (N, F) features are known."""
+
+
+class NativeSearch(Search):
+    """Compiled; runs on `torch.get_num_threads()` threads."""
+
+    def __init__(self, codebook: Tensor, features: Features) -> None:
+        self.work = len(codebook) * (features.used + 4)
+        arrays = codebook, features(codebook), features.order(codebook)
+        self.codes = module().Codebook(*(array.numpy() for array in arrays))
+
+    def parts(self, rows: int) -> Iterator[slice]:
+        threads = torch.get_num_threads()
+        size = min(ROWS, max(256 * threads, WORK * threads // self.work))
+        return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
+
+    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        index, distance = torch.empty(len(vectors), dtype=torch.int32), torch.empty(len(vectors))
+        arrays = (array.numpy() for array in (vectors, features, index, distance))
+        self.codes.nearest(*arrays, module().kernels_in_use(), torch.get_num_threads())
+        return index, distance
+
+
+class TorchSearch(Search):
+    """In torch, where surfkit was installed without a compiler; makes no use of features."""
+
+    def __init__(self, codebook: Tensor) -> None:
+        self.codebook = codebook
+        self.mean = codebook.double().mean(0).float().double()
+        self.centred = codebook.double() - self.mean
+        self.half = self.centred.square().sum(1) / 2
+        self.reach = float(self.half.max().mul(2).sqrt())
+
+    def parts(self, rows: int) -> Iterator[slice]:
+        size = max(1, ENTRIES // len(self.codebook))
+        return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
+
+    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        centred = vectors.double() - self.mean
+        score = self.half - centred @ self.centred.T  # half the squared distance, less that to the mean
+        error = (vectors.shape[1] + 16) * 2.0**-53 * (centred.norm(dim=1) + self.reach).square() + 1e-300
+        row, code = (score <= (score.amin(1) + 2 * error)[:, None]).nonzero().T
+        exact = torch.zeros(len(row), dtype=torch.float64)
+        for x, c in zip(vectors.T, self.codebook.T, strict=True):
+            off = x[row].double() - c[code].double()
+            exact += off * off
+        order = np.lexsort((code, exact, row))
+        first = order[np.searchsorted(row[order], np.arange(len(vectors)))]
+        return code[first].int(), exact[first].float()
+
+
+def searching(codebook: Tensor, features: Features) -> Search:
+    """The codebook, compiled if surfkit is."""
+    return NativeSearch(codebook, features) if module() is not None else TorchSearch(codebook)

@@ -1,0 +1,116 @@
+"""Vectree quantisation (CityGaussianV2, section 3.3, after LightGaussian): colours that matter little as codes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.compress.base import Compressor, Plan, kinds_of
+from surfkit.compress.colors import CHOSEN, COLUMNS, Codes, vectors, width
+from surfkit.compress.kmeans import kmeans
+from surfkit.compress.packed import encodings_of, shape_encodings
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.primitives.model import SplatModel
+
+PASSES = 10
+"""Of k-means."""
+
+
+@dataclass(frozen=True)
+class Vectree(Compressor):
+    """The spherical harmonics of the points that contribute least become codes of a codebook, those of the others
+    float16; positions get 16 bits in the leaves of an octree; radii, rotations and opacities are rounded to steps."""
+
+    needs_importance: ClassVar[bool] = True
+
+    ratio: float = 0.4
+    """Share of the points whose harmonics become codes: those with the lowest mean contribution to the training
+    views."""
+
+    codes: int = 8_192
+    """Vectors of a codebook."""
+
+    codebooks: Literal["one", "by-degree"] = "one"
+    """One codebook for all harmonics of a point, or one for each of their degrees."""
+
+    scale: float = 0.02
+    """Steps of the logarithm of radii."""
+
+    rotation: float = 0.002
+    """Steps of the components of unit quaternions."""
+
+    opacity: float = 1 / 256
+    """Steps of opacities."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ratio <= 1:
+            raise BadInput(f"compress.ratio is {self.ratio}; it must lie in 0 to 1")
+        if not 1 <= self.codes <= 65_536:
+            raise BadInput(f"compress.codes is {self.codes}; it must be 1 to 65536")
+        for name in ("scale", "rotation", "opacity"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise BadInput(f"compress.{name} is {getattr(self, name)}; it must be above 0")
+
+    def coarser(self, factor: float) -> Vectree:
+        """See `Compressor.coarser`: more points get codes, of fewer vectors."""
+        codes = int(min(max(round(self.codes / factor), 1), 65_536))
+        steps = {name: getattr(self, name) * factor for name in ("scale", "rotation", "opacity")}
+        return replace(self, ratio=min(1.0, self.ratio * factor), codes=codes, **steps)
+
+    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+        """See `Compressor.plan`."""
+        kinds = kinds_of(model)
+        if not set(COLUMNS) <= set(kinds):
+            raise BadInput(f"compress:vectree needs the columns {' and '.join(COLUMNS)}; choose compress:packed")
+        if importance is None:
+            raise BadInput("compress:vectree needs the contributions to training views; choose compress:packed")
+        chosen = least(importance, self.ratio)
+        numbers = vectors({name: model.params[name][chosen] for name in COLUMNS})
+        weights = importance[chosen].float()
+        parts = self.parts(width(kinds))
+        ends = np.cumsum([0, *parts]).tolist()
+        tables = {
+            f"sh.codes.{at}": codebook(numbers[:, start:stop], self.codes, weights, seed, f"codebook {at + 1}")
+            for at, (start, stop) in enumerate(zip(ends, ends[1:], strict=False))
+        }
+        found = shape_encodings(model, None, self.scale, self.rotation, self.opacity) | {COLUMNS: Codes(parts)}
+        return Plan(encodings_of(kinds, found), tables, {CHOSEN: chosen})
+
+    def parts(self, coefficients: int) -> tuple[int, ...]:
+        """Coefficients that each codebook is for."""
+        if self.codebooks == "one":
+            return (coefficients,)
+        return tuple(3 * (2 * degree + 1) for degree in range(int((coefficients // 3) ** 0.5)))
+
+
+def least(importance: Tensor, ratio: float) -> Tensor:
+    """(N,) bool, the `ratio` of the points with the lowest importance; of equal ones the first."""
+    chosen = torch.zeros(len(importance), dtype=torch.bool)
+    chosen[importance.argsort(stable=True)[: round(ratio * len(importance))]] = True
+    return chosen
+
+
+def codebook(numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str) -> np.ndarray:
+    """(C, D) float16 vectors for (n, D) ones, C at most `codes`; in an order that depends on nothing but themselves."""
+    given = torch.from_numpy(np.ascontiguousarray(numbers, np.float32))
+    if not len(given):
+        return np.zeros((0, numbers.shape[1]), np.float16)
+    weights = weights / weights.mean() if weights.sum() > 0 else torch.ones_like(weights)
+    # A point that no view sees must not pull at a code, but may still be seen from elsewhere.
+    found = kmeans(
+        given,
+        codes,
+        weights.clamp_min(1e-3),
+        seed=seed,
+        iterations=PASSES,
+        progress=lambda done, of: emit(Progress(name, done, of)),
+    )
+    rounded = found.numpy().astype(np.float16)
+    if not np.isfinite(rounded).all():
+        raise BadInput("spherical harmonics beyond what float16 holds; choose compress:lossless")
+    return np.unique(rounded, axis=0)

@@ -1,0 +1,216 @@
+"""From a trained run to its compressed model: chosen, written into the run folder, and measured."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from surfkit.compress.base import Compressor
+from surfkit.compress.container import ModelFile, write_model
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, read_keys, write_json
+from surfkit.core.events import FileWritten, Progress, Warned, emit
+from surfkit.core.registry import name_of
+from surfkit.densify.trim import Trim
+from surfkit.evaluate.images.measure import psnr
+from surfkit.method.base import Reconstruction
+from surfkit.primitives.drawing import drawn_by
+from surfkit.primitives.model import SplatModel
+from surfkit.raster.api import Rasterizer
+from surfkit.run.context import RunContext
+from surfkit.run.folder import Run
+from surfkit.run.method import splats_of, with_drawing
+from surfkit.scene.photos import view_photo
+from surfkit.scene.scene import Frame, View
+from surfkit.train.views import ViewContributions
+
+JUDGED = 24
+"""Training views, evenly spaced, on which the loss is estimated while settings are chosen."""
+TRIES = 8
+"""Of settings, between the two ends below."""
+FINEST, COARSEST = 1 / 64, 32.0
+"""Errors that are tried, as factors of those of the compressor."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a compressed model shall come to: one of the two, or neither.
+
+    Attributes:
+        bytes: Of the file, at most.
+        decibels: By which PSNR on training views may fall, at most.
+    """
+
+    bytes: int | None = None
+    decibels: float | None = None
+
+    @property
+    def is_set(self) -> bool:
+        """Whether settings are to be chosen."""
+        return self.bytes is not None or self.decibels is not None
+
+
+def make_wanted_compressed(ctx: RunContext, made: Reconstruction) -> None:
+    """Compress as the recipe wants; that it cannot be done is told, and costs no measurements."""
+    run = ctx.run
+    assert run.recipe.compress is not None
+    try:
+        compress_run(ctx, made, run.recipe.compress)
+    except BadInput as error:
+        emit(Warned(f"no compressed model: {error}; `surfkit compress {run.out}` tries again with other settings"))
+
+
+def compress_run(
+    ctx: RunContext, made: Reconstruction, compressor: Compressor, target: Target | None = None
+) -> dict[str, Any]:
+    """Compress the model of a run into its folder, and return what compressed.json says.
+
+    Raises:
+        BadInput: The run has no splats, or they cannot be compressed so.
+    """
+    began, run, model = time.perf_counter(), ctx.run, on_cpu(splats_of(ctx.run, made))
+    importance = importance_of(model, ctx.scene.train, ctx.rasterizer) if compressor.needs_importance else None
+    run.compressed_record.unlink(missing_ok=True)
+    run.compressed.mkdir(exist_ok=True)
+    if target is not None and target.is_set:
+        judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
+        compressor = fitted(compressor, target, model, importance, run.recipe.seed, judge)
+    size = write_compressed(run.compressed_model, model, compressor, importance, ctx.scene.frame, run.recipe.seed)
+    record = {
+        "compressor": compressor,
+        "steps": made.last_steps,
+        "points": len(model),
+        "bytes": size,
+        "ply_bytes": run.cloud.stat().st_size if run.cloud.exists() else None,
+        "seconds": round(time.perf_counter() - began, 2),
+    }
+    write_json(run.compressed_record, record)
+    emit(FileWritten(run.compressed_record, "facts of the compressed model"))
+    return dump(record)
+
+
+def write_compressed(
+    path: Path, model: SplatModel, compressor: Compressor, importance: Tensor | None, frame: Frame | None, seed: int
+) -> int:
+    """Write a model as `.surfkit` file with progress, and return its bytes."""
+    plan = compressor.plan(model, importance, seed)
+    size = write_model(
+        path, model, plan, compressor, frame, lambda done, of: emit(Progress("compressing points", done, of))
+    )
+    emit(FileWritten(path, "compressed model"))
+    return size
+
+
+def has_compressed(run: Run, steps: int) -> bool:
+    """Whether the file that a recipe wants is there, made from splats of so many steps; it may want none."""
+    if run.recipe.compress is None:
+        return True
+    if not run.compressed_record.exists():
+        return False
+    remedy = f"delete it, and surfkit compress {run.out} makes it again"
+    return read_keys(run.compressed_record, {"steps": int}, remedy)["steps"] == steps and run.compressed_model.exists()
+
+
+def decompressed(ctx: RunContext, made: Reconstruction) -> tuple[RunContext, Reconstruction]:
+    """A run with the model of its compressed file in place of its own; results go to the folder of that file.
+
+    Raises:
+        BadInput: There is no such file, it is damaged, or of an earlier model.
+    """
+    run = ctx.run
+    if not run.compressed_record.exists() or not run.compressed_model.exists():
+        raise BadInput(f"{run.out}: there is no compressed model; make one with surfkit compress {run.out}")
+    model, _ = ModelFile(run.compressed_model).read()
+    small = replace(made, splats=model, mesh=None, draw=None, draw_color=None)
+    return replace(ctx, run=replace(run, out=run.compressed)), with_drawing(small, ctx.rasterizer)
+
+
+def importance_of(model: SplatModel, views: Sequence[View], rasterizer: Rasterizer) -> Tensor:
+    """(N,) mean contribution of each point over views, as `Trim` ranks points (CityGaussianV2, section 3.3)."""
+    gamma, draws = Trim().gamma, drawn_by(model.primitive, rasterizer)
+    with torch.no_grad():
+        tally = ViewContributions(views, draws, model.splats.detached(), model.near)
+        total = torch.zeros(len(model))
+        for at, (amount, pixels) in enumerate(tally.each(gamma, 1 - gamma), 1):
+            total += (amount / pixels.clamp_min(1)).cpu()
+            emit(Progress("contributions to views", at, len(views)))
+    return total / max(1, len(views))
+
+
+def on_cpu(model: SplatModel) -> SplatModel:
+    """The same model without autograd graph, on the CPU."""
+    return replace(model, params={name: value.detach().cpu().contiguous() for name, value in model.params.items()})
+
+
+class Judge:
+    """Tells how much of the PSNR of a model on training views another one loses."""
+
+    def __init__(self, model: SplatModel, views: Sequence[View], rasterizer: Rasterizer) -> None:
+        step = max(1, len(views) // JUDGED)
+        self.views, self.draws, self.near = views[::step], drawn_by(model.primitive, rasterizer), model.near
+        self.photos: list[Tensor] = []
+        self.renders: list[Tensor] = []
+        for view in self.views:
+            self.photos.append(view_photo(view).float() / 255)
+            self.renders.append(self._render(model, view))
+
+    def loss(self, other: SplatModel) -> float:
+        """Decibels: the larger of what is measured and what the difference of the renders leads one to expect.
+
+        What is measured on few views may even be a gain, by chance; errors that are independent of those of the model
+        add to them.
+        """
+        measured, expected = [], []
+        for view, photo, before in zip(self.views, self.photos, self.renders, strict=True):
+            after = self._render(other, view)
+            own, change = psnr(before, photo), psnr(after, before)
+            measured.append(own - psnr(after, photo))
+            expected.append(10 * math.log10(1 + 10 ** ((own - change) / 10)))
+        return max(sum(measured), sum(expected)) / len(measured)
+
+    def _render(self, model: SplatModel, view: View) -> Tensor:
+        with torch.no_grad():
+            maps = self.draws.render(model.splats, view.camera, self.near, geometry=False, distortion=False).maps
+        return maps.color.clamp(0, 1).cpu()
+
+
+def fitted(
+    compressor: Compressor, target: Target, model: SplatModel, importance: Tensor | None, seed: int, judge: Judge | None
+) -> Compressor:
+    """The compressor with errors as large as the target allows, or as small; bisected on the scale of all errors.
+
+    Raises:
+        BadInput: The target cannot be reached, or the compressor has no such setting.
+    """
+
+    def fits(factor: float) -> bool:
+        """Whether a file is good enough at this factor; files of fewer bytes lose more."""
+        tried = compressor.coarser(factor)
+        path = Path(folder) / "tried.surfkit"
+        size = write_model(path, model, tried.plan(model, importance, seed), tried)
+        done[0] += 1
+        emit(Progress("choosing settings", done[0], TRIES + 2))
+        if target.bytes is not None:
+            return size <= target.bytes
+        return judge.loss(ModelFile(path).read()[0]) <= target.decibels
+
+    done = [0]
+    with TemporaryDirectory() as folder:
+        good, bad = (COARSEST, FINEST) if target.bytes is not None else (FINEST, COARSEST)
+        if fits(bad):
+            return compressor.coarser(bad)
+        if not fits(good):
+            what = f"{target.bytes:,} bytes" if target.bytes is not None else f"{target.decibels:g} dB"
+            raise BadInput(f"compress:{name_of(compressor)} does not come to {what} with any setting; allow more")
+        for _ in range(TRIES):
+            middle = math.sqrt(good * bad)
+            good, bad = (middle, bad) if fits(middle) else (good, middle)
+    return compressor.coarser(good)
