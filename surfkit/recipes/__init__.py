@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
+from surfkit.compress.vectree import Vectree
 from surfkit.core.registry import hookimpl
+from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.prune import Importance
 from surfkit.densify.signal import AbsGradient
@@ -12,12 +14,14 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.method.imported import SplatImport
+from surfkit.primitives.columns import RATES
 from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.recipes import city
 from surfkit.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS
+from surfkit.refine.light import DistilSH, PruneAndRecover, slowing
 from surfkit.train.stage import Stage
 
 GAUSSIANS = Recipe(
@@ -71,10 +75,16 @@ TRIMMED = Recipe(
     mesh=TSDF(),
 )
 
+# Rates fall by 5 % every 400 of the 5,000 steps of recovery; positions go on at the rate that they ended with.
+LIGHT_RATES = slowing({name: rate.start for name, rate in RATES.items()}, 0.95**12.5) | {"means": LearningRate(1.6e-6)}
 LIGHT = Recipe(
-    about="3DGS, then two thirds of the points dropped by importance and 5,000 steps to recover (LightGaussian, 2023)",
+    about="3DGS, then two thirds of the points dropped, simpler colours, most of them codes (LightGaussian, 2023)",
     primitive=Gaussian3D(),
-    pretrain=Stage(steps=35_000, prune=(Importance(at=(30_000,), ratio=0.66),)),
+    refine=(
+        PruneAndRecover(Stage(5_000, densify=None, prune=(Importance(at=(0,), ratio=0.66),), rates=LIGHT_RATES)),
+        DistilSH(Stage(5_000, densify=None, rates=LIGHT_RATES | {"opacities": LearningRate(0.0)})),
+    ),
+    compress=Vectree(ratio=0.6),
 )
 
 IMPORTED = Recipe(
@@ -104,6 +114,7 @@ def surfkit_recipes() -> Mapping[str, Recipe]:
         "citygs2-short": city.SHORT,
         "citygs2-s": city.SMALL,
         "citygs2-t": city.TINY,
+        "citygs2-released": city.RELEASED,
         "citygs2-aerial": city.AERIAL,
         "citygs2-street": city.STREET,
     }
