@@ -122,17 +122,7 @@ class Recipe:
             except BadInput as error:
                 raise BadInput(f"lod: {error}") from error
         for path, stage, primitive in self.stages():
-            columns = primitive.columns()
-            lacking = [name for name in stage.rates if name not in columns]
-            if unknown := [name for name in lacking if name not in RATES]:
-                raise BadInput(
-                    f"{path}.rates.{unknown[0]}: primitive {name_of(primitive)} has no such column; it has "
-                    f"{', '.join(columns)}"
-                )
-            if lacking:
-                emit(Warned(f"{path}.rates: {', '.join(lacking)} not used, as primitive {name_of(primitive)} has none"))
-            if stage.appearance is not None:
-                stage.appearance.refuse_unfit(primitive)
+            _refuse_unfit_stage(path, stage, primitive)
 
     @property
     def has_stages(self) -> bool:
@@ -149,6 +139,24 @@ class Recipe:
         """Names of the fields that the method does not use."""
         used = {"about", "method", "seed", *self.method.uses, *["depth"] * self.method.needs_prior}
         return tuple(each.name for each in fields(self) if each.name not in used)
+
+
+def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
+    columns = primitive.columns()
+    lacking = [name for name in stage.rates if name not in columns]
+    if unknown := [name for name in lacking if name not in RATES]:
+        raise BadInput(
+            f"{path}.rates.{unknown[0]}: primitive {name_of(primitive)} has no such column; it has {', '.join(columns)}"
+        )
+    if lacking:
+        emit(Warned(f"{path}.rates: {', '.join(lacking)} not used, as primitive {name_of(primitive)} has none"))
+    if stage.signal.absolute and not primitive.has_absolute_gradients:
+        raise BadInput(
+            f"{path}.signal: {name_of(stage.signal)} wants absolute pixel gradients, and primitive "
+            f"{name_of(primitive)} draws itself without them; choose {path}.signal:loss-gradient, or another primitive"
+        )
+    if stage.appearance is not None:
+        stage.appearance.refuse_unfit(primitive)
 
 
 def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:

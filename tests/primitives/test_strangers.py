@@ -122,10 +122,36 @@ class Anchors(Primitive):
         return tuple(value.new_zeros(len(splats)).index_add(0, owner, value) for value in found)
 
 
+@dataclass(frozen=True)
+class Drawn(Balls):
+    """Balls that torch draws."""
+
+    has_absolute_gradients: ClassVar[bool] = False
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        true = rasterizer.render(splats, camera, near, False, False)
+        return AutogradRender(splats, camera, lambda s: draw(s, camera, near).maps, true.seen, true.radii)
+
+
+@dataclass(frozen=True)
+class Boasting(Drawn):
+    """Declares gradients that it does not have."""
+
+    has_absolute_gradients: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class Small(Balls):
+    """Draws half a picture."""
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
+
+
 class Package:
     @hookimpl
     def surfkit_components(self):
-        return {"balls": Balls, "fog": Fog, "anchors": Anchors}
+        return {"balls": Balls, "fog": Fog, "anchors": Anchors, "drawn": Drawn, "small": Small}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -142,9 +168,21 @@ def source(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors()], ids=["balls", "fog", "anchors"])
+@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors(), Drawn()], ids=["balls", "fog", "anchors", "drawn"])
 def test_they_keep_the_contract(primitive):
     check_primitive(primitive)
+
+
+@pytest.mark.parametrize(
+    ("primitive", "fault"),
+    [
+        (Boasting(), "Boasting.render: set has_absolute_gradients to False: signal: absolute pixel gradients"),
+        (Small(), "primitive small: its render gives color of shape"),
+    ],
+)
+def test_a_render_that_is_not_as_declared_is_named(primitive, fault):
+    with pytest.raises(AssertionError, match=fault):
+        check_primitive(primitive)
 
 
 def notes(out):
@@ -233,6 +271,15 @@ def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_pat
         recipe.refuse_unfit()
 
 
+def test_absolute_gradients_that_torch_does_not_have_are_refused(source, tmp_path, capsys):
+    assert train(source, tmp_path / "a", "recipe:absgs", "primitive:drawn") == 2
+    told = capsys.readouterr().err
+    assert "pretrain.signal: abs-gradient wants absolute pixel gradients, and primitive drawn draws itself" in told
+    assert "choose pretrain.signal:loss-gradient" in told and not (tmp_path / "a" / "pretrain").exists()
+    words = "recipe:absgs", "primitive:drawn", "pretrain.signal:loss-gradient"
+    assert train(source, tmp_path / "b", *words, "--pretrain.steps", "2") == 0
+
+
 def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
     splats = Anchors().activate(
         Anchors().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
@@ -256,6 +303,8 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     own = AutogradRender(splats, camera, lambda s: draw(s, camera, 0.01).maps, true.seen, true.radii)
     cotangent = type(true.maps)(color=torch.randn(3, 16, 16))
     a, b = true.backward(cotangent, cotangent), own.backward(cotangent, cotangent)
+    with pytest.raises(BadInput, match="absolute pixel gradients cannot be had .* choose signal:loss-gradient"):
+        own.backward(cotangent, cotangent, absolute=True)
     for name, value in a.tensors().items():
         assert torch.allclose(value, b.tensors()[name], atol=1e-6), name
     seen = a.signal.norm(dim=1) > 1e-4
@@ -263,19 +312,10 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
 
 
-@dataclass(frozen=True)
-class Small(Balls):
-    """Draws half a picture."""
-
-    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
-        return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
-
-
-def test_pictures_of_another_size_are_refused_in_one_line(source, monkeypatch):
+def test_pictures_of_another_size_are_refused_in_one_line(source):
     scene = read(Data(source))
     trainer = Trainer(Stage(steps=2), Small(), scene.train, photo_cache(scene.train), select("cpu")[0])
     draw = torch.Generator().manual_seed(0)
     state = trainer.begin(Points.fresh(Small().init(scene.cloud, draw)), draw)
-    monkeypatch.setattr("surfkit.primitives.drawing.name_of", lambda part: "small")
     with pytest.raises(BadInput, match=r"primitive small: its render gives color of shape \(3, 30, 20\) for a view of"):
         trainer.step(state)
