@@ -128,8 +128,6 @@ def _check_render(name: str, primitive: Primitive, splats: Splats) -> None:
     camera = Camera(pose, 30.0, 30.0, 16.0, 12.0, 32, 24)
     with unchanged(name, splats=splats.named()):
         render = primitive.render(splats, camera, select("cpu")[0], 0.01)
-    missing = {"color", "alpha"} - set(render.maps.present())
-    assert not missing, f"{name} gives no {' and no '.join(sorted(missing))}"
     try:
         refuse_wrong_maps(primitive, render.maps, camera)
     except BadInput as error:

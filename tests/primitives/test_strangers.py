@@ -15,12 +15,15 @@ from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.export.ply import read_splats
+from surfkit.losses.photometric import L1
+from surfkit.losses.reprojection import Reprojection
+from surfkit.losses.surface import NormalConsistency
 from surfkit.pipeline import load_run
 from surfkit.primitives.base import harmonics
 from surfkit.primitives.edit import apply
 from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Points
-from surfkit.raster.api import Splats
+from surfkit.raster.api import Maps, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.reference import draw
 from surfkit.raster.select import select
@@ -148,10 +151,22 @@ class Small(Balls):
         return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
 
 
+@dataclass(frozen=True)
+class Bare(Balls):
+    """Draws a few maps, whatever is asked for."""
+
+    maps: tuple[str, ...] = ("color", "alpha")
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        render = rasterizer.render(splats, camera, near)
+        render.maps = Maps(**{name: getattr(render.maps, name) for name in self.maps})
+        return render
+
+
 class Package:
     @hookimpl
     def surfkit_components(self):
-        return {"balls": Balls, "fog": Fog, "anchors": Anchors, "drawn": Drawn, "small": Small}
+        return {"balls": Balls, "fog": Fog, "anchors": Anchors, "drawn": Drawn, "small": Small, "bare": Bare}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -240,7 +255,6 @@ def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
     drawn = run.last.primitive.activate(state.points.params, 0).opacities
     table = read_splats(tmp_path / "run" / "point_cloud.ply")
     assert torch.allclose(table.opacity_logits.sigmoid(), drawn, atol=1e-6)
-    points = Points.fresh({"means": torch.zeros(2, 3), "opacities": torch.zeros(2)})
     points = Points.fresh(Fog().init(Cloud(torch.rand(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator()))
     points.params["opacities"].zero_()  # drawn as 0.632
     lowered = apply(Fog(), points, Edit(max_opacity=0.3), torch.Generator())
@@ -312,10 +326,39 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
 
 
-def test_pictures_of_another_size_are_refused_in_one_line(source):
-    scene = read(Data(source))
-    trainer = Trainer(Stage(steps=2), Small(), scene.train, photo_cache(scene.train), select("cpu")[0])
+def begun(stage, primitive, scene):
+    trainer = Trainer(stage, primitive, scene.train, photo_cache(scene.train), select("reference")[0])
     draw = torch.Generator().manual_seed(0)
-    state = trainer.begin(Points.fresh(Small().init(scene.cloud, draw)), draw)
+    return trainer, trainer.begin(Points.fresh(primitive.init(scene.cloud, draw)), draw)
+
+
+def test_pictures_of_another_size_are_refused_in_one_line(source):
+    trainer, state = begun(Stage(steps=2), Small(), read(Data(source)))
     with pytest.raises(BadInput, match=r"primitive small: its render gives color of shape \(3, 30, 20\) for a view of"):
         trainer.step(state)
+
+
+@pytest.mark.parametrize(
+    ("maps", "loss", "lacking"),
+    [
+        (("color",), L1(), "alpha, which every view needs"),
+        (("alpha",), L1(), "color, which every view needs"),
+        (("color", "alpha", "depth", "median"), NormalConsistency(start=2), "normal, which loss late reads"),
+        (
+            ("color", "alpha", "depth"),
+            Reprojection(start=2),
+            "median, which loss late reads; leave .* losses.late",
+        ),
+    ],
+)
+def test_maps_that_a_render_leaves_out_are_named_in_the_first_step(source, maps, loss, lacking):
+    stage = Stage(steps=4, losses={"l1": L1(), "late": loss})
+    trainer, state = begun(stage, Bare(maps=maps), read(Data(source)))
+    with pytest.raises(BadInput, match=f"primitive bare: its render gives no {lacking}"):
+        trainer.step(state)
+
+
+def test_maps_that_no_loss_reads_may_be_left_out(source):
+    trainer, state = begun(Stage(steps=2, losses={"l1": L1()}), Bare(), read(Data(source)))
+    trainer.step(state)
+    assert state.index == 1
