@@ -8,11 +8,9 @@ import pytest
 import torch
 from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F401 (fixtures)
 
-from surfkit.blocks import forecast as foresight
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block
-from surfkit.blocks.forecast import BlockPoints, forecast, initial_points, point_memory
+from surfkit.blocks.forecast import FROZEN_BYTES, POINT_BYTES, BlockPoints, forecast, initial_points, point_memory
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -59,7 +57,7 @@ def block_state(out, index):
 
 def coarse_and_plan(out):
     coarse = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
-    return coarse, read_json(out / "blocks" / "plan.json", blocks.Record).plan
+    return coarse, read_json(out / "blocks" / "plan.json", schedule.Record).plan
 
 
 def test_frozen_points_end_as_the_coarse_model_has_them(runs):
@@ -119,7 +117,7 @@ def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):  # noqa: 
 
 def killed_in_block_1(monkeypatch):
     """A worker that is killed without a word after step 7 of block 1, three steps after its last checkpoint."""
-    command = blocks.job_of
+    command = schedule.job_of
 
     def deadly(ctx, block, compute):
         job = command(ctx, block, compute)
@@ -134,7 +132,7 @@ def killed_in_block_1(monkeypatch):
             job = replace(job, command=("-c", code))
         return job
 
-    monkeypatch.setattr(blocks, "job_of", deadly)
+    monkeypatch.setattr(schedule, "job_of", deadly)
 
 
 def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):  # noqa: F811
@@ -151,14 +149,16 @@ def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypa
     """As a checkpoint from before points were frozen is, in one line; nothing of it is lost."""
     frozen = replace(growing, context="frozen")
     with monkeypatch.context() as patch:
-        patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
+        patch.setattr(worker, "optimise", stop_after(worker.optimise, 6))
         with pytest.raises(KeyboardInterrupt):
             run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "blocks" / "000" / "tune" / "checkpoint.safetensors"
     state = checkpoint.load(path)
     state.frozen = {}
     checkpoint.save(path, state)
-    with pytest.raises(blocks.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"):
+    with pytest.raises(
+        schedule.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"
+    ):
         run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     assert checkpoint.load(path).index == 6 and "delete" in capsys.readouterr().err
     with pytest.raises(BadInput, match='context "frozen", and this one has "tuned"'):
@@ -197,14 +197,14 @@ def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F81
         path.unlink()
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
-    ctx = tuning.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
-    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 0
+    ctx = worker.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
+    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 0
     again = block_state(tmp_path / "run", 0)
     assert all(torch.equal(value, again.points.params[name]) for name, value in true.points.params.items())
     map_path(made.path, plan.blocks[0].views[0]).unlink()
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
+    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         (place.out / "pretrain").mkdir(parents=True)
         os.link(runs["frozen"] / "pretrain" / "checkpoint.safetensors", place.out / "pretrain/checkpoint.safetensors")
         block = Block(place, plan, 0)
-        told = forecast([block], tuning.open_coarse_model(place), [])
+        told = forecast([block], worker.open_coarse_model(place), [])
         found[context] = Found(point_memory(block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.planned.points, block.planned.begins
         wanted = {
@@ -234,11 +234,11 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         }
         assert initial_points(block) == wanted[context]
         block.write(begun_points=own + 7 if context == "frozen" else both + 7)
-        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * foresight.POINT_BYTES
+        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * POINT_BYTES
         assert point_memory(block) - found[context].memory == more
     around = plan.blocks[0].begins - plan.blocks[0].points
-    assert found["densified"].memory - found["tuned"].memory == 2 * around * foresight.POINT_BYTES
-    less = foresight.POINT_BYTES - foresight.FROZEN_BYTES
+    assert found["densified"].memory - found["tuned"].memory == 2 * around * POINT_BYTES
+    less = POINT_BYTES - FROZEN_BYTES
     assert found["tuned"].memory - found["frozen"].memory == around * less
     pace = coarse.seconds / coarse.index
     assert found["densified"].seconds == found["tuned"].seconds == pytest.approx(STEPS * pace)
