@@ -20,9 +20,9 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared
 from surfkit.evaluate.images.pictures import colour_depth, write_picture
-from surfkit.raster.select import Device
+from surfkit.raster.select import Device, torch_device
 from surfkit.readers.data import Reading
 from surfkit.readers.depth_files import FOLDER, RECORD, DepthFile, map_path
 from surfkit.readers.depth_prior import trust_warning
