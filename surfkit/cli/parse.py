@@ -24,6 +24,7 @@ from tyro._errors import (
 )
 
 from surfkit.cli.flags import explain_flag, flags
+from surfkit.cli.help_text import one_paragraph_each
 from surfkit.cli.recipes import ARGV
 from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
 from surfkit.core.check import BadInput
@@ -64,7 +65,8 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
     try:
         with on_parse_error(refuse):
-            return _refuse_nan(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
+            words, rules = choices_first(command, argv), one_paragraph_each()
+            return _refuse_nan(tyro.cli(command, prog=prog, args=words, config=_CONFIG, registry=rules))
     finally:
         ARGV.reset(token)
 
