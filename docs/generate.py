@@ -8,6 +8,7 @@ A test holds them to it, so run this after a change of a setting, a default, a h
 from __future__ import annotations
 
 import ast
+import builtins
 import contextlib
 import importlib
 import inspect
@@ -179,11 +180,16 @@ def _import(imports: dict[str, set[str]], cls: type, hints: list[ast.expr | None
 
     for hint in hints:
         for name in {node.id for node in ast.walk(hint) if isinstance(node, ast.Name)} if hint else ():
-            found = getattr(importlib.import_module(cls.__module__), name, None)
-            module = "surfkit" if name in surfkit.__all__ else getattr(found, "__module__", None)
-            module = "" if inspect.ismodule(found) else module
-            if module is not None and module != "builtins":
-                imports.setdefault(module, set()).add(name)
+            found = getattr(importlib.import_module(cls.__module__), name, getattr(builtins, name, None))
+            home = getattr(found, "__module__", None)
+            if name in surfkit.__all__:
+                home = "surfkit"
+            elif inspect.ismodule(found):
+                home = ""
+            elif home is None or getattr(importlib.import_module(home), name, None) is not found:
+                home = cls.__module__  # a name for another type
+            if home != "builtins":
+                imports.setdefault(home, set()).add(name)
 
 
 def _attributes(cls: type) -> dict[str, str]:
