@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 from needs import needs
-from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same
 
 from surfkit.blocks import schedule
 from surfkit.blocks.schedule import Compute, Unfinished
@@ -121,7 +121,7 @@ def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     wait_for((folder / "saved").exists)
 
 
-def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):  # noqa: F811
+def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):
     """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
     reached, command = tmp_path / "reached", schedule.job_of
     code = (
@@ -254,7 +254,7 @@ def test_without_slurm_or_the_package(monkeypatch, tmp_path):
         Slurm("local").ready()
 
 
-def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):  # noqa: F811
+def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BadInput, match="sbatch is not on this machine"):
         run(recipe, data, tmp_path / "run", Compute("cpu", Slurm()), EVERY)

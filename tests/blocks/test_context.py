@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F401 (fixtures)
+from two_blocks import EVERY, STEPS, same, stop_after
 
 from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block
@@ -33,7 +33,7 @@ DENSIFY = ADC(start=2, until=STEPS, every=2, threshold=1e-9, reset_every=7, reco
 
 
 @pytest.fixture(scope="module")
-def growing(recipe):  # noqa: F811
+def growing(recipe):
     """Points multiply from the first steps on, and are reset, culled and trimmed."""
     prune = (Trim(ratio=0.1, start=2, until=STEPS, every=1, recovery=0),)
     return replace(
@@ -42,7 +42,7 @@ def growing(recipe):  # noqa: F811
 
 
 @pytest.fixture(scope="module")
-def runs(data, growing, tmp_path_factory):  # noqa: F811
+def runs(data, growing, tmp_path_factory):
     """A run of each kind, in this process."""
     found = {}
     for context in ("densified", "tuned", "frozen"):
@@ -110,7 +110,7 @@ def test_the_plan_tells_the_borders(runs):
     assert int((means @ x < border).sum()) == gave[0]["kept"] and int((means @ x >= border).sum()) == gave[1]["kept"]
 
 
-def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):  # noqa: F811
+def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):
     run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert same(tmp_path, runs["tuned"])
 
@@ -135,7 +135,7 @@ def killed_in_block_1(monkeypatch):
     monkeypatch.setattr(schedule, "job_of", deadly)
 
 
-def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):  # noqa: F811
+def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):
     """In a pool; what was made in this process, undisturbed, has the same bits, those of the frozen points too."""
     killed_in_block_1(monkeypatch)
     run(replace(growing, context="frozen"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
@@ -145,7 +145,7 @@ def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypa
         assert all(torch.equal(value, found.frozen[name]) for name, value in true.frozen.items())
 
 
-def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypatch, capsys):
     """As a checkpoint from before points were frozen is, in one line; nothing of it is lost."""
     frozen = replace(growing, context="frozen")
     with monkeypatch.context() as patch:
@@ -165,7 +165,7 @@ def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypa
         run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu"), EVERY)
 
 
-def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):  # noqa: F811
+def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):
     """Its blocks go on as they began."""
     run(replace(growing, context="densified"), data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "recipe.json"
@@ -175,7 +175,7 @@ def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):
     assert load_run(tmp_path)[0].recipe.context == "densified" and same(tmp_path, runs["densified"])
 
 
-def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F811
+def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):
     """With those of all other photographs deleted it comes to the same bits."""
     truth = photograph(Flight(views=12, width=32, height=24, points=300))
     write_colmap(tmp_path / "data", truth, tracks=True)
@@ -215,7 +215,7 @@ class Found:
     seconds: float
 
 
-def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: F811
+def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):
     loaded, _, scene = load_run(runs["frozen"])
     coarse, plan = coarse_and_plan(runs["frozen"])
     found = {}

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same
 
 from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block, read_plan
@@ -23,7 +23,7 @@ from surfkit.pipeline import opened, run
 
 
 @pytest.fixture
-def block(undisturbed, tmp_path) -> Block:  # noqa: F811
+def block(undisturbed, tmp_path) -> Block:
     """A block of a run, in a folder of its own."""
     loaded = opened(undisturbed)
     return Block(replace(loaded, out=tmp_path), read_plan(loaded).plan, 0)
@@ -51,7 +51,7 @@ def test_a_driver_that_goes_while_no_step_is_made(block, monkeypatch):
 
 
 @pytest.fixture
-def elsewhere(undisturbed, tmp_path):  # noqa: F811
+def elsewhere(undisturbed, tmp_path):
     """A run whose first block was heard of on another machine, and how to say when."""
     shutil.copytree(undisturbed, tmp_path / "run")
 
@@ -91,7 +91,7 @@ def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
         assert read_state(folder / "blocks" / "000").status == status
 
 
-def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):  # noqa: F811
+def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):
     monkeypatch.setattr(schedule, "LEAVE_S", 0.2)
     folder = elsewhere(STALE_S - 3)
     run(recipe, data, folder, Compute("cpu"), EVERY)

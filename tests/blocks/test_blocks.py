@@ -1,17 +1,15 @@
 """Whole runs with blocks: who works on them, and how they are interrupted, changes nothing."""
 
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from two_blocks import EVERY, STEPS, params, same, stop_after
 
 from surfkit import pipeline
 from surfkit.appearance.exposure import Exposure
@@ -23,54 +21,11 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
 from surfkit.execute import Inline, Pool
 from surfkit.execute.state import read_state
-from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.recipe import Recipe
 from surfkit.run.stage import Intervals
-from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint, streaming
 from surfkit.train.material import CacheSettings
-from surfkit.train.progress import Display
-from surfkit.train.stage import Stage
-
-STEPS = 12
-EVERY = Intervals(checkpoint=4, pictures=0)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Data:
-    folder = tmp_path_factory.mktemp("scene")
-    write_colmap(folder, photograph(Flight(views=16, width=32, height=24, points=200)))
-    return Data(folder)
-
-
-@pytest.fixture(scope="module")
-def recipe() -> Recipe:
-    """Two blocks, half of the points each; colours learn all degrees in pretraining, and none would while tuning."""
-    stage = Stage(steps=STEPS, sh_every=1_000)
-    return Recipe(
-        pretrain=replace(stage, sh_every=STEPS // 3), partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=stage
-    )
-
-
-@pytest.fixture(scope="module")
-def undisturbed(data, recipe, tmp_path_factory):
-    out = tmp_path_factory.mktemp("undisturbed") / "run"
-    run(recipe, data, out, Compute("cpu"), EVERY)
-    return out
-
-
-def params(out: Path) -> dict[str, torch.Tensor]:
-    """Raw parameters of the merged model."""
-    return checkpoint.load_last(out / "tune" / "checkpoint.safetensors")[0].points.params
-
-
-def same(a: Path, b: Path) -> bool:
-    one, other = params(a), params(b)
-    cloud = (a / "point_cloud.ply").read_bytes() == (b / "point_cloud.ply").read_bytes()
-    return cloud and all(torch.equal(value, other[name]) for name, value in one.items())
 
 
 def test_what_a_run_leaves(undisturbed, data, recipe):
@@ -135,23 +90,6 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
         load_run(tmp_path)
     run(recipe, data, tmp_path, Compute("cpu", Pool(workers=1)), EVERY)
     assert same(tmp_path, undisturbed)
-
-
-def stop_after(optimise, step):
-    """An `optimise` during which SIGINT comes after a step."""
-
-    class Interrupting(Display):
-        def show(self, done):
-            super().show(done)
-            if done.index == step:
-                os.kill(os.getpid(), signal.SIGINT)
-
-    def stopping(job, state):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("surfkit.run.stage.Display", Interrupting)
-            return optimise(job, state)
-
-    return stopping
 
 
 def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_path, capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from needs import needs
-from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same, stop_after
 
 from surfkit.blocks import schedule, worker
 from surfkit.blocks.schedule import Compute, Unfinished
@@ -119,9 +119,10 @@ def test_the_kind_of_failure_that_an_error_means():
 
 def test_the_driver_is_killed(cluster, tmp_path):
     """Ray kills the agents of a driver that is gone; what works for them notices, and saves."""
-    here, folder = str(Path(__file__).parent), str(tmp_path)
+    tests, folder = str(Path(__file__).parents[1]), str(tmp_path)
     code = (
-        f"import sys; sys.path.insert(0, {here!r})\nfrom pathlib import Path\nfrom test_ray import SAVING, job\n"
+        f"import sys; sys.path[:0] = {[tests]}\nfrom pathlib import Path\n"
+        "from execute.test_ray import SAVING, job\n"
         "from surfkit.execute import Ray\n"
         f"list(Ray(address={cluster.address!r}, cpus=1, memory_gb=0.1).run([job(Path({folder!r}), 0, SAVING)]))"
     )
@@ -133,7 +134,7 @@ def test_the_driver_is_killed(cluster, tmp_path):
     wait_for(lambda: not psutil.pid_exists(int((tmp_path / "000" / "began").read_text())))
 
 
-def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):  # noqa: F811
+def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):
     """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
     train_block, command = schedule.train_block, schedule.job_of
 
@@ -163,7 +164,7 @@ def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, r
     assert same(tmp_path, undisturbed)
 
 
-def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):
     """It is killed while a block is between two steps, which is saved there, and finished on the other node."""
     node = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"], memory=SMALL["memory"])
     agent = node.all_processes["raylet"][0].process.pid
