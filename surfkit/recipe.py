@@ -67,9 +67,9 @@ class Recipe:
     """Optimisation of each block, where the scene is cut."""
 
     context: Context = "densified"
-    """Points around a block that its views show: densified like its own; tuned, but neither cloned nor split; or
-    frozen, drawn as they are in the coarse model. None of them is merged. Whose a point is, its position tells at each
-    edit."""
+    """What happens to the points outside a block that its views show: they are densified like its own, tuned but
+    neither cloned nor split, or frozen as they are in the coarse model. In no case are they merged: only points whose
+    position is in the block are its own."""
 
     refine: tuple[Annotated[Refine, choice(Refine)], ...] = ()
     """What the whole model goes through when it is trained, and its blocks merged if there are any; refine.0:NAME adds
@@ -85,7 +85,7 @@ class Recipe:
     """How levels of detail are made of the model, for cameras that see it from afar; none makes none."""
 
     seed: int = 0
-    """Of every random draw."""
+    """Random seed."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**63:

@@ -75,9 +75,9 @@ def _refuse_nan(settings: T, at: str = "") -> T:
     """The settings, or BadInput if one at any depth is nan, which passes most checks, or has no place in 64 bits."""
     inner: Iterable[tuple[Any, Any]] = ()
     if isinstance(settings, float) and math.isnan(settings):
-        raise BadInput(f"{at.removeprefix('recipe.')} is nan, which is no number")
+        raise BadInput(f"{at.removeprefix('recipe.')} is nan; give a number")
     if isinstance(settings, int) and abs(settings) >= 2**63:
-        raise BadInput(f"{at.removeprefix('recipe.')} is {settings}; whole numbers lie within 9.2e18 of 0")
+        raise BadInput(f"{at.removeprefix('recipe.')} is {settings}; give a whole number between -9.2e18 and 9.2e18")
     if is_dataclass(settings):
         inner = ((field.name, getattr(settings, field.name)) for field in fields(settings))
     elif isinstance(settings, dict):

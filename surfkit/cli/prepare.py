@@ -38,9 +38,9 @@ OVERVIEW_VIEWS = 4
 class Depth:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
-    An interrupted command continues when it is given again. Methods: `estimator:plane-sweep` and
-    `estimator:patch-match` (multi-view stereo, no network weights), and `estimator:depth-anything-v2` (a network, one
-    photograph at a time).
+    An interrupted command continues when it is given again. Two methods are multi-view stereo and need no network
+    weights: `estimator:plane-sweep` and `estimator:patch-match`. The network `estimator:depth-anything-v2` looks at one
+    photograph at a time.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -56,7 +56,8 @@ class Depth:
     """How the data set is read."""
 
     device: Device = "auto"
-    """Device for the estimate."""
+    """Device for the estimate: auto, cpu, cuda, or that of a rasterizer, by its name (`surfkit components
+    rasterizer`)."""
 
     def run(self) -> None:
         """Estimate, and print the results."""

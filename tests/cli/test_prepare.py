@@ -112,7 +112,7 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["prepare", "deph"], "nothing named 'deph' to prepare"),
+        (["prepare", "deph"], "prepare has no 'deph'"),
         (["prepare", "depth", "nowhere"], "nowhere: no such folder"),
         (["prepare", "depth", "d", "estimator:plan-sweep"], "did you mean 'plane-sweep'?"),
         (["prepare", "depth", "d", "--estimator.window", "4"], "window is 4; it must be an odd number"),
