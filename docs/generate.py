@@ -8,6 +8,7 @@ A test holds them to it, so run this after a change of a setting, a default, a h
 from __future__ import annotations
 
 import ast
+import builtins
 import contextlib
 import importlib
 import inspect
@@ -26,8 +27,10 @@ ROOT = HERE.parent
 REGENERATE = "Written by `python docs/generate.py`."
 KINDS_INTRODUCTION = (
     "A part is a frozen dataclass that extends the base class of its kind. [Write a plugin](plugins.md) makes one,",
-    "step by step, and [Components](components.md) lists those that there are. What must be written comes first.",
-    "Arguments, shapes and units are in the docstrings of the base classes.",
+    "step by step, and [Components](components.md) lists those that there are. Each base class is shown with all that",
+    "a part inherits: what is marked `@abstractmethod` must be written, the other methods may be replaced, and class",
+    "variables and settings may have other values. [Conventions](conventions.md) has the letters of shapes, the frames",
+    "and the units.",
 )
 INTRODUCTION = (
     "`surfkit COMMAND --help` shows the same, and the options of the parts that are chosen with `FIELD:NAME`;",
@@ -36,6 +39,8 @@ INTRODUCTION = (
 )
 BOX, GAP, LEFT, WIDTH = 44, 12, 90, 900
 """Sizes in the picture of the floors, pixels."""
+WIDE = 96
+"""Columns of Python code, so that it fits the pages."""
 
 
 def main() -> None:
@@ -75,7 +80,7 @@ def kinds() -> str:
     for base in sorted(bases, key=lambda base: base.__name__):
         about, _, _ = inspect.cleandoc(base.__doc__ or "").partition("\nAttributes:\n")
         lines += ["", f"## {kebab(base.__name__)}", "", about.strip(), "", _home(base), ""]
-        lines += [f"- {line}" for line in _contract(base)]
+        lines += _contract(base)
     return "\n".join(lines) + "\n"
 
 
@@ -92,37 +97,106 @@ def _home(base: type) -> str:
 
 
 def _contract(base: type) -> Iterator[str]:
-    """What a part of a kind must have, may replace and may set, each with the first sentence about it."""
-    lines: dict[str, list[str]] = {"write": [], "may replace": [], "may set": []}
-    for cls in reversed([cls for cls in base.__mro__ if cls.__module__.startswith("surfkit.")]):
-        for name, found in vars(cls).items():
-            function = found.fget if isinstance(found, property) else found
-            if inspect.isfunction(function) and (name == "__call__" or not name.startswith("_")):
-                names = ", ".join(list(inspect.signature(function).parameters)[1:])
-                shown = f"`{name}`" if isinstance(found, property) else f"`{name}({names})`"
-                what = "write" if name in base.__abstractmethods__ else "may replace"
-                lines[what].append(f"{shown}: {_sentence(function.__doc__)}")
-        lines["may set"] += [f"`{name}`{text and ': '}{text}" for name, text in _class_variables(cls)]
-    for what, texts in lines.items():
-        yield from (f"{what} {text}" for text in texts)
+    """A base class as Python: what a part inherits, the abstract methods before those that it may replace."""
+    values: dict[str, list[str]] = {}
+    methods: dict[str, list[str]] = {}
+    imports: dict[str, set[str]] = {"surfkit": {"Component"}}
+    for cls, node, text in _members(base):
+        if isinstance(node, ast.AnnAssign):
+            values[node.target.id] = ["    " + ast.unparse(node).replace("'", '"'), *_docstring(text, 4)]
+            _import(imports, cls, [node.annotation])
+        else:
+            methods[node.name] = [*_signature(node), *_docstring(text, 8)]
+            _import(imports, cls, [*(each.annotation for each in node.args.args), node.returns])
+    yield "```python"
+    for module, names in sorted(imports.items()):
+        if used := ", ".join(sorted(names - {base.__name__})):
+            yield f"from {module} import {used}" if module else f"import {used}"
+    yield from ("", "", f"class {base.__name__}(Component):")
+    before: list[str] = []
+    for lines in (
+        *values.values(),
+        *(methods[n] for n in sorted(methods, key=lambda n: n not in base.__abstractmethods__)),
+    ):
+        yield from ([""] if len(before) > 1 or (before and len(lines) > 1) else []) + lines
+        before = lines
+    yield "```"
 
 
-def _class_variables(cls: type) -> Iterator[tuple[str, str]]:
-    """Class variables that a class declares, with their values, and what it says of each."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+def _members(base: type) -> Iterator[tuple[type, ast.AnnAssign | ast.FunctionDef, str | None]]:
+    """Public variables and methods of a base class and its own bases: the class, the source and the docstring."""
+    from surfkit.core.registry import Component
+
+    for cls in reversed(base.__mro__):
+        if not issubclass(cls, Component) or cls is Component:
+            continue
+        body, told = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body, _attributes(cls)
+        for node, after in zip(body, [*body[1:], None], strict=True):
+            if isinstance(node, ast.AnnAssign) and not node.target.id.startswith("_"):
+                yield cls, node, after.value.value if isinstance(after, ast.Expr) else told.get(node.target.id)
+            elif isinstance(node, ast.FunctionDef) and (node.name == "__call__" or not node.name.startswith("_")):
+                yield cls, node, ast.get_docstring(node)
+
+
+def _signature(node: ast.FunctionDef) -> Iterator[str]:
+    """A method's first lines, in lines of WIDE columns."""
+    yield from (f"    @{ast.unparse(each)}" for each in node.decorator_list)
+    returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
+    line = f"    def {node.name}({ast.unparse(node.args)}){returns}:"
+    if len(line) <= WIDE:
+        yield line
+        return
+    given = [ast.unparse(each) for each in node.args.args]
+    defaults = [f" = {ast.unparse(each)}" for each in node.args.defaults]
+    defaults = [""] * (len(given) - len(defaults)) + defaults
+    yield f"    def {node.name}("
+    yield from (f"        {name}{default}," for name, default in zip(given, defaults, strict=True))
+    yield f"    ){returns}:"
+
+
+def _docstring(text: str | None, indent: int) -> list[str]:
+    """A docstring in lines of WIDE columns: paragraphs and the entries of lists are filled anew."""
+    if not text:
+        return []
+    groups: list[str] = []
+    for line in inspect.cleandoc(text).splitlines():
+        entry = re.match(r" +(- |\w[\w, ]*: )|\w+:$", line)
+        if not groups or not line or not groups[-1] or entry or re.fullmatch(r"\w+:", groups[-1]):
+            groups.append(line)
+        else:
+            groups[-1] += " " + line.strip()
+    lines: list[str] = []
+    for group in groups:
+        own = len(group) - len(group.lstrip())
+        more = " " * (indent + own + (4 if own else 0))
+        lines += textwrap.wrap(group.strip(), WIDE, initial_indent=" " * (indent + own), subsequent_indent=more) or [""]
+    lines[0] = f'{" " * indent}"""{lines[0].lstrip()}'
+    return [*lines, " " * indent + '"""'] if len(lines) > 1 else [lines[0] + '"""']
+
+
+def _import(imports: dict[str, set[str]], cls: type, hints: list[ast.expr | None]) -> None:
+    """Add from where the names in type hints of a class are imported, from surfkit itself if it has them."""
+    import surfkit
+
+    for hint in hints:
+        for name in {node.id for node in ast.walk(hint) if isinstance(node, ast.Name)} if hint else ():
+            found = getattr(importlib.import_module(cls.__module__), name, getattr(builtins, name, None))
+            home = getattr(found, "__module__", None)
+            if name in surfkit.__all__:
+                home = "surfkit"
+            elif inspect.ismodule(found):
+                home = ""
+            elif home is None or getattr(importlib.import_module(home), name, None) is not found:
+                home = cls.__module__  # a name for another type
+            if home != "builtins":
+                imports.setdefault(home, set()).add(name)
+
+
+def _attributes(cls: type) -> dict[str, str]:
+    """What the docstring of a class says of its attributes."""
     _, _, listed = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
-    told = {found[1]: _sentence(found[2]) for found in re.finditer(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", listed, re.M)}
-    for field, text in zip(tree.body, [*tree.body[1:], None], strict=True):
-        if isinstance(field, ast.AnnAssign) and "ClassVar" in ast.unparse(field.annotation):
-            name, value = field.target.id, f" = {ast.unparse(field.value)}" if field.value else ""
-            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                told[name] = _sentence(str(text.value.value))
-            yield f"{name}{value}", told.get(name, "")
-
-
-def _sentence(text: str | None) -> str:
-    """The first paragraph of a docstring in one line."""
-    return " ".join((text or "").strip().split("\n\n")[0].split())
+    found = re.finditer(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", listed, re.M)
+    return {each[1]: " ".join(each[2].split()) for each in found}
 
 
 def commands() -> str:

@@ -67,9 +67,9 @@ class Recipe:
     """Optimisation of each block, where the scene is cut."""
 
     context: Context = "densified"
-    """Points around a block that its views show: densified like its own; tuned, but neither cloned nor split; or
-    frozen, drawn as they are in the coarse model. None of them is merged. Whose a point is, its position tells at each
-    edit."""
+    """What happens to the points outside a block that its views show: they are densified like its own, tuned but
+    neither cloned nor split, or frozen as they are in the coarse model. In no case are they merged: only points whose
+    position is in the block are its own."""
 
     refine: tuple[Annotated[Refine, choice(Refine)], ...] = ()
     """What the whole model goes through when it is trained, and its blocks merged if there are any; refine.0:NAME adds
@@ -85,7 +85,7 @@ class Recipe:
     """How levels of detail are made of the model, for cameras that see it from afar; none makes none."""
 
     seed: int = 0
-    """Of every random draw."""
+    """Random seed."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**63:
@@ -122,17 +122,7 @@ class Recipe:
             except BadInput as error:
                 raise BadInput(f"lod: {error}") from error
         for path, stage, primitive in self.stages():
-            columns = primitive.columns()
-            lacking = [name for name in stage.rates if name not in columns]
-            if unknown := [name for name in lacking if name not in RATES]:
-                raise BadInput(
-                    f"{path}.rates.{unknown[0]}: primitive {name_of(primitive)} has no such column; it has "
-                    f"{', '.join(columns)}"
-                )
-            if lacking:
-                emit(Warned(f"{path}.rates: {', '.join(lacking)} not used, as primitive {name_of(primitive)} has none"))
-            if stage.appearance is not None:
-                stage.appearance.refuse_unfit(primitive)
+            _refuse_unfit_stage(path, stage, primitive)
 
     @property
     def has_stages(self) -> bool:
@@ -149,6 +139,24 @@ class Recipe:
         """Names of the fields that the method does not use."""
         used = {"about", "method", "seed", *self.method.uses, *["depth"] * self.method.needs_prior}
         return tuple(each.name for each in fields(self) if each.name not in used)
+
+
+def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
+    columns = primitive.columns()
+    lacking = [name for name in stage.rates if name not in columns]
+    if unknown := [name for name in lacking if name not in RATES]:
+        raise BadInput(
+            f"{path}.rates.{unknown[0]}: primitive {name_of(primitive)} has no such column; it has {', '.join(columns)}"
+        )
+    if lacking:
+        emit(Warned(f"{path}.rates: {', '.join(lacking)} not used, as primitive {name_of(primitive)} has none"))
+    if stage.signal.absolute and not primitive.has_absolute_gradients:
+        raise BadInput(
+            f"{path}.signal: {name_of(stage.signal)} wants absolute pixel gradients, and primitive "
+            f"{name_of(primitive)} draws itself without them; choose {path}.signal:loss-gradient, or another primitive"
+        )
+    if stage.appearance is not None:
+        stage.appearance.refuse_unfit(primitive)
 
 
 def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:

@@ -47,7 +47,11 @@ def test_the_suite_is_collected(collected, case):
     text, status = collected[case]
     assert status == 0, text[-3000:]
     assert "tests/core/test_check.py: " in text
-    for file, package in {"test_fuzz.py": "hypothesis", "test_ray.py": "ray", "mesh/test_tsdf.py": "trimesh"}.items():
+    for file, package in {
+        "test_fuzz.py": "hypothesis",
+        "execute/test_ray.py": "ray",
+        "mesh/test_tsdf.py": "trimesh",
+    }.items():
         assert (f"tests/{file}: " in text) == (package not in case.partition(":")[2].split(",")), file
 
 

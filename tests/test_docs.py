@@ -1,5 +1,7 @@
 """What README and docs/ say is true: links, anchors, paths, commands, options, parts, settings. Nothing is run here."""
 
+import ast
+import builtins
 import importlib.util
 import json
 import re
@@ -171,6 +173,21 @@ def test_what_is_generated_is_current(name):
     spec.loader.exec_module(module)
     page = ROOT / "docs" / f"{name}.{'svg' if name == 'floors' else 'md'}"
     assert getattr(module, name)() == page.read_text(), "run `python docs/generate.py`"
+
+
+def test_every_kind_is_shown_as_python_with_all_its_types():
+    page = (ROOT / "docs" / "kinds.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
+    assert len(blocks) == page.count("\n## ") > 15
+    for block in blocks:
+        *imports, shown = ast.parse(block).body
+        known = {alias.name for line in imports for alias in line.names} | {shown.name, *vars(builtins)}
+        methods = [node for node in shown.body if isinstance(node, ast.FunctionDef)]
+        assert methods and all(node.returns and ast.get_docstring(node) for node in methods), shown.name
+        for node in methods:
+            hints = [each.annotation for each in node.args.args[1:]] + [node.returns]
+            used = {each.id for hint in hints for each in ast.walk(hint) if isinstance(each, ast.Name)}
+            assert used <= known, f"{shown.name}.{node.name}: nothing says where {used - known} come from"
 
 
 def test_every_folder_is_explained():

@@ -25,7 +25,7 @@ from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import complete
-from surfkit.run import stage as optimise
+from surfkit.run import stage
 from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import CacheSettings
@@ -185,13 +185,13 @@ def test_a_file_in_the_place_of_the_folder_is_refused(data, recipe, tmp_path):
 def test_an_interrupted_run_goes_on_to_the_same_points(
     finished, data, recipe, tmp_path, monkeypatch, capsys, number, at
 ):
-    class Interrupting(optimise.Display):
+    class Interrupting(stage.Display):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise, "Display", Interrupting)
+        patch.setattr(stage, "Display", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path)
     assert f"stopped after step {at} of 60; the same command goes on" in capsys.readouterr().err
@@ -206,7 +206,7 @@ def test_an_interrupted_run_goes_on_to_the_same_points(
 
 def test_checkpoints_are_written_every_so_often(data, recipe, tmp_path, monkeypatch):
     written = []
-    monkeypatch.setattr(optimise.checkpoint, "save", lambda path, state: written.append(state.index))
+    monkeypatch.setattr(stage.checkpoint, "save", lambda path, state: written.append(state.index))
     run(with_steps(recipe, 10), data, tmp_path, intervals=Intervals(4))
     assert written == [4, 8, 10]
 

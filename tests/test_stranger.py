@@ -20,7 +20,7 @@ from surfkit.densify.base import Densify, Prune
 from surfkit.export.ply import read_splats
 from surfkit.losses.base import Loss
 from surfkit.mesh.base import Mesher
-from surfkit.run import stage as optimise
+from surfkit.run import stage
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -124,13 +124,13 @@ def test_a_run_of_all_of_them(finished):
 def test_an_interrupted_run_comes_to_the_same(train, finished, tmp_path, monkeypatch):
     """Stopped after three steps, between two edits: what the densifier has summed up is kept."""
 
-    class Interrupting(optimise.Display):
+    class Interrupting(stage.Display):
         def show(self, done):
             if done.index == 3:
                 os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise, "Display", Interrupting)
+        patch.setattr(stage, "Display", Interrupting)
         train(tmp_path / "run", *WORDS.values(), status=130)
     assert state_of(tmp_path / "run").index == 3
     resumed, whole = state_of(train(tmp_path / "run", *WORDS.values())), state_of(finished)

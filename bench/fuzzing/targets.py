@@ -41,21 +41,21 @@ class Target:
 def run_folder(here: Path, words: str = TRAIN, stop: str | None = None) -> None:
     """A run that is finished, or stopped after the first step of a stage, such as "pretrain" or "block 1"."""
     from surfkit.cli import main
-    from surfkit.run import stage as optimise
+    from surfkit.run import stage
 
     colmap(here)
-    display = optimise.Display
+    display = stage.Display
 
     class Stopping(display):
         def show(self, done: Any) -> None:
             if self.stage == stop:
                 os.kill(os.getpid(), signal.SIGTERM)
 
-    optimise.Display = Stopping
+    stage.Display = Stopping
     try:
         status = main(words.replace("--steps 2", "--steps 2 --checkpoint-every 1").format(here=here).split())
     finally:
-        optimise.Display = display
+        stage.Display = display
     assert status == (130 if stop else 0), status
 
 

@@ -25,8 +25,7 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
-from surfkit.execute import base as executor
-from surfkit.execute.base import Executor, Inline, JobResult
+from surfkit.execute.base import LOG, Executor, Inline, Job, JobResult
 from surfkit.execute.remote import POLL_S
 from surfkit.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.partition.picture import plan_picture
@@ -308,11 +307,11 @@ def record_failure(block: Block, result: JobResult) -> str:
         return "is worked on by another process"
     if block.state.status != "failed":
         block.write(status="failed", kind=kind, error=f"exit status {status}")
-        return f"ended with status {status}; see {block.folder / executor.LOG}"
+        return f"ended with status {status}; see {block.folder / LOG}"
     return f"failed: {block.state.error}"
 
 
-def job_of(ctx: RunContext, block: Block, compute: Compute) -> executor.Job:
+def job_of(ctx: RunContext, block: Block, compute: Compute) -> Job:
     """The job that trains one block."""
     elsewhere = compute.workers.at_once is None
     share = ctx.caches.bytes() // (compute.workers.at_once or 1)
@@ -326,7 +325,7 @@ def job_of(ctx: RunContext, block: Block, compute: Compute) -> executor.Job:
     views = [view for view in ctx.scene.train if view.name in names]
     photos = 3 * sum(view.camera.width * view.camera.height for view in views)
     cached = photos if elsewhere and ctx.caches.cache == "auto" else min(share, photos)
-    return executor.Job(
+    return Job(
         index=block.index,
         folder=block.folder,
         call=lambda: train_block(ctx, block),

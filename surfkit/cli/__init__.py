@@ -161,7 +161,7 @@ def _dispatch(words: list[str]) -> int:
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
             if rest and rest[0] not in ("-h", "--help", "help"):
-                raise BadInput(f"nothing named {rest[0]!r} to {name}; usage: {wanted}")
+                raise BadInput(f"{name} has no {rest[0]!r}; usage: {wanted}")
             print(f"{COMMANDS[name]}\n\nusage: {wanted}\n\n`surfkit {name} {next(iter(command))} --help` tells more.")
             return 0
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]

@@ -60,7 +60,8 @@ class Ablate:
     """Folder of the results. Default: runs/DATA-ablate-TABLE."""
 
     device: Device = "auto"
-    """Device for training and rendering."""
+    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     def run(self) -> int:
         """Run the table and show it; 1 if a row failed."""

@@ -19,7 +19,7 @@ Kinds = dict[str, dict[str, type[Component]]]
 class Components:
     """List the components that recipes are made of, by kind."""
 
-    kind: Annotated[str | None, tyro.conf.Positional] = None
+    kind: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="KIND")] = None
     """Show only this kind, such as "densify". Default: all kinds."""
 
     markdown: bool = False

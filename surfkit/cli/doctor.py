@@ -73,7 +73,8 @@ class Doctor:
     """Folder of the run folders: free disk space is checked there."""
 
     device: Device = "auto"
-    """Device for training and rendering."""
+    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "recipe", settled(self.recipe))

@@ -83,7 +83,8 @@ class Evaluate:
     backbones to torch's cache (760 MB), a folder, or `none`. metrics.json says what was not measured and why."""
 
     device: Device = "auto"
-    """Device for rendering."""
+    """Device for rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     def run(self) -> None:
         """Measure, and print the results."""
@@ -98,7 +99,7 @@ class Evaluate:
                     raise BadInput("--lod is for photographs, and --gt for geometry: leave out one of the two")
                 return self._geometry(self.gt, zones)
             if (self.views, self.out, self.geometry) != (None, None, Comparison()):
-                raise BadInput("--views, --out and the options of the comparison are for geometry: give --gt, too")
+                raise BadInput("--views, --out and the options of the comparison have no effect without --gt; add --gt")
             if self.target.is_file():
                 raise BadInput(f"{self.target}: a file; to measure its geometry, name the truth with --gt")
             refuse_no_run(self.target)
@@ -127,7 +128,9 @@ class Evaluate:
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):
-            raise BadInput("--lpips-weights and --device are for photographs: leave them out, or --gt")
+            raise BadInput(
+                "--lpips-weights has no effect with --gt, and --device only with --seen or --seams; leave them out"
+            )
         run = opened(self.target) if self.target.is_dir() else None
         if run is None and zones != Zones():
             raise BadInput(f"{self.target}: a file; --seen and --seams need the run, its photographs and its blocks")

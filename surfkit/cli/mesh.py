@@ -69,7 +69,8 @@ class MeshOf:
     """Metres per unit of the data set's coordinates, if the data set does not state it. Settings in metres need it."""
 
     device: Device = "auto"
-    """Device for rendering."""
+    """Device for rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     prepare: bool = True
     """Estimate the depth maps that the mesher needs, with the settings of the run's recipe, if there are none. They are

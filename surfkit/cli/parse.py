@@ -24,6 +24,7 @@ from tyro._errors import (
 )
 
 from surfkit.cli.flags import explain_flag, flags
+from surfkit.cli.help_text import one_paragraph_each
 from surfkit.cli.recipes import ARGV
 from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
 from surfkit.core.check import BadInput
@@ -64,7 +65,8 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
     try:
         with on_parse_error(refuse):
-            return _refuse_nan(tyro.cli(command, prog=prog, args=choices_first(command, argv), config=_CONFIG))
+            words, rules = choices_first(command, argv), one_paragraph_each()
+            return _refuse_nan(tyro.cli(command, prog=prog, args=words, config=_CONFIG, registry=rules))
     finally:
         ARGV.reset(token)
 
@@ -73,9 +75,9 @@ def _refuse_nan(settings: T, at: str = "") -> T:
     """The settings, or BadInput if one at any depth is nan, which passes most checks, or has no place in 64 bits."""
     inner: Iterable[tuple[Any, Any]] = ()
     if isinstance(settings, float) and math.isnan(settings):
-        raise BadInput(f"{at.removeprefix('recipe.')} is nan, which is no number")
+        raise BadInput(f"{at.removeprefix('recipe.')} is nan; give a number")
     if isinstance(settings, int) and abs(settings) >= 2**63:
-        raise BadInput(f"{at.removeprefix('recipe.')} is {settings}; whole numbers lie within 9.2e18 of 0")
+        raise BadInput(f"{at.removeprefix('recipe.')} is {settings}; give a whole number between -9.2e18 and 9.2e18")
     if is_dataclass(settings):
         inner = ((field.name, getattr(settings, field.name)) for field in fields(settings))
     elif isinstance(settings, dict):

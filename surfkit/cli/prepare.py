@@ -20,9 +20,9 @@ from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.plane_sweep import PlaneSweep
-from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared
 from surfkit.evaluate.images.pictures import colour_depth, write_picture
-from surfkit.raster.select import Device
+from surfkit.raster.select import Device, torch_device
 from surfkit.readers.data import Reading
 from surfkit.readers.depth_files import FOLDER, RECORD, DepthFile, map_path
 from surfkit.readers.depth_prior import trust_warning
@@ -38,9 +38,9 @@ OVERVIEW_VIEWS = 4
 class Depth:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
-    An interrupted command continues when it is given again. Methods: `estimator:plane-sweep` and
-    `estimator:patch-match` (multi-view stereo, no network weights), and `estimator:depth-anything-v2` (a network, one
-    photograph at a time).
+    An interrupted command continues when it is given again. Two methods are multi-view stereo and need no network
+    weights: `estimator:plane-sweep` and `estimator:patch-match`. The network `estimator:depth-anything-v2` looks at one
+    photograph at a time.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -56,7 +56,8 @@ class Depth:
     """How the data set is read."""
 
     device: Device = "auto"
-    """Device for the estimate."""
+    """Device for the estimate: auto, cpu, cuda, or that of a rasterizer, by its name (`surfkit components
+    rasterizer`)."""
 
     def run(self) -> None:
         """Estimate, and print the results."""

@@ -67,7 +67,8 @@ class Train:
     """How the data set is read."""
 
     device: Device = "auto"
-    """Device for training and rendering."""
+    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     executor: Annotated[Executor, choice(Executor)] = Inline()
     """Where the blocks are trained, if the recipe divides the scene into blocks: `executor:pool` trains several at the

@@ -28,7 +28,7 @@ from surfkit.train.material import CacheSettings
 class Tune:
     """Train one block of a run to its end, from its last checkpoint.
 
-    `surfkit train` does this for all blocks. Use this command to divide the blocks between machines that share the run
+    For all blocks, `surfkit train` does this. Use this command to divide the blocks between machines that share the run
     folder; then give the `surfkit train` command again to merge the blocks.
     """
 
@@ -39,7 +39,8 @@ class Tune:
     """Number of the block, counted from 0."""
 
     device: Device = "auto"
-    """Device for training and rendering."""
+    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    (`surfkit components rasterizer`)."""
 
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB; auto is half of the free memory."""

@@ -141,10 +141,10 @@ class LearningRate:
     """A learning rate."""
 
     start: float
-    """At the first step."""
+    """Learning rate at the first step."""
 
     end: float | None = None
-    """At the last step, reached along a straight line in the logarithm; constant if unset."""
+    """Learning rate at the last step, reached along a straight line in the logarithm; constant if unset."""
 
     def __post_init__(self) -> None:
         if self.start < 0 or (self.end is not None and (self.end <= 0 or self.start == 0)):

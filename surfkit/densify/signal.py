@@ -13,8 +13,8 @@ from surfkit.densify.base import Signal
 
 @dataclass(frozen=True)
 class LossGradient(Signal):
-    """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised to the size of the total
-    (CityGaussianV2, eq. gradient)."""
+    """Decomposed-gradient densification: the screen-space gradient of chosen losses, raised to the size of the
+    total (CityGaussianV2, eq. gradient)."""
 
     terms: tuple[str, ...] | None = None
     """Losses, by name, that drive densification; all of them if unset."""

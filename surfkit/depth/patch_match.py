@@ -57,8 +57,8 @@ class PatchMatch(DepthEstimator):
     """PatchMatch stereo (Bleyer et al. 2011): each pixel has a slanted plane, improved by the planes of other pixels.
 
     Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency,
-    in the views that match best at each pixel; then also by the reprojection error in the depth maps of other views
-    (Xu and Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit.
+    in the views that match best at each pixel; then also by the reprojection error in the depth maps of other
+    views (Xu and Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit.
     """
 
     aligned: ClassVar[bool] = True

@@ -16,7 +16,6 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import (
     FOLDER,
@@ -165,10 +164,3 @@ class Preparation:
         normal = None if estimate.normal is None else estimate.normal.numpy()
         write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > TRUSTED).float().mean())
-
-
-def torch_device(device: Device) -> torch.device:
-    """Where torch computes; unlike the rasterizer, an estimator runs on any device."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise BadInput("--device cuda: torch finds no CUDA device here; use --device cpu")
-    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")

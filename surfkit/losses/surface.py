@@ -24,7 +24,7 @@ class NormalConsistency(Loss):
     """Loss weight, from `start` on."""
 
     end: float | None = None
-    """Share at the last step, reached along a straight line in the logarithm; constant if unset."""
+    """Loss weight at the last step, reached along a straight line in the logarithm; constant if unset."""
 
     start: Steps = 7_000
     """Steps without this term, as a surface must form first; 0 has it from the first step."""

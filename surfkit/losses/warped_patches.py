@@ -37,8 +37,8 @@ TEXTURE = 0.01
 
 @dataclass(frozen=True)
 class WarpedPatches(TwoViews, Loss):
-    """One minus the normalised cross-correlation of patches and of what a neighbouring photograph shows in their place
-    (PGSR, arXiv 2406.06521).
+    """One minus the normalised cross-correlation of patches and of what a neighbouring photograph shows in their
+    place (PGSR, arXiv 2406.06521).
 
     A patch of the photograph is warped into the neighbour over the plane through its central pixel that the rendered
     depth and normal describe. Exposure does not matter. The loss is the mean of exp(-e) (1 - NCC), where e is the error

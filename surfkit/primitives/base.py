@@ -35,6 +35,10 @@ class Primitive(Component):
     in_ply: ClassVar[bool] = True
     """Whether its splats can be written as PLY files of splats; without them a run has no point_cloud.ply."""
 
+    has_absolute_gradients: ClassVar[bool] = True
+    """Whether its `render` can give absolute pixel gradients, for signals that want them (AbsGS); `AutogradRender`
+    cannot."""
+
     sh_degree: int = 3
     """Highest degree of the spherical harmonics of a colour, 0 to 3; 0 is one colour for all directions."""
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import name_of
+from surfkit.core.registry import kebab
 from surfkit.primitives.base import Primitive
 from surfkit.raster.api import Maps, Rasterizer, Render, Splats
 from surfkit.scene.camera import Camera
@@ -41,15 +42,37 @@ class PrimitiveRasterizer(Rasterizer):
         return self.primitive.opacity_before(splats, camera, self.inner, near, points)
 
 
-def refuse_wrong_maps(primitive: Primitive, maps: Maps, camera: Camera) -> None:
-    """BadInput for maps of another size than the view, which a `render` of the primitive's own may give."""
-    size = (camera.height, camera.width)
-    for name, value in maps.present().items():
+def refuse_wrong_maps(
+    primitive: Primitive, maps: Maps, camera: Camera, read_by: Mapping[str, str] | None = None
+) -> None:
+    """BadInput for maps that a `render` of the primitive's own leaves out, or gives in another size than the view's.
+
+    Args:
+        primitive: What drew.
+        maps: What it drew; colour and alpha are always wanted.
+        camera: Of the view.
+        read_by: By the name of a map that a loss reads, the name of the loss.
+    """
+    size, present, who = (
+        (camera.height, camera.width),
+        maps.present(),
+        f"primitive {kebab(type(primitive).__name__)}: its render",
+    )
+    for name in ("color", "alpha"):
+        if name not in present:
+            raise BadInput(f"{who} gives no {name}, which every view needs; see `surfkit.raster.api.Maps`")
+    for name, loss in (read_by or {}).items():
+        if name not in present:
+            raise BadInput(
+                f"{who} gives no {name}, which loss {loss} reads; leave the loss out with losses.{loss}:none, or let "
+                "the render draw that map"
+            )
+    for name, value in present.items():
         wanted = (3, *size) if name in ("color", "normal") else size
         if value.shape != wanted:
             raise BadInput(
-                f"primitive {name_of(primitive)}: its render gives {name} of shape {tuple(value.shape)} for a view of "
-                f"{wanted}; see `surfkit.raster.api.Maps`"
+                f"{who} gives {name} of shape {tuple(value.shape)} for a view of {wanted}; see "
+                "`surfkit.raster.api.Maps`"
             )
 
 

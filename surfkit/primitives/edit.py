@@ -72,7 +72,7 @@ def withheld(edit: Edit, may: Tensor) -> Edit:
     def kept(value: Tensor | None) -> Tensor | None:
         return None if value is None else value * left.view(-1, *[1] * (value.dim() - 1))
 
-    def else_(value: Tensor | None, neutral: float) -> Tensor | None:
+    def or_neutral(value: Tensor | None, neutral: float) -> Tensor | None:
         return None if value is None else torch.where(left, value, neutral)
 
     return replace(
@@ -80,8 +80,8 @@ def withheld(edit: Edit, may: Tensor) -> Edit:
         clone=kept(edit.clone),
         split=kept(edit.split),
         move=kept(edit.move),
-        opacities=else_(edit.opacities, torch.nan),
-        scale_by=else_(edit.scale_by, 1.0),
+        opacities=or_neutral(edit.opacities, torch.nan),
+        scale_by=or_neutral(edit.scale_by, 1.0),
         forget=kept(edit.forget),
     )
 
@@ -151,8 +151,8 @@ def _adjusted(primitive: Primitive, points: Points, edit: Edit) -> Points:
 def _dimmed(primitive: Primitive, points: Points, most: float) -> Points:
     """Points with opacities of at most `most`, whose optimiser starts anew for what that has changed."""
     opacities = primitive.activate(points.params | points.shared, 0).opacities.detach()
-    limit = torch.where(opacities > most, most, torch.nan).double()
-    params = primitive.with_opacities(points.params, torch.where(limit.isnan(), limit, most))
+    wanted = torch.full_like(opacities, torch.nan, dtype=torch.float64).masked_fill(opacities > most, most)
+    params = primitive.with_opacities(points.params, wanted)
     anew = {name: torch.zeros_like(value) for name, value in params.items() if value is not points.params[name]}
     return replace(
         points,

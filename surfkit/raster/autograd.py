@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.raster.api import STANDARD, Gradients, Maps, Render, Splats
 from surfkit.scene.camera import Camera
 
@@ -32,11 +33,13 @@ def _signal(means: Tensor, gradient: Tensor, camera: Camera) -> Tensor:
 class AutogradRender(Render):
     """A view that a function of the splats draws with torch.
 
-    The densification signal is the gradient by the positions, seen from the camera. The sum of the sizes of the pixels'
-    shares (AbsGS) cannot be had from it: with a signal that asks for them the sum with signs is given.
+    The densification signal is the gradient by the positions, seen from the camera. Absolute pixel gradients (AbsGS)
+    cannot be had from it: a primitive that draws itself so sets `has_absolute_gradients` to False.
     """
 
-    def __init__(self, splats: Splats, camera: Camera, draw: Callable[[Splats], Maps], seen: Tensor, radii: Tensor):
+    def __init__(
+        self, splats: Splats, camera: Camera, draw: Callable[[Splats], Maps], seen: Tensor, radii: Tensor
+    ) -> None:
         """Draw.
 
         Args:
@@ -55,7 +58,16 @@ class AutogradRender(Render):
     def backward(
         self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
     ) -> Gradients:
-        """See `Render.backward`."""
+        """See `Render.backward`.
+
+        Raises:
+            BadInput: Absolute pixel gradients are asked for.
+        """
+        if absolute:
+            raise BadInput(
+                "signal: absolute pixel gradients cannot be had from splats that torch draws (AutogradRender); choose "
+                "signal:loss-gradient"
+            )
         grads = self._pull(total)
         means = self._leaves["means"].detach()
         part = None if chosen is None else _signal(means, self._pull(chosen)["means"], self._camera)[:rows]

@@ -41,7 +41,7 @@ class Reading:
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
     masks: Path | None = None
-    """Folder of the masks, when none of the folders called masks; relative to the data set. Black is ignored."""
+    """Folder of the masks, if it is not called masks; relative to the data set. Black pixels are ignored."""
 
     layout: str | None = None
     """Layout of the data set, such as colmap (`surfkit components reader` lists them); recognised if left out."""
@@ -50,7 +50,7 @@ class Reading:
     """Composite transparent pixels of photographs over white instead of black."""
 
     metres_per_unit: float | None = None
-    """Metres per unit of the data set's coordinates, where it does not say. Settings in metres need it."""
+    """Metres per unit of the data set's coordinates, if the data set does not state it. Settings in metres need it."""
 
     model: Path | None = None
     """Folder of the COLMAP model, such as sparse/1, where there are several; the one with most photographs by

@@ -20,8 +20,8 @@ from surfkit.losses.warped_patches import WarpedPatches
 from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
+from surfkit.recipes import surface
 from surfkit.recipes.surface import STEREO
-from surfkit.recipes.surface import SURFACE as BEST
 from surfkit.report.ablation import Row, Table
 from surfkit.train.stage import Stage
 
@@ -111,11 +111,11 @@ SURFACE = Table(
     replace(COARSE_BASELINE, mesh=TSDF()),
     (
         Row("2DGS, sparse points"),
-        Row("+ stereo depth as a loss", DEPTH | {"depth": BEST.depth}),
-        Row("+ dense start", {"start": BEST.start, "pretrain.densify": BEST.pretrain.densify}),
-        Row("+ stronger depth loss", {"pretrain.losses.depth": BEST.pretrain.losses["depth"]}),
-        Row("+ no normal consistency", {"pretrain.losses": BEST.pretrain.losses}),
-        Row("+ fusion by agreement", {"mesh": BEST.mesh}),
+        Row("+ stereo depth as a loss", DEPTH | {"depth": surface.SURFACE.depth}),
+        Row("+ dense start", {"start": surface.SURFACE.start, "pretrain.densify": surface.SURFACE.pretrain.densify}),
+        Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
+        Row("+ no normal consistency", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
+        Row("+ fusion by agreement", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),

@@ -45,25 +45,27 @@ class MeshOutput:
     """What becomes of the triangles of a mesher."""
 
     formats: tuple[Format, ...] = ("ply",)
-    """Files to write: ply, obj, glb. The last has floats alone and so an offset of its own, in NAME.glb.json."""
+    """Files to write: ply, obj, glb. GLB has 32-bit floats only, so its coordinates are relative to an offset, which is
+    in NAME.glb.json."""
 
     lods: tuple[float, ...] = ()
     """Also write meshes with these shares of the triangles, such as 0.25 0.05: mesh-lod1, mesh-lod2 and so on."""
 
     clusters: int = 50
-    """Drop loose clusters of triangles that are smaller than this many others."""
+    """Keep this many of the largest clusters of connected triangles, and drop the smaller ones."""
 
     least_triangles: int = 50
-    """Drop loose clusters with fewer triangles."""
+    """Also drop clusters of connected triangles with fewer triangles than this."""
 
     hole_edges: int = 0
     """Fill holes of up to this many edges; 0 leaves all open."""
 
     crop_box: tuple[float, float, float, float, float, float] | None = None
-    """Keep what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
+    """Keep only what lies in this box: lowest x y z, then highest x y z, in the frame of the input."""
 
     crop: Path | None = None
-    """Keep what lies in the volume of this crop file, as Tanks and Temples has them, in the frame of the input."""
+    """Keep only what lies in the volume of this crop file, JSON in the format of Tanks and Temples, in the frame of the
+    input."""
 
     def __post_init__(self) -> None:
         for name in ("clusters", "least_triangles"):

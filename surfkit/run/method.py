@@ -22,14 +22,13 @@ from surfkit.core.events import Progress, StepDone, emit, say
 from surfkit.core.files import replacing
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import hookimpl, name_of, plugins
-from surfkit.depth.prepare import torch_device
 from surfkit.mesh.base import Mesh
 from surfkit.method.base import MethodInput, Reconstruction
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Maps, Rasterizer
-from surfkit.raster.select import Device
+from surfkit.raster.select import Device, torch_device
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
 from surfkit.run.context import RunContext

@@ -13,9 +13,9 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
-from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, torch_device
+from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation
 from surfkit.mesh.base import Mesher
-from surfkit.raster.select import Device
+from surfkit.raster.select import Device, torch_device
 from surfkit.readers.depth_files import FOLDER
 from surfkit.readers.depth_prior import prior_files
 from surfkit.readers.fingerprint import Fingerprint, fingerprint

@@ -7,8 +7,11 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput, expect
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.drawing import refuse_wrong_maps
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Splats
+from surfkit.raster.api import Maps, Splats
+from surfkit.raster.select import select
+from surfkit.scene.camera import Camera
 from surfkit.testing.compare import unchanged
 from surfkit.testing.inputs import cloud
 
@@ -16,7 +19,7 @@ from surfkit.testing.inputs import cloud
 def check_primitive(primitive: Primitive, count: int = 50) -> None:
     """A primitive declares the columns that it begins with, its splats have the right shapes, edits change them as
     asked, children are no larger than their parents, splats come back from the table of a file, and the same seed gives
-    the same.
+    the same. A `render` of its own draws maps and has gradients, the absolute ones where it declares them.
 
     Args:
         primitive: To check.
@@ -36,6 +39,8 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
     _check_edits(name, primitive, params)
     _check_split(name, primitive, params, count // 2)
     _check_table(name, primitive, params)
+    if type(primitive).render is not Primitive.render:
+        _check_render(f"{name}.render", primitive, primitive.activate(params, primitive.sh_degree).detached())
 
 
 def _check_columns(name: str, primitive: Primitive, params: Columns, count: int) -> None:
@@ -115,6 +120,30 @@ def _check_table(name: str, primitive: Primitive, params: Columns) -> None:
     for field in ("means", "quats", "scales", "opacities", "sh"):
         close = torch.allclose(getattr(before, field), getattr(after, field), rtol=1e-3, atol=1e-5)
         assert close, f"{name}.from_table does not give back the {field} of its table"
+
+
+def _check_render(name: str, primitive: Primitive, splats: Splats) -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([-0.5, -0.5, 2])
+    camera = Camera(pose, 30.0, 30.0, 16.0, 12.0, 32, 24)
+    with unchanged(name, splats=splats.named()):
+        render = primitive.render(splats, camera, select("cpu")[0], 0.01)
+    try:
+        refuse_wrong_maps(primitive, render.maps, camera)
+    except BadInput as error:
+        raise AssertionError(str(error)) from error
+    for field, value in (("seen", render.seen), ("radii", render.radii)):
+        assert value.shape == (len(splats),), f"{name}: {field} has shape {tuple(value.shape)}, not ({len(splats)},)"
+    cotangent = Maps(color=torch.ones_like(render.maps.color))
+    for key, value in render.backward(cotangent, cotangent).named().items():
+        shape = splats.named()[key].shape
+        assert value.shape == shape, f"{name}: the gradient of {key!r} has shape {tuple(value.shape)}, not {shape}"
+    try:
+        render.backward(cotangent, cotangent, absolute=True)
+    except BadInput as error:
+        assert not primitive.has_absolute_gradients, f"{name}: set has_absolute_gradients to False: {error}"
+    else:
+        assert primitive.has_absolute_gradients, f"{name} gives absolute gradients, and has_absolute_gradients is False"
 
 
 def _check_same(what: str, first: dict[str, Tensor], second: dict[str, Tensor]) -> None:

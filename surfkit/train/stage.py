@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Protocol
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ from surfkit.primitives.edit import Edit, apply, merge, withheld
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
-from surfkit.scene.cache import Cache
+from surfkit.scene.cache import out_of_turn
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
 from surfkit.train.cotangents import added, gradient, pulled
@@ -221,17 +221,16 @@ class Trainer:
         """One optimisation step: render a view, compare it with its photograph, update the points, then edit them."""
         stage, index = self.stage, state.index + 1
         shown, target = self.target(state)
-        active = stage.weights_at(index)
-        reads = {name for loss in active for name in stage.losses[loss].reads}
+        active, reads = stage.weights_at(index), self.maps_read(index)
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.all_params().items()}
         state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
         shape = self.primitive.activate(leaves, state.sh_degree)
         splats = self.drawn(state, shape)
 
         paired = stage.is_paired(index)
-        geometry, distortion = paired or bool(reads & GEOMETRY), "distortion" in reads
+        geometry, distortion = paired or bool(reads.keys() & GEOMETRY), "distortion" in reads
         render = self.draws.render(splats, target.view.camera, stage.near, geometry, distortion)
-        refuse_wrong_maps(self.primitive, render.maps, target.view.camera)
+        refuse_wrong_maps(self.primitive, render.maps, target.view.camera, reads)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
         losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
@@ -260,6 +259,17 @@ class Trainer:
     def draws(self) -> Rasterizer:
         """What draws the splats of the primitive."""
         return drawn_by(self.primitive, self.rasterizer)
+
+    def maps_read(self, index: int) -> dict[str, str]:
+        """By the name of a map that the losses of step `index` read, one of these losses."""
+        names = list(self.stage.weights_at(index))
+        if index == 1 and self.draws is not self.rasterizer:
+            # what a render of the primitive's own lacks for the last steps is told now, not after hours
+            names += [name for at in range(-99, 1) for name in self.stage.weights_at(max(1, self.stage.steps + at))]
+        losses = {name: self.stage.losses[name] for name in names}
+        # the neighbour of a pair is chosen by the median depth
+        pairs = ((*loss.reads, *["median"] * loss.needs_neighbour) for loss in losses.values())
+        return {read: name for name, reads in zip(losses, pairs, strict=True) for read in reads}
 
     @cached_property
     def rates(self) -> dict[str, LearningRate]:
@@ -387,8 +397,3 @@ class Trainer:
 def rates_of(stage: Stage, primitive: Primitive) -> dict[str, LearningRate]:
     """The learning rate of each parameter: the primitive's own, unless the stage has another."""
     return {name: stage.rates.get(name, column.rate) for name, column in primitive.columns().items()}
-
-
-def out_of_turn(known: Pictures | Sequence, at: int) -> Any:
-    """The value of a position, without disturbing what is read ahead."""
-    return known.aside(at) if isinstance(known, Cache) else known[at]

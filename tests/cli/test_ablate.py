@@ -11,7 +11,7 @@ import torch
 from surfkit import pipeline
 from surfkit.cli import main
 from surfkit.recipes.ablations import TABLES
-from surfkit.run import stage as optimise
+from surfkit.run import stage
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
@@ -70,13 +70,13 @@ def test_a_real_table_interrupted_and_continued(scene, monkeypatch, tmp_path, ca
     command = ["ablate", "table:gradient", "--data", str(scene), "--steps", "4", "--rows", "1", "SSIM"]
     stop = ["--out", "stopped"]
 
-    class Interrupting(optimise.Display):
+    class Interrupting(stage.Display):
         def show(self, done):
             if done.index == 2:
                 os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise, "Display", Interrupting)
+        patch.setattr(stage, "Display", Interrupting)
         assert main([*command, *stop]) == 130
     said = capsys.readouterr().err
     assert "stopped after step 2 of 4" in said and "stopped keeps what is finished; give the same command again" in said

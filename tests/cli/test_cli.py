@@ -8,6 +8,7 @@ import subprocess
 import sys
 import types
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -75,6 +76,19 @@ def test_none_and_tuple_positions(world, capsys):
     assert main([*words, "--pretrain.prune.0.every", "3"]) == 0
     out = capsys.readouterr().out
     assert "grow=None" in out and "prune=(Adaptive(every=3" in out
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_texts_of_settings_fill_the_lines(capsys, monkeypatch, width):
+    """The first word of a line never fits on the line before."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main(["train", "recipe:citygs2", "--help"]) == 0
+    lines = capsys.readouterr().out.replace("│", " ").splitlines()
+    lines = [line.strip() if re.match(" {8}\\S", line) else "" for line in lines]
+    pairs = [(line, then) for line, then in pairwise(lines) if line and then]
+    assert len(pairs) > 50
+    ragged = [line for line, then in pairs if len(f"{line} {then.split()[0]}") <= width - 10]
+    assert not ragged
 
 
 def test_help_of_a_command_shows_recipes_and_settings(world, capsys):

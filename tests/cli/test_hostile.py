@@ -168,7 +168,10 @@ def test_links_to_themselves_and_folders_are_one_line(made, capsys, tmp_path):
             r"window is 17, and .* is 12 x 9 .* to 9",
         ),
         ("mesh {m}/run mesh:tetra --mesh.bisections 1000000", "give 0 to 52"),
-        ("mesh {m}/run mesh:tetra --mesh.min-views 100000000000000000000", r"mesh.min_views is 10+; whole numbers lie"),
+        (
+            "mesh {m}/run mesh:tetra --mesh.min-views 100000000000000000000",
+            r"mesh.min_views is 10+; give a whole number",
+        ),
         ("mesh {m}/run --memory 99999999999999999999999TB", "--memory .* at most 1000TB"),
         ("train recipe:2dgs --data {m}/data --steps 1000000000000000", "--steps 1000000000000000: give 1 to 100000000"),
         ("train recipe:2dgs --data {m}/data --pretrain.steps 1000000000000000", "a stage has .* give 1 to 100000000"),

@@ -16,7 +16,7 @@ from surfkit.losses import DepthRegression
 from surfkit.pipeline import run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import map_path
-from surfkit.run import stage as optimise
+from surfkit.run import stage
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 SMALL = ("--test-every", "4", "--estimator.longest", "48")
@@ -50,7 +50,7 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
     recipe = with_steps(evolve(recipes()["2dgs"], "primitive.sh_degree", 0), 60)
     losses = recipe.pretrain.losses | {"depth": DepthRegression()}
     seen = []
-    step = optimise.Trainer.step
+    step = stage.Trainer.step
 
     def watched(self, state):
         done = step(self, state)
@@ -58,7 +58,7 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
         return done
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(optimise.Trainer, "step", watched)
+        patch.setattr(stage.Trainer, "step", watched)
         run(evolve(recipe, "pretrain.losses", losses), Data(farm, test_every=4), tmp_path / "run")
     assert len(seen) == 60 and max(seen) > 0  # as soon as rays get opaque
     assert json.loads((tmp_path / "run/run.json").read_text())["notes"] == []
@@ -112,7 +112,7 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["prepare", "deph"], "nothing named 'deph' to prepare"),
+        (["prepare", "deph"], "prepare has no 'deph'"),
         (["prepare", "depth", "nowhere"], "nowhere: no such folder"),
         (["prepare", "depth", "d", "estimator:plan-sweep"], "did you mean 'plane-sweep'?"),
         (["prepare", "depth", "d", "--estimator.window", "4"], "window is 4; it must be an odd number"),

@@ -9,7 +9,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry import repetition as measurement
+from surfkit.evaluate.geometry import repetition
 from surfkit.evaluate.geometry.comparison import Comparison, compare
 from surfkit.evaluate.geometry.errors import error_colors
 from surfkit.evaluate.geometry.measure import measure_geometry
@@ -131,7 +131,7 @@ def test_a_given_transform_and_crop(tmp_path):
 
 
 def test_a_large_cloud_is_thinned_while_it_is_read(monkeypatch):
-    monkeypatch.setattr(measurement, "MOST", 1_000)
+    monkeypatch.setattr(repetition, "MOST", 1_000)
     found = cloud_side(surface(lattice(side=200)), None)
     assert 300 < len(found.cloud) < 3_000 and found.voxel > 0.3
     assert len(cloud_side(surface(lattice(side=20)), None).cloud) == 400

@@ -9,8 +9,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.mesh.delaunay import crossing, split
 from surfkit.mesh.tetra import Tetra, triangles, used
-from surfkit.testing.inputs import BALL_RADIUS as RADIUS
-from surfkit.testing.inputs import mesh_input as ball
+from surfkit.testing.inputs import BALL_RADIUS, mesh_input
 
 
 def edges_of(faces):
@@ -31,19 +30,19 @@ def volume(vertices, faces) -> float:
 
 @pytest.mark.parametrize("kind", ["surfel", "gaussian"])
 def test_a_ball_becomes_a_closed_ball(kind):
-    mesh = Tetra(longest=0, agree=0).mesh(ball(kind))
+    mesh = Tetra(longest=0, agree=0).mesh(mesh_input(kind))
     assert is_closed(mesh.faces)
     assert len(mesh.vertices) - len(edges_of(mesh.faces)) // 2 + len(mesh.faces) == 2
     radius = np.linalg.norm(mesh.vertices, axis=1)
-    assert np.abs(radius - RADIUS).max() < 0.02 and np.abs(radius - RADIUS).mean() < 0.005
-    assert volume(mesh.vertices, mesh.faces) == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+    assert np.abs(radius - BALL_RADIUS).max() < 0.02 and np.abs(radius - BALL_RADIUS).mean() < 0.005
+    assert volume(mesh.vertices, mesh.faces) == pytest.approx(4 / 3 * np.pi * BALL_RADIUS**3, rel=0.05)
     assert (np.abs(mesh.colors.astype(int) - [255, 0, 0]).max(1) < 70).mean() > 0.9
 
 
 def test_more_bisections_come_closer():
-    given = ball(views=30)
+    given = mesh_input(views=30)
     error = [
-        np.abs(np.linalg.norm(Tetra(longest=0, bisections=n).mesh(given).vertices, axis=1) - RADIUS).mean()
+        np.abs(np.linalg.norm(Tetra(longest=0, bisections=n).mesh(given).vertices, axis=1) - BALL_RADIUS).mean()
         for n in (0, 8)
     ]
     assert error[1] < 0.3 * error[0]
@@ -51,7 +50,7 @@ def test_more_bisections_come_closer():
 
 def test_tiles_give_the_same_surface():
     """With a budget of 2,000 points a tile, against all in one."""
-    given = ball(views=8)
+    given = mesh_input(views=8)
     whole, tiled = Tetra().mesh(given), Tetra().mesh(replace(given, generator=torch.Generator(), budget_bytes=1))
     assert len(whole.faces) > 1_000 and len(given.splats) * 9 > 2 * 2_000
     corners = [{tuple(sorted(map(tuple, m.vertices[face]))) for face in m.faces} for m in (whole, tiled)]
@@ -86,7 +85,7 @@ def test_tiles_hold_every_point_once():
 
 def test_what_no_view_shows_has_no_surface():
     """One camera: what the ball hides from it is the inside of something, and no triangle reaches into it."""
-    given = ball()
+    given = mesh_input()
     one, direction = given.views[:1], given.views[0].camera.centre.numpy() / 2
     mesh = Tetra(min_views=1).mesh(replace(given, views=one))
     assert len(mesh.faces) > 200
@@ -96,14 +95,14 @@ def test_what_no_view_shows_has_no_surface():
 
 
 def test_masked_pixels_show_nothing():
-    given = ball()
+    given = mesh_input()
     left = torch.zeros(96, 96, dtype=torch.bool)
     with pytest.raises(BadInput, match="no surface"):
         Tetra().mesh(replace(given, keep=lambda at: left))
 
 
 def test_faint_splats_give_no_points():
-    given = ball()
+    given = mesh_input()
     with pytest.raises(BadInput, match="opacity"):
         Tetra(faint=0.99).mesh(given)
 

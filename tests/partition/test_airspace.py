@@ -14,8 +14,7 @@ from surfkit.partition.plan import Fewest, plan
 from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
-
-from .cities import below, city
+from surfkit.testing.inputs import above, coarse_model
 
 LEVEL = torch.eye(3, dtype=torch.float64)
 
@@ -79,7 +78,7 @@ def test_what_boxes_fill_as_outlines_do():
 
 def test_a_box_from_above():
     """A camera 2 above the ground, beside a box of height 1: its roof is at depth 1, its foot hides behind it."""
-    camera = below(0.0, 0.0, 2.0)  # 48 x 40 pixels, focal 50: the picture spans 0.96 x 0.8 at depth 1
+    camera = above(0.0, 0.0, 2.0)  # 48 x 40 pixels, focal 50: the picture spans 0.96 x 0.8 at depth 1
     low, high = torch.tensor([0.12, -1.0, 0.0]).double(), torch.tensor([2.0, 1.0, 1.0]).double()
     # From its roof's near side, x = 0.12 at depth 1, or its foot's, x = 0.12 at depth 2: 0.06 at depth 1, to 0.48.
     assert filled(camera, LEVEL, low, high) == pytest.approx((0.48 - 0.06) / 0.96, abs=0.5 / 48)
@@ -102,8 +101,10 @@ def towers() -> Splats:
 
 def test_the_space_of_a_block_is_that_of_nearly_all_its_points():
     """Two blocks, x below 0 and above: the first has height, and a stray point; grown by a fifth."""
-    cameras = [below(x, 0.5, 1.0) for x in (-0.5, 0.05, 0.15, 0.5, 2.0)]
-    sight = replace(city(200), splats=towers(), views=[View(str(i), c, path=None) for i, c in enumerate(cameras)])
+    cameras = [above(x, 0.5, 1.0) for x in (-0.5, 0.05, 0.15, 0.5, 2.0)]
+    sight = replace(
+        coarse_model(200), splats=towers(), views=[View(str(i), c, path=None) for i, c in enumerate(cameras)]
+    )
     owner = (sight.splats.means[:, 0] > 0).long()
     assert Ground.under(sight.centres, sight.splats.means) == Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     share = Airspace().measure(sight, owner, 3).numpy()
@@ -123,7 +124,7 @@ def test_the_space_of_a_block_is_that_of_nearly_all_its_points():
 def test_a_view_through_the_air_joins_though_it_shows_no_point():
     """A level view over the low roofs and past the single tower: its share of points is nothing."""
     draws = torch.Generator().manual_seed(1)
-    sight, means = city(4_000), torch.rand(4_000, 3, generator=draws) * torch.tensor([2.0, 2.0, 0.01]) - 1
+    sight, means = coarse_model(4_000), torch.rand(4_000, 3, generator=draws) * torch.tensor([2.0, 2.0, 0.01]) - 1
     means[:, 2] += 1
     means[:60, :] = torch.rand(60, 3, generator=draws) * torch.tensor([0.02, 0.02, 0.5]) + torch.tensor([0.7, 0.7, 0.0])
     means[60:120, :] = means[:60] - torch.tensor([1.4, 1.4, 0.0])

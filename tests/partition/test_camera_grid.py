@@ -9,13 +9,14 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.partition import CameraGrid
 from surfkit.scene.scene import View
-
-from .cities import below, city
+from surfkit.testing.inputs import above, coarse_model
 
 
 def under(*places: tuple[float, float]):
     """The city under cameras at these places."""
-    return replace(city(200), views=[View(f"{i}.png", below(x, y), path=None) for i, (x, y) in enumerate(places)])
+    return replace(
+        coarse_model(200), views=[View(f"{i}.png", above(x, y), path=None) for i, (x, y) in enumerate(places)]
+    )
 
 
 def test_every_cell_has_as_many_cameras_as_the_next():
@@ -45,7 +46,7 @@ def test_borders_lie_midway_and_columns_have_rows_of_their_own():
 
 def test_cameras_in_lines_are_not_torn_apart():
     """6 x 5 cameras: each of three columns is two whole lines of flight; four are as even as lines can be."""
-    sight = city()
+    sight = coarse_model()
     owner = CameraGrid((3, 5)).cells(sight).owner(sight.centres)
     assert torch.bincount(owner).tolist() == [2] * 15
     owner = CameraGrid((4, 1)).cells(sight).owner(sight.centres)
@@ -55,6 +56,6 @@ def test_cameras_in_lines_are_not_torn_apart():
 
 def test_too_few_places_are_told():
     with pytest.raises(BadInput, match=r"too few places for camera-grid.blocks \(7, 1\)"):
-        CameraGrid((7, 1)).cells(city())
+        CameraGrid((7, 1)).cells(coarse_model())
     with pytest.raises(BadInput, match="too few places"):
-        CameraGrid((2, 6)).cells(city())
+        CameraGrid((2, 6)).cells(coarse_model())

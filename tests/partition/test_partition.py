@@ -23,8 +23,9 @@ from surfkit.partition.base import Contraction, Ground
 from surfkit.partition.merge import Merge
 from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough
 from surfkit.testing import check_partition
+from surfkit.testing.inputs import above, coarse_model
 
-from .cities import FLAT, below, city
+FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), CameraGrid((3, 2)), Balanced(6)]
 
@@ -32,7 +33,7 @@ WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), CameraGrid((3, 2)), Balanc
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: type(way).__name__)
 def test_every_place_is_owned_once(way):
     """Random points near and far, and points exactly on the sides of the cells, counted cell by cell."""
-    cells = way.cells(city())
+    cells = way.cells(coarse_model())
     draws = torch.Generator().manual_seed(1)
     points = torch.randn(4_000, 3, generator=draws, dtype=torch.float64) * torch.logspace(-1, 4, 4_000)[:, None]
     if cells.contraction is None:
@@ -124,14 +125,14 @@ def test_the_ground_under_a_kite_is_that_of_the_points():
 
 
 def test_rows_of_equal_count():
-    sight = city()
+    sight = coarse_model()
     cells = QuantileGrid((3, 1)).cells(sight)
     assert torch.bincount(cells.owner(sight.splats.means)).tolist() == [500, 500, 500]
 
 
 def test_balanced_cells_share_the_work():
     """Work counted from the plan, not from the strips: the largest block against the mean."""
-    sight = city()
+    sight = coarse_model()
 
     def unevenness(way):
         shares = [block.work for block in plan(sight, way, PictureShare(0.02), Fewest(views=1)).blocks]
@@ -141,7 +142,7 @@ def test_balanced_cells_share_the_work():
 
 
 def test_both_ways_to_assign_mostly_agree():
-    sight = city()
+    sight = coarse_model()
     cells = QuantileGrid((2, 2)).cells(sight)
     owner = cells.owner(sight.splats.means)
     by_ssim = SSIMDifference().measure(sight, owner, 4)
@@ -158,7 +159,7 @@ def test_difference_is_that_of_the_pictures():
     """One view, one block, drawn by hand."""
     from surfkit.raster.ssim import ssim_reference
 
-    sight = city(300)
+    sight = coarse_model(300)
     owner = (sight.splats.means[:, 0] > 0).long()
     found = SSIMDifference().measure(replace(sight, views=sight.views[14:15]), owner, 2)
     kept = owner == 0
@@ -170,7 +171,7 @@ def test_difference_is_that_of_the_pictures():
 
 
 def test_the_plan_names_everything_and_survives_a_file():
-    sight = city()
+    sight = coarse_model()
     made = plan(sight, QuantileGrid((2, 2)), PictureShare())
     assert sum(block.points for block in made.blocks) == len(sight.splats)
     assert sum(block.cameras for block in made.blocks) == len(sight.views)
@@ -198,7 +199,7 @@ def test_blocks_with_hardly_any_points_join_too():
     joins = torch.tensor([[1, 1, 0], [1, 1, 0], [0, 1, 1]]).bool()
     found, views, _ = with_enough(cells, joins, joins, 1, torch.tensor([False, True, False]))
     assert found.blocks == (0, 0, 1) and views.tolist() == [[True, False], [True, False], [True, True]]
-    sight = city()
+    sight = coarse_model()
     far = replace(sight.splats, means=sight.splats.means.clone())
     far.means[0] = torch.tensor([40.0, 40.0, 0.0])
     lonely = Cells(FLAT, ((None, None, 20.0, None), (20.0, None, None, None)), (0, 1))
@@ -239,7 +240,7 @@ def merged(cells, coarse, tuned, skipped=frozenset()):
 
 
 def test_merged_points_come_from_their_owner_once():
-    sight = city()
+    sight = coarse_model()
     cells = QuantileGrid((2, 2)).cells(sight)
     draws = torch.Generator().manual_seed(4)
     tuned = {}
@@ -254,7 +255,7 @@ def test_merged_points_come_from_their_owner_once():
 
 
 def test_a_hole_is_refused_or_filled():
-    sight = city()
+    sight = coarse_model()
     cells = QuantileGrid((2, 2)).cells(sight)
     coarse = {"means": sight.splats.means}
     tuned = {index: coarse for index in (0, 1, 3)}
@@ -277,17 +278,17 @@ def test_bad_settings_and_scenes():
     ):
         with pytest.raises(BadInput):
             make()
-    sight = city(40)
+    sight = coarse_model(40)
     with pytest.raises(BadInput, match="too few"):
         QuantileGrid((50, 1)).cells(sight)
     in_line = replace(sight, views=sight.views[:6])
     with pytest.raises(BadInput, match="quantile-grid"):
         ContractedGrid((2, 2)).cells(in_line)
-    away = replace(sight, views=tuple(replace(v, camera=below(50.0 + i, 60.0)) for i, v in enumerate(sight.views)))
+    away = replace(sight, views=tuple(replace(v, camera=above(50.0 + i, 60.0)) for i, v in enumerate(sight.views)))
     assert plan(away, QuantileGrid((1, 1)), PictureShare()).blocks[0].cameras == len(sight.views)
 
 
 def test_a_partition_with_a_gap_is_found():
     gap = Cells(FLAT, ((None, None, 0.0, None), (0.1, None, None, None)), (0, 1))
     with pytest.raises(AssertionError, match="no owner"):
-        check_partition(Fixed(gap), city())
+        check_partition(Fixed(gap), coarse_model())

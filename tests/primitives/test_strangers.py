@@ -15,12 +15,15 @@ from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.export.ply import read_splats
+from surfkit.losses.photometric import L1
+from surfkit.losses.reprojection import Reprojection
+from surfkit.losses.surface import NormalConsistency
 from surfkit.pipeline import load_run
 from surfkit.primitives.base import harmonics
 from surfkit.primitives.edit import apply
 from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Points
-from surfkit.raster.api import Splats
+from surfkit.raster.api import Maps, Splats
 from surfkit.raster.autograd import AutogradRender, DerivedRender
 from surfkit.raster.reference import draw
 from surfkit.raster.select import select
@@ -122,10 +125,48 @@ class Anchors(Primitive):
         return tuple(value.new_zeros(len(splats)).index_add(0, owner, value) for value in found)
 
 
+@dataclass(frozen=True)
+class Drawn(Balls):
+    """Balls that torch draws."""
+
+    has_absolute_gradients: ClassVar[bool] = False
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        true = rasterizer.render(splats, camera, near, False, False)
+        return AutogradRender(splats, camera, lambda s: draw(s, camera, near).maps, true.seen, true.radii)
+
+
+@dataclass(frozen=True)
+class Boasting(Drawn):
+    """Declares gradients that it does not have."""
+
+    has_absolute_gradients: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class Small(Balls):
+    """Draws half a picture."""
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
+
+
+@dataclass(frozen=True)
+class Bare(Balls):
+    """Draws a few maps, whatever is asked for."""
+
+    maps: tuple[str, ...] = ("color", "alpha")
+
+    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
+        render = rasterizer.render(splats, camera, near)
+        render.maps = Maps(**{name: getattr(render.maps, name) for name in self.maps})
+        return render
+
+
 class Package:
     @hookimpl
     def surfkit_components(self):
-        return {"balls": Balls, "fog": Fog, "anchors": Anchors}
+        return {"balls": Balls, "fog": Fog, "anchors": Anchors, "drawn": Drawn, "small": Small, "bare": Bare}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -142,9 +183,21 @@ def source(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors()], ids=["balls", "fog", "anchors"])
+@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors(), Drawn()], ids=["balls", "fog", "anchors", "drawn"])
 def test_they_keep_the_contract(primitive):
     check_primitive(primitive)
+
+
+@pytest.mark.parametrize(
+    ("primitive", "fault"),
+    [
+        (Boasting(), "Boasting.render: set has_absolute_gradients to False: signal: absolute pixel gradients"),
+        (Small(), "primitive small: its render gives color of shape"),
+    ],
+)
+def test_a_render_that_is_not_as_declared_is_named(primitive, fault):
+    with pytest.raises(AssertionError, match=fault):
+        check_primitive(primitive)
 
 
 def notes(out):
@@ -202,7 +255,6 @@ def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
     drawn = run.last.primitive.activate(state.points.params, 0).opacities
     table = read_splats(tmp_path / "run" / "point_cloud.ply")
     assert torch.allclose(table.opacity_logits.sigmoid(), drawn, atol=1e-6)
-    points = Points.fresh({"means": torch.zeros(2, 3), "opacities": torch.zeros(2)})
     points = Points.fresh(Fog().init(Cloud(torch.rand(2, 3), torch.zeros(2, 3, dtype=torch.uint8)), torch.Generator()))
     points.params["opacities"].zero_()  # drawn as 0.632
     lowered = apply(Fog(), points, Edit(max_opacity=0.3), torch.Generator())
@@ -233,6 +285,15 @@ def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_pat
         recipe.refuse_unfit()
 
 
+def test_absolute_gradients_that_torch_does_not_have_are_refused(source, tmp_path, capsys):
+    assert train(source, tmp_path / "a", "recipe:absgs", "primitive:drawn") == 2
+    told = capsys.readouterr().err
+    assert "pretrain.signal: abs-gradient wants absolute pixel gradients, and primitive drawn draws itself" in told
+    assert "choose pretrain.signal:loss-gradient" in told and not (tmp_path / "a" / "pretrain").exists()
+    words = "recipe:absgs", "primitive:drawn", "pretrain.signal:loss-gradient"
+    assert train(source, tmp_path / "b", *words, "--pretrain.steps", "2") == 0
+
+
 def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
     splats = Anchors().activate(
         Anchors().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
@@ -256,6 +317,8 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     own = AutogradRender(splats, camera, lambda s: draw(s, camera, 0.01).maps, true.seen, true.radii)
     cotangent = type(true.maps)(color=torch.randn(3, 16, 16))
     a, b = true.backward(cotangent, cotangent), own.backward(cotangent, cotangent)
+    with pytest.raises(BadInput, match="absolute pixel gradients cannot be had .* choose signal:loss-gradient"):
+        own.backward(cotangent, cotangent, absolute=True)
     for name, value in a.tensors().items():
         assert torch.allclose(value, b.tensors()[name], atol=1e-6), name
     seen = a.signal.norm(dim=1) > 1e-4
@@ -263,19 +326,39 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
 
 
-@dataclass(frozen=True)
-class Small(Balls):
-    """Draws half a picture."""
-
-    def render(self, splats, camera, rasterizer, near, geometry=True, distortion=True):
-        return rasterizer.render(splats, replace(camera, width=camera.width // 2), near, geometry, distortion)
-
-
-def test_pictures_of_another_size_are_refused_in_one_line(source, monkeypatch):
-    scene = read(Data(source))
-    trainer = Trainer(Stage(steps=2), Small(), scene.train, photo_cache(scene.train), select("cpu")[0])
+def begun(stage, primitive, scene):
+    trainer = Trainer(stage, primitive, scene.train, photo_cache(scene.train), select("reference")[0])
     draw = torch.Generator().manual_seed(0)
-    state = trainer.begin(Points.fresh(Small().init(scene.cloud, draw)), draw)
-    monkeypatch.setattr("surfkit.primitives.drawing.name_of", lambda part: "small")
+    return trainer, trainer.begin(Points.fresh(primitive.init(scene.cloud, draw)), draw)
+
+
+def test_pictures_of_another_size_are_refused_in_one_line(source):
+    trainer, state = begun(Stage(steps=2), Small(), read(Data(source)))
     with pytest.raises(BadInput, match=r"primitive small: its render gives color of shape \(3, 30, 20\) for a view of"):
         trainer.step(state)
+
+
+@pytest.mark.parametrize(
+    ("maps", "loss", "lacking"),
+    [
+        (("color",), L1(), "alpha, which every view needs"),
+        (("alpha",), L1(), "color, which every view needs"),
+        (("color", "alpha", "depth", "median"), NormalConsistency(start=2), "normal, which loss late reads"),
+        (
+            ("color", "alpha", "depth"),
+            Reprojection(start=2),
+            "median, which loss late reads; leave .* losses.late",
+        ),
+    ],
+)
+def test_maps_that_a_render_leaves_out_are_named_in_the_first_step(source, maps, loss, lacking):
+    stage = Stage(steps=4, losses={"l1": L1(), "late": loss})
+    trainer, state = begun(stage, Bare(maps=maps), read(Data(source)))
+    with pytest.raises(BadInput, match=f"primitive bare: its render gives no {lacking}"):
+        trainer.step(state)
+
+
+def test_maps_that_no_loss_reads_may_be_left_out(source):
+    trainer, state = begun(Stage(steps=2, losses={"l1": L1()}), Bare(), read(Data(source)))
+    trainer.step(state)
+    assert state.index == 1

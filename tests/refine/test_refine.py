@@ -28,9 +28,8 @@ from surfkit.recipes.city import FIRST
 from surfkit.refine import DistilSH, PruneAndRecover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
-from surfkit.run import stage as optimise
 from surfkit.run.folder import Run
-from surfkit.run.stage import Intervals
+from surfkit.run.stage import Intervals, drawing, return_to_checkpoint
 from surfkit.testing import check_refine
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint
@@ -114,7 +113,7 @@ def test_distillation_learns_what_the_model_drew_before(finished, data):
     cut = replace(teacher.points, params=loaded.recipe.refine[1].params(teacher.points.params))
     (*_, before, last), rasterizer = loaded.stages, select("cpu")[0]
     drawn = [
-        optimise.drawing(stage, state, rasterizer, geometry=False)
+        drawing(stage, state, rasterizer, geometry=False)
         for stage, state in ((before, teacher), (last, student), (last, replace(teacher, points=cut, sh_degree=1)))
     ]
     views = loaded.recipe.refine[1].views(scene.train, 0)
@@ -132,7 +131,7 @@ def test_interrupted_and_continued(finished, data, recipe, tmp_path, monkeypatch
         if path.parent.name.startswith("refine") and state.index == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(optimise.checkpoint, "save", stop)
+    monkeypatch.setattr(checkpoint, "save", stop)
     for part in ("refine0", "refine1"):
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path, Compute("cpu"), EVERY)
@@ -176,7 +175,7 @@ def test_the_time_left_is_that_of_the_refinement(finished, tmp_path):
 
 def test_numbers_that_stay_infinite_name_the_rates_of_the_refinement(data, recipe, tmp_path):
     with pytest.raises(NotFinite, match=r"lower refine\.1\.stage\.rates in another folder"):
-        optimise.return_to_checkpoint(Run(tmp_path, recipe, data).last, 2, Diverged(3, "a.png", "infinite"), interrupt)
+        return_to_checkpoint(Run(tmp_path, recipe, data).last, 2, Diverged(3, "a.png", "infinite"), interrupt)
 
 
 def test_a_file_in_the_place_of_a_folder(data, recipe, tmp_path):

@@ -13,9 +13,9 @@ from surfkit.densify.signal import LossGradient
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe, without_unused
+from surfkit.recipes import surface
 from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, SURFACE, TABLES
 from surfkit.recipes.surface import STEREO
-from surfkit.recipes.surface import SURFACE as BEST
 from surfkit.report.ablation import Row, Table, build, built_on, limit_points, pick, scaled
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
@@ -64,7 +64,7 @@ def test_every_row_changes_what_it_is_built_on(name, label):
 def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_wants_its_maps():
     recipes = build(SURFACE)
     last = [row.label for row in SURFACE.rows if row.kept][-1]
-    assert recipes[last] == replace(BEST, about=recipes[last].about)
+    assert recipes[last] == replace(surface.SURFACE, about=recipes[last].about)
     first, *others, alone = recipes.values()
     assert first.depth is None and "depth" not in first.pretrain.losses and first.pretrain.densify is not None
     assert all(recipe.depth is not None and recipe.mesh is not None for recipe in others)

@@ -11,12 +11,11 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.readers import read as scenes
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_prior import read_priors, resized
-from surfkit.readers.read import observations
+from surfkit.readers.read import observations, read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.align import align, sample
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -36,12 +35,12 @@ def farm(made, tmp_path):
     """A copy to write maps into: its data, scene, and exact inverse depth by name, 1/input units."""
     folder, truth = made
     data = Data(Path(shutil.copytree(folder, tmp_path / "farm")))
-    scene = scenes.read(data)
+    scene = read(data)
     exact = {name: (truth.scene.frame.scale / e.depth.clamp_min(1e-9)).numpy() for name, e in truth.exact.items()}
     return data, scene, {name: np.where(truth.exact[name].depth > 0, inv, 0) for name, inv in exact.items()}
 
 
-def read(data, scene, normals=False):
+def priors_of(data, scene, normals=False):
     """The priors, and what was warned of."""
     with collect_notes() as kept:
         notes = kept.texts
@@ -117,7 +116,7 @@ def test_samples_are_bilinear_at_pixel_centres():
 def test_relative_maps_are_aligned(farm):
     data, scene, exact = farm
     relative(data, exact)
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert notes == []
     check_exact(priors, scene, exact, share=0.03)  # sparse points are not at the centres of pixels
     depths = [observations(data, scene).of(view)[1] for view in scene.train]
@@ -130,7 +129,7 @@ def test_points_with_a_large_error_do_not_count(farm):
     points = data.path / "sparse/0/points3D.txt"
     rows = [line.split(" ") for line in points.read_text().splitlines()]
     points.write_text("".join(" ".join([*row[:7], "1.5", *row[8:]]) + "\n" for row in rows))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert priors is None and "only 0 sparse points" in notes[0]
 
 
@@ -139,12 +138,12 @@ def test_maps_that_came_in_input_units_are_taken_as_they_are(farm):
     for name, inverse in exact.items():
         write_map(data.path, name, inverse, (inverse > 0).astype(float))
     write_record(data.path, {"aligned": True})
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert notes == []
     check_exact(priors, scene, exact, share=1e-5)
     for name, inverse in exact.items():
         write_map(data.path, name, 3 * inverse, np.ones_like(inverse))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert priors is None and "not those of the sparse points" in notes[0]
 
 
@@ -157,7 +156,7 @@ def test_hierarchical_3dgs(farm):
         Image.fromarray(np.where(inverse > 0, stored, 0).astype(np.uint16)).save(data.path / "depths" / name)
         params[Path(name).stem] = {"scale": scale, "offset": offset}
     (data.path / "sparse/0/depth_params.json").write_text(json.dumps(params))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert notes == []
     check_exact(priors, scene, exact)
 
@@ -176,7 +175,7 @@ def test_nerfstudio(farm, end):
             np.save(data.path / path, millimetres)
         frames.append({"file_path": f"./images/{name}", "depth_file_path": path})
     (data.path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert notes == []
     check_exact(priors, scene, exact)
 
@@ -190,7 +189,7 @@ def test_what_cannot_be_used_is_listed_once(farm):
     np.save(paths[1], good[:, :40])
     np.save(paths[2], np.full_like(good, 7))
     paths[3].write_bytes(b"no array")
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert [prior is None for prior in priors] == [True] * 4 + [False]
     names = [view.name for view in scene.train]
     assert len(notes) == 1 and notes[0].startswith("4 of 5 photographs train without a depth prior: ")
@@ -198,7 +197,7 @@ def test_what_cannot_be_used_is_listed_once(farm):
         assert text in notes[0]
     assert f"constant: {names[2]}" in notes[0] and "cannot be read" in notes[0] and names[3] in notes[0]
     np.save(paths[4], np.full_like(good, np.nan))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert (
         priors is None
         and "everything that needs them is switched off" in notes[0]
@@ -211,7 +210,7 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
     relative(data, exact)
     view = scene.train[2]
     np.save(map_path(data.path, view.name), 5.2 * np.load(map_path(data.path, view.name)))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert priors[2] is None and notes == [
         f"1 of 5 photographs train without a depth prior: its scale is far from that of the other images: {view.name}"
     ]
@@ -222,7 +221,7 @@ def test_without_any_map_the_warning_says_what_to_run(farm):
     data, scene, _ = farm
     off = "so everything that needs them is switched off, such as the losses depth and normal-prior"
     for normals, more in ((False, ""), (True, " estimator:patch-match")):
-        priors, notes = read(data, scene, normals)
+        priors, notes = priors_of(data, scene, normals)
         assert priors is None and notes == [
             f"{data.path} has no depth priors, {off}; make them with `surfkit prepare depth {data.path}{more}`"
         ]
@@ -231,8 +230,8 @@ def test_without_any_map_the_warning_says_what_to_run(farm):
 def test_priors_without_normals_are_warned_of_where_a_loss_wants_some(farm):
     data, scene, exact = farm
     relative(data, exact)
-    assert read(data, scene)[1] == []
-    priors, notes = read(data, scene, normals=True)
+    assert priors_of(data, scene)[1] == []
+    priors, notes = priors_of(data, scene, normals=True)
     assert priors[0].normal is None and notes == [
         "5 of 5 depth priors have no normals, and the loss normal-prior learns nothing from those; "
         f"make others with `surfkit prepare depth {data.path} estimator:patch-match --again`"
@@ -240,10 +239,10 @@ def test_priors_without_normals_are_warned_of_where_a_loss_wants_some(farm):
     up = np.stack([0 * exact[scene.train[0].name]] * 2 + [-np.ones_like(exact[scene.train[0].name])])
     for view in scene.train[1:]:
         write_map(data.path, view.name, np.load(map_path(data.path, view.name)), np.ones_like(up[0]), up)
-    (note,) = read(data, scene, normals=True)[1]
+    (note,) = priors_of(data, scene, normals=True)[1]
     assert note.startswith("1 of 5 depth priors have no normals")
     write_map(data.path, scene.train[0].name, np.load(map_path(data.path, scene.train[0].name)), up[0] + 1, up)
-    assert read(data, scene, normals=True)[1] == []
+    assert priors_of(data, scene, normals=True)[1] == []
 
 
 def test_maps_that_saw_held_out_photographs_are_warned_of(farm):
@@ -251,9 +250,9 @@ def test_maps_that_saw_held_out_photographs_are_warned_of(farm):
     for name, inverse in exact.items():
         write_map(data.path, name, inverse, np.ones_like(inverse))
     write_record(data.path, {"aligned": True, "matched": [view.name for view in scene.train]})
-    assert read(data, scene)[1] == []
+    assert priors_of(data, scene)[1] == []
     write_record(data.path, {"aligned": True, "matched": list(exact)})
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert priors is not None and len(notes) == 1 and scene.held_out[0].name in notes[0]
 
 
@@ -334,6 +333,6 @@ def test_normals_of_another_kind_are_a_reason_not_to_use_a_map(farm):
         write_map(data.path, name, inverse, np.ones_like(inverse))
     write_record(data.path, {"aligned": True})
     np.save(normal_path(map_path(data.path, scene.train[1].name)), np.zeros((48, 64, 3), np.float32))
-    priors, notes = read(data, scene)
+    priors, notes = priors_of(data, scene)
     assert priors[1] is None and priors[0] is not None
     assert "normals are float32 of shape (48, 64, 3), not int8 of (3, height, width)" in notes[0]

@@ -12,8 +12,7 @@ from surfkit.densify.filters import CountCap
 from surfkit.densify.trim import Trim
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
-from surfkit.train import checkpoint
-from surfkit.train import streaming as pieces
+from surfkit.train import checkpoint, streaming
 from surfkit.train.stage import Stage
 
 QUIET = Stage(steps=6, densify=None, sh_every=2)
@@ -141,7 +140,7 @@ def test_a_state_with_frozen_points_on_disk(begin, tmp_path):
     for one, other in ((state.points.params, again.points.params), (state.frozen, again.frozen)):
         assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
     checkpoint.save(path, again)
-    stored = pieces.opened(path)
+    stored = streaming.opened(path)
     assert sum(len(piece.points) for piece in stored.pieces()) == len(again.points)
     assert len(stored.state.frozen["means"]) == 15 and stored.state.frozen["means"].device.type == "meta"
 

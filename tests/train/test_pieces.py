@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.train import checkpoint
-from surfkit.train import streaming as pieces
+from surfkit.train import checkpoint, streaming
 from surfkit.train.stage import Stage
 
 from .test_checkpoint import small_files
@@ -16,8 +15,8 @@ from .test_checkpoint import small_files
 @pytest.fixture
 def path(begin, tmp_path, monkeypatch):
     """A state of 40 points after two steps in a file, to be read 7 points at a time."""
-    monkeypatch.setattr(pieces, "ROWS", 7)
-    monkeypatch.setattr(pieces, "BYTES", 100)
+    monkeypatch.setattr(streaming, "ROWS", 7)
+    monkeypatch.setattr(streaming, "BYTES", 100)
     trainer, state = begin(Stage(steps=9))
     for _ in range(2):
         trainer.step(state)
@@ -32,7 +31,7 @@ def whole(stored) -> dict[str, torch.Tensor]:
 
 
 def test_pieces_are_the_whole(path):
-    true, stored = checkpoint.load(path), pieces.opened(path)
+    true, stored = checkpoint.load(path), streaming.opened(path)
     found = whole(stored)
     assert found.keys() == true.points.params.keys()
     assert all(torch.equal(found[name], value) for name, value in true.points.params.items())
@@ -43,9 +42,9 @@ def test_pieces_are_the_whole(path):
 
 def test_what_is_written_in_pieces_is_read_as_any_other(path):
     """Against the file that the whole state gives; moments are 0."""
-    stored, true = pieces.opened(path), checkpoint.load(path)
+    stored, true = streaming.opened(path), checkpoint.load(path)
     there = path.with_name("d.safetensors")
-    pieces.save(there, stored.state, (piece.points.params for piece in stored.pieces()))
+    streaming.save(there, stored.state, (piece.points.params for piece in stored.pieces()))
     found = checkpoint.load(there)
     assert all(torch.equal(found.points.params[name], value) for name, value in true.points.params.items())
     assert all(
@@ -63,32 +62,32 @@ def test_a_flipped_bit_anywhere_is_noticed(path, where):
     content[int(where * len(content))] ^= 4
     path.write_bytes(content)
     with pytest.raises(BadInput, match="c.safetensors"):
-        pieces.opened(path)
-    stored, damage = pieces.open_last(path)
+        streaming.opened(path)
+    stored, damage = streaming.open_last(path)
     assert stored.path == checkpoint.before(path) and str(path) in damage
 
 
 def test_files_that_are_no_checkpoint(path):
-    assert pieces.open_last(path.with_name("none.safetensors")) is None
+    assert streaming.open_last(path.with_name("none.safetensors")) is None
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(BadInput, match="no readable checkpoint"):
-        pieces.opened(path)
+        streaming.opened(path)
     path.write_bytes(b"nonsense")
     with pytest.raises(BadInput, match="no readable checkpoint"):
-        pieces.open_last(path)
+        streaming.open_last(path)
 
 
 def test_a_full_disk_leaves_what_was_there(path):
-    stored, content = pieces.opened(path), path.read_bytes()
+    stored, content = streaming.opened(path), path.read_bytes()
     parts = [piece.points.params for piece in stored.pieces()]
     with small_files(len(content) // 2), pytest.raises(OSError) as error:  # noqa: PT011
-        pieces.save(path, stored.state, iter(parts))
+        streaming.save(path, stored.state, iter(parts))
     assert error.value.errno == errno.EFBIG and path.read_bytes() == content
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_pieces_that_are_not_all_the_points_are_not_saved(path):
-    stored, content = pieces.opened(path), path.read_bytes()
+    stored, content = streaming.opened(path), path.read_bytes()
     with pytest.raises(AssertionError, match="not the points"):
-        pieces.save(path, stored.state, [next(stored.pieces()).points.params])
+        streaming.save(path, stored.state, [next(stored.pieces()).points.params])
     assert path.read_bytes() == content

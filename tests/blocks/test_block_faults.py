@@ -14,9 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfkit.blocks import forecast as foresight
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import forecast, schedule, worker
 from surfkit.blocks.block import Block, read_plan
 from surfkit.blocks.oom_retry import NO_CACHE, NO_GROWTH, START_AGAIN, apply_fallback, next_fallback
 from surfkit.blocks.schedule import Compute, Unfinished
@@ -25,8 +23,7 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.densify import Limited
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Step
-from surfkit.execute import Pool
-from surfkit.execute import base as executor
+from surfkit.execute import Pool, base
 from surfkit.execute.base import Job, JobResult
 from surfkit.execute.state import BlockState, read_state, write_state
 from surfkit.losses.depth import DepthRegression
@@ -97,7 +94,7 @@ def same(a: Path, b: Path) -> bool:
 
 def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
     """Memory gives out in a block whenever it has more than some points."""
-    optimise, step = tuning.optimise, Trainer.step
+    optimise, step = worker.optimise, Trainer.step
 
     def optimising(job, state):
         def short(self, state):
@@ -108,7 +105,7 @@ def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
         patch.setattr(Trainer, "step", short)
         return optimise(job, state)
 
-    patch.setattr(tuning, "optimise", optimising)
+    patch.setattr(worker, "optimise", optimising)
 
 
 def test_a_block_for_which_memory_is_short_stops_to_grow(undisturbed, data, recipe, tmp_path, monkeypatch, capsys):
@@ -168,7 +165,7 @@ def test_a_block_that_never_fits_fails_and_may_be_tried_elsewhere(data, recipe, 
 
 def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Real processes with a real limit: 10 MB for each point, and 3 GB more than the program has."""
-    command, out = blocks.job_of, without_block_0(undisturbed, tmp_path / "run")
+    command, out = schedule.job_of, without_block_0(undisturbed, tmp_path / "run")
     write_state(
         out / "blocks" / "000",
         read_state(out / "blocks" / "000"),
@@ -190,7 +187,7 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
         return replace(job, command=("-c", code))
 
     with monkeypatch.context() as patch:
-        patch.setattr(blocks, "job_of", limited)
+        patch.setattr(schedule, "job_of", limited)
         run(recipe, data, out, Compute("cpu", Pool(workers=2)), EVERY)
     state = read_state(out / "blocks" / "000")
     log = (out / "blocks" / "000" / "log.txt").read_text()
@@ -201,7 +198,7 @@ def test_a_worker_without_memory_comes_down_the_ladder(undisturbed, data, recipe
 
 def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, recipe, tmp_path, monkeypatch):
     """SIGKILL, and the system counts one more; the first rung leaves the result as it is."""
-    command, kills, out = blocks.job_of, iter([7, 8, 8]), without_block_0(undisturbed, tmp_path / "run")
+    command, kills, out = schedule.job_of, iter([7, 8, 8]), without_block_0(undisturbed, tmp_path / "run")
 
     def deadly(ctx, block, compute):
         job = command(ctx, block, compute)
@@ -209,8 +206,8 @@ def test_a_worker_that_the_system_ends_for_want_of_memory(undisturbed, data, rec
         return replace(job, command=("-c", "import os; os.kill(os.getpid(), 9)")) if first else job
 
     with monkeypatch.context() as patch:
-        patch.setattr(blocks, "job_of", deadly)
-        patch.setattr(executor, "oom_kills", lambda: next(kills))
+        patch.setattr(schedule, "job_of", deadly)
+        patch.setattr(base, "oom_kills", lambda: next(kills))
         run(recipe, data, out, Compute("cpu", Pool(workers=2)), EVERY)
     assert read_state(out / "blocks" / "000").fallback == NO_CACHE and same(out, undisturbed)
     assert any("ended by SIGKILL while memory ran out" in text for text in notes(out))
@@ -224,7 +221,7 @@ def test_the_kind_of_a_failure_is_what_the_executor_reports(undisturbed, kind):
     plan = read_plan(loaded).plan
     for why, status in (("an OutOfMemoryError, or OUT_OF_MEMORY", 70), (None, -9)):
         block = Block(replace(loaded, out=loaded.out / "elsewhere"), plan, 0)
-        told = blocks.record_failure(block, JobResult(Job(0, block.folder, lambda: 0, ()), status, why, kind))
+        told = schedule.record_failure(block, JobResult(Job(0, block.folder, lambda: 0, ()), status, why, kind))
         assert told.startswith(f"failed: {why}" if why else "was ended by SIGKILL")
         assert read_state(block.folder).kind == block.state.kind == (kind or "crash")
         assert block.is_out_of_memory == (kind == "oom")
@@ -298,13 +295,13 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     out, limits = without_block_0(undisturbed, tmp_path / "run"), resource.getrlimit(resource.RLIMIT_FSIZE)
     compute = Compute("cpu") if workers is None else Compute("cpu", workers)
     size = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
-    train = blocks.train_waiting
+    train = schedule.train_waiting
 
     def limited(*args):
         resource.setrlimit(resource.RLIMIT_FSIZE, (2 * size, limits[1]))  # enough before points multiply twice
         return train(*args)
 
-    monkeypatch.setattr(blocks, "train_waiting", limited)
+    monkeypatch.setattr(schedule, "train_waiting", limited)
     try:
         with pytest.raises(DiskFull, match=r"block \d failed: .*the disk is full .*: free some space, and the same"):
             run(recipe, data, out, compute, EVERY)
@@ -313,7 +310,7 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     last, damage = checkpoint.load_last(out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     assert read_state(out / "blocks" / "000").kind == "disk" and not list(out.rglob(".*.part"))
     assert 0 < last.index < STEPS and damage is None
-    monkeypatch.setattr(blocks, "train_waiting", train)
+    monkeypatch.setattr(schedule, "train_waiting", train)
     run(recipe, data, out, Compute("cpu"), EVERY)
     assert same(out, undisturbed)
 
@@ -321,12 +318,12 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
 def test_blocks_do_not_begin_without_room(undisturbed, data, recipe, tmp_path, monkeypatch, capsys):
     whole = (undisturbed / "pretrain" / "checkpoint.safetensors").stat().st_size
     usage = type("Usage", (), {"free": whole // 2})
-    monkeypatch.setattr(foresight.shutil, "disk_usage", lambda path: usage)
+    monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(BadInput, match=r"blocks need at least \S+ MB of disk .* are free; make room"):
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert not list((tmp_path / "blocks").glob("00*"))
     usage.free = 2 * whole
-    monkeypatch.setattr(foresight, "free_bytes", lambda: 1 << 20)
+    monkeypatch.setattr(forecast, "free_bytes", lambda: 1 << 20)
     run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     said = notes(tmp_path)
     assert any("may need about" in text and "of disk" in text for text in said)
@@ -372,13 +369,13 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
         write_map(tmp_path / "data", name, inverse * (30 if at == 3 else 1), (exact.depth > 0).float().numpy())
     write_record(tmp_path / "data", {"aligned": False})
     assert map_path(tmp_path / "data", "view_003.png").exists()
-    read, given = tuning.read_ahead, []
+    read, given = worker.read_ahead, []
 
     def reading(data, scene, losses, caches, known):
         given.append((scene, read(data, scene, losses, caches, known)))
         return given[-1][1]
 
-    monkeypatch.setattr(tuning, "read_ahead", reading)
+    monkeypatch.setattr(worker, "read_ahead", reading)
     deep = {"losses": recipe.tune.losses | {"depth": DepthRegression()}}
     pretrain, tune = replace(recipe.pretrain, **deep), replace(recipe.tune, **deep)
     apart = replace(recipe, pretrain=pretrain, tune=tune, assign=PictureShare(0.6))
@@ -397,7 +394,7 @@ def test_depth_priors_of_a_block_are_those_of_the_scene(tmp_path, recipe, monkey
 
 def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeypatch):
     """It goes back to its checkpoint twice, and is not begun again."""
-    optimise, step = tuning.optimise, Trainer.step
+    optimise, step = worker.optimise, Trainer.step
 
     def optimising(job, state):
         def spoilt(self, state):
@@ -408,7 +405,7 @@ def test_numbers_that_stay_infinite_fail_a_block(data, recipe, tmp_path, monkeyp
         monkeypatch.setattr(Trainer, "step", spoilt)
         return optimise(job, state)
 
-    monkeypatch.setattr(tuning, "optimise", optimising)
+    monkeypatch.setattr(worker, "optimise", optimising)
     with pytest.raises(Unfinished, match="block 1 failed: .*the losses are nan, also after .* halved 2 times"):
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     states = [read_state(tmp_path / "blocks" / name) for name in ("000", "001")]

@@ -11,9 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 from needs import needs
-from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same
 
-from surfkit.blocks import schedule as blocks
+from surfkit.blocks import schedule
 from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.core.check import BadInput
 from surfkit.execute import Slurm, slurm
@@ -121,9 +121,9 @@ def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     wait_for((folder / "saved").exists)
 
 
-def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):  # noqa: F811
+def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):
     """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
-    reached, command = tmp_path / "reached", blocks.job_of
+    reached, command = tmp_path / "reached", schedule.job_of
     code = (
         "import os, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
@@ -144,7 +144,7 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
     thread = threading.Thread(target=preempt)
     thread.start()
     with monkeypatch.context() as patch, pytest.raises(Unfinished, match="block 1 failed: machine .* is not there"):
-        patch.setattr(blocks, "job_of", lingering)
+        patch.setattr(schedule, "job_of", lingering)
         run(recipe, data, tmp_path / "run", Compute("cpu", Slurm("local", cpus=1, parallel=2)), EVERY)
     thread.join()
     log = (tmp_path / "run" / "blocks" / "000" / LOG).read_text()
@@ -254,7 +254,7 @@ def test_without_slurm_or_the_package(monkeypatch, tmp_path):
         Slurm("local").ready()
 
 
-def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):  # noqa: F811
+def test_a_run_that_cannot_have_its_executor_says_so_first(data, recipe, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(BadInput, match="sbatch is not on this machine"):
         run(recipe, data, tmp_path / "run", Compute("cpu", Slurm()), EVERY)

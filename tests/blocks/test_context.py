@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
-from test_blocks import EVERY, STEPS, data, recipe, same, stop_after  # noqa: F401 (fixtures)
+from two_blocks import EVERY, STEPS, same, stop_after
 
-from surfkit.blocks import forecast as foresight
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block
-from surfkit.blocks.forecast import BlockPoints, forecast, initial_points, point_memory
+from surfkit.blocks.forecast import FROZEN_BYTES, POINT_BYTES, BlockPoints, forecast, initial_points, point_memory
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
@@ -35,7 +33,7 @@ DENSIFY = ADC(start=2, until=STEPS, every=2, threshold=1e-9, reset_every=7, reco
 
 
 @pytest.fixture(scope="module")
-def growing(recipe):  # noqa: F811
+def growing(recipe):
     """Points multiply from the first steps on, and are reset, culled and trimmed."""
     prune = (Trim(ratio=0.1, start=2, until=STEPS, every=1, recovery=0),)
     return replace(
@@ -44,7 +42,7 @@ def growing(recipe):  # noqa: F811
 
 
 @pytest.fixture(scope="module")
-def runs(data, growing, tmp_path_factory):  # noqa: F811
+def runs(data, growing, tmp_path_factory):
     """A run of each kind, in this process."""
     found = {}
     for context in ("densified", "tuned", "frozen"):
@@ -59,7 +57,7 @@ def block_state(out, index):
 
 def coarse_and_plan(out):
     coarse = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
-    return coarse, read_json(out / "blocks" / "plan.json", blocks.Record).plan
+    return coarse, read_json(out / "blocks" / "plan.json", schedule.Record).plan
 
 
 def test_frozen_points_end_as_the_coarse_model_has_them(runs):
@@ -112,14 +110,14 @@ def test_the_plan_tells_the_borders(runs):
     assert int((means @ x < border).sum()) == gave[0]["kept"] and int((means @ x >= border).sum()) == gave[1]["kept"]
 
 
-def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):  # noqa: F811
+def test_a_pool_comes_to_the_same_bits(runs, data, growing, tmp_path):
     run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
     assert same(tmp_path, runs["tuned"])
 
 
 def killed_in_block_1(monkeypatch):
     """A worker that is killed without a word after step 7 of block 1, three steps after its last checkpoint."""
-    command = blocks.job_of
+    command = schedule.job_of
 
     def deadly(ctx, block, compute):
         job = command(ctx, block, compute)
@@ -134,10 +132,10 @@ def killed_in_block_1(monkeypatch):
             job = replace(job, command=("-c", code))
         return job
 
-    monkeypatch.setattr(blocks, "job_of", deadly)
+    monkeypatch.setattr(schedule, "job_of", deadly)
 
 
-def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):  # noqa: F811
+def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypatch):
     """In a pool; what was made in this process, undisturbed, has the same bits, those of the frozen points too."""
     killed_in_block_1(monkeypatch)
     run(replace(growing, context="frozen"), data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
@@ -147,25 +145,27 @@ def test_killed_in_the_middle_of_a_block(runs, data, growing, tmp_path, monkeypa
         assert all(torch.equal(value, found.frozen[name]) for name, value in true.frozen.items())
 
 
-def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_a_block_of_another_context_is_refused(data, growing, tmp_path, monkeypatch, capsys):
     """As a checkpoint from before points were frozen is, in one line; nothing of it is lost."""
     frozen = replace(growing, context="frozen")
     with monkeypatch.context() as patch:
-        patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
+        patch.setattr(worker, "optimise", stop_after(worker.optimise, 6))
         with pytest.raises(KeyboardInterrupt):
             run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "blocks" / "000" / "tune" / "checkpoint.safetensors"
     state = checkpoint.load(path)
     state.frozen = {}
     checkpoint.save(path, state)
-    with pytest.raises(blocks.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"):
+    with pytest.raises(
+        schedule.Unfinished, match="000/tune/checkpoint.safetensors has no frozen points, and the recipe"
+    ):
         run(frozen, data, tmp_path, Compute("cpu"), EVERY)
     assert checkpoint.load(path).index == 6 and "delete" in capsys.readouterr().err
     with pytest.raises(BadInput, match='context "frozen", and this one has "tuned"'):
         run(replace(growing, context="tuned"), data, tmp_path, Compute("cpu"), EVERY)
 
 
-def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):  # noqa: F811
+def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):
     """Its blocks go on as they began."""
     run(replace(growing, context="densified"), data, tmp_path, Compute("cpu"), EVERY)
     path = tmp_path / "recipe.json"
@@ -175,7 +175,7 @@ def test_a_recipe_from_before_there_was_a_choice(runs, data, growing, tmp_path):
     assert load_run(tmp_path)[0].recipe.context == "densified" and same(tmp_path, runs["densified"])
 
 
-def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F811
+def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):
     """With those of all other photographs deleted it comes to the same bits."""
     truth = photograph(Flight(views=12, width=32, height=24, points=300))
     write_colmap(tmp_path / "data", truth, tracks=True)
@@ -197,14 +197,14 @@ def test_a_block_needs_no_depth_maps_but_its_own(recipe, tmp_path):  # noqa: F81
         path.unlink()
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
-    ctx = tuning.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
-    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 0
+    ctx = worker.RunContext(loaded, scene, select("cpu")[0], EVERY, CacheSettings())
+    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 0
     again = block_state(tmp_path / "run", 0)
     assert all(torch.equal(value, again.points.params[name]) for name, value in true.points.params.items())
     map_path(made.path, plan.blocks[0].views[0]).unlink()
     os.unlink(loaded.out / "blocks" / "000" / "state.json")
     checkpoint.discard(loaded.out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert tuning.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
+    assert worker.train_block(ctx, Block(loaded, plan, 0)) == 2, "its own it does need"
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Found:
     seconds: float
 
 
-def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: F811
+def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):
     loaded, _, scene = load_run(runs["frozen"])
     coarse, plan = coarse_and_plan(runs["frozen"])
     found = {}
@@ -224,7 +224,7 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         (place.out / "pretrain").mkdir(parents=True)
         os.link(runs["frozen"] / "pretrain" / "checkpoint.safetensors", place.out / "pretrain/checkpoint.safetensors")
         block = Block(place, plan, 0)
-        told = forecast([block], tuning.open_coarse_model(place), [])
+        told = forecast([block], worker.open_coarse_model(place), [])
         found[context] = Found(point_memory(block), told.least_bytes, told.disk_bytes, told.seconds)
         own, both = block.planned.points, block.planned.begins
         wanted = {
@@ -234,11 +234,11 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):  # noqa: 
         }
         assert initial_points(block) == wanted[context]
         block.write(begun_points=own + 7 if context == "frozen" else both + 7)
-        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * foresight.POINT_BYTES
+        more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * POINT_BYTES
         assert point_memory(block) - found[context].memory == more
     around = plan.blocks[0].begins - plan.blocks[0].points
-    assert found["densified"].memory - found["tuned"].memory == 2 * around * foresight.POINT_BYTES
-    less = foresight.POINT_BYTES - foresight.FROZEN_BYTES
+    assert found["densified"].memory - found["tuned"].memory == 2 * around * POINT_BYTES
+    less = POINT_BYTES - FROZEN_BYTES
     assert found["tuned"].memory - found["frozen"].memory == around * less
     pace = coarse.seconds / coarse.index
     assert found["densified"].seconds == found["tuned"].seconds == pytest.approx(STEPS * pace)

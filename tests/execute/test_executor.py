@@ -8,7 +8,7 @@ import pytest
 
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
-from surfkit.execute import base as executor
+from surfkit.execute import base
 from surfkit.execute.base import LOG, Inline, Job, Pool
 from surfkit.execute.state import STALE_S, BlockState, find_worker, read_state, write_state
 
@@ -36,7 +36,7 @@ def test_pool_tells_how_each_ended_and_keeps_what_it_printed(tmp_path):
 
 def test_pool_reports_what_the_kernel_killed_for_lack_of_memory(tmp_path, monkeypatch):
     kills = iter([2, 3, 3])
-    monkeypatch.setattr(executor, "oom_kills", lambda: next(kills))
+    monkeypatch.setattr(base, "oom_kills", lambda: next(kills))
     killed = "import os; os.kill(os.getpid(), 9)"
     jobs = [job(tmp_path, at, killed, cost=3 - at) for at in range(2)] + [job(tmp_path, 2, "raise SystemExit(3)")]
     ends = list(Pool(workers=1).run(jobs))
@@ -71,7 +71,7 @@ def test_two_at_a_time(tmp_path):
 
 
 def test_memory_keeps_blocks_waiting_but_never_all(tmp_path, monkeypatch):
-    monkeypatch.setattr(executor, "free_bytes", lambda: 1_000)
+    monkeypatch.setattr(base, "free_bytes", lambda: 1_000)
     look = "import glob; raise SystemExit(len(glob.glob('../*/here')) and 7)"
     slow = "from pathlib import Path; import time; Path('here').touch(); time.sleep(0.5); Path('here').unlink()"
     jobs = [job(tmp_path, 0, slow, cost=2.0, memory_bytes=5_000), job(tmp_path, 1, look, memory_bytes=500)]
@@ -85,7 +85,7 @@ def test_leaving_stops_the_workers(tmp_path):
     code += "signal.signal(signal.SIGTERM, save)\nPath('began').touch()\ntime.sleep(60)\n"
     running = Pool(workers=1).run([job(tmp_path, 0, f"exec({code!r})")])
     began = time.monotonic()
-    executor_poll = executor.POLL_S
+    executor_poll = base.POLL_S
 
     class Stop(Exception):
         pass
@@ -97,12 +97,12 @@ def test_leaving_stops_the_workers(tmp_path):
         real(seconds)
 
     real = time.sleep
-    executor.time.sleep = sleep
+    base.time.sleep = sleep
     try:
         with pytest.raises(Stop):
             next(running)
     finally:
-        executor.time.sleep = real
+        base.time.sleep = real
     assert (tmp_path / "00" / "saved").exists() and time.monotonic() - began < 40
 
 

@@ -6,6 +6,7 @@ import os
 import resource
 import shutil
 import signal
+import statistics
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,16 +23,16 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.lock import locked
 from surfkit.core.tree import evolve
 from surfkit.densify.base import Prune
-from surfkit.evaluate.images import measure as images
 from surfkit.losses.depth import DepthRegression
 from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.recipe import complete
 from surfkit.run import journal
-from surfkit.run import stage as optimise
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train import checkpoint, stage
+from surfkit.train.progress import Display
+from surfkit.train.stage import Trainer
 
 STEPS = 24
 
@@ -85,13 +86,13 @@ def steps(out):
 def interrupted(recipe, data, out, at, monkeypatch, **settings):
     """A run that is asked to stop after a step."""
 
-    class Interrupting(optimise.Display):
+    class Interrupting(Display):
         def show(self, done):
             if done.index == at:
                 os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise, "Display", Interrupting)
+        patch.setattr("surfkit.run.stage.Display", Interrupting)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, out, **settings)
 
@@ -336,7 +337,7 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
 
 
 def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_path, monkeypatch):
-    step = optimise.Trainer.step
+    step = Trainer.step
 
     def short(self, state):
         if state.index == 12:
@@ -344,7 +345,7 @@ def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_pa
         return step(self, state)
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise.Trainer, "step", short)
+        patch.setattr(Trainer, "step", short)
         with pytest.raises(Fault, match="out of memory.*photographs are no longer kept in it; smaller.*--longest"):
             run(recipe, data, tmp_path / "run", intervals=Intervals(10))
     assert checkpoint.load(tmp_path / "run" / "pretrain" / "checkpoint.safetensors").index == 10
@@ -376,7 +377,7 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
 
 def test_a_cache_is_lowered_before_memory_is_gone(data, recipe, tmp_path, monkeypatch):
     free = iter([1 << 30, 100 << 20])  # looked at every ten steps
-    monkeypatch.setattr(optimise, "free_bytes", lambda: next(free))
+    monkeypatch.setattr("surfkit.run.stage.free_bytes", lambda: next(free))
     assert run(recipe, data, tmp_path / "run")["steps"] == STEPS
     assert len(notes(tmp_path / "run")) == 1
     assert notes(tmp_path / "run")[0].startswith("step 20: only 100 MiB of memory are free; photographs, masks and")
@@ -447,4 +448,4 @@ def test_pictures_along_the_way_change_nothing_else(data, recipe, tmp_path):
 def test_the_psnr_along_the_way_is_that_of_the_end(data, recipe, tmp_path):
     metrics = run(recipe, data, tmp_path / "run", intervals=Intervals(pictures=STEPS - 1))
     line = next(line for line in journal.read(tmp_path / "run" / "events.jsonl") if line["event"] == "Measured")
-    assert images.statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)
+    assert statistics.fmean(line["psnr"].values()) == pytest.approx(metrics["images"]["psnr"], abs=1.0)

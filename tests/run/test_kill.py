@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from needs import needs_native
 
-BENCH = Path(__file__).parents[1] / "bench" / "kill.py"
+BENCH = Path(__file__).parents[2] / "bench" / "kill.py"
 
 
 @needs_native

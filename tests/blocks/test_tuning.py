@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from test_blocks import EVERY, data, recipe, same, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same
 
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block, read_plan
 from surfkit.blocks.schedule import Compute
 from surfkit.blocks.worker import heartbeats
@@ -24,14 +23,14 @@ from surfkit.pipeline import opened, run
 
 
 @pytest.fixture
-def block(undisturbed, tmp_path) -> Block:  # noqa: F811
+def block(undisturbed, tmp_path) -> Block:
     """A block of a run, in a folder of its own."""
     loaded = opened(undisturbed)
     return Block(replace(loaded, out=tmp_path), read_plan(loaded).plan, 0)
 
 
 def test_heartbeats_while_no_step_is_made(block, monkeypatch):
-    monkeypatch.setattr(tuning, "HEARTBEAT_S", 0.0)
+    monkeypatch.setattr(worker, "HEARTBEAT_S", 0.0)
     block.write(status="running", step=3, heard=0.0)
     with heartbeats(block):
         until = time.monotonic() + 20
@@ -52,7 +51,7 @@ def test_a_driver_that_goes_while_no_step_is_made(block, monkeypatch):
 
 
 @pytest.fixture
-def elsewhere(undisturbed, tmp_path):  # noqa: F811
+def elsewhere(undisturbed, tmp_path):
     """A run whose first block was heard of on another machine, and how to say when."""
     shutil.copytree(undisturbed, tmp_path / "run")
 
@@ -72,7 +71,7 @@ def elsewhere(undisturbed, tmp_path):  # noqa: F811
 
 def test_a_block_that_is_worked_on_elsewhere_is_left_alone(elsewhere, capsys):
     folder = elsewhere(10)
-    assert main(["tune", str(folder), "0"]) == tuning.BUSY
+    assert main(["tune", str(folder), "0"]) == worker.BUSY
     assert (
         "process 7 on far sent a heartbeat" in capsys.readouterr().err
         and read_state(folder / "blocks/000").host == "far"
@@ -88,17 +87,17 @@ def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
     for seconds, status in ((10, "running"), (STALE_S, "failed")):
         folder = elsewhere(seconds)
         loaded = opened(folder)
-        assert blocks.record_failure(Block(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
+        assert schedule.record_failure(Block(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
         assert read_state(folder / "blocks" / "000").status == status
 
 
-def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(blocks, "LEAVE_S", 0.2)
+def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):
+    monkeypatch.setattr(schedule, "LEAVE_S", 0.2)
     folder = elsewhere(STALE_S - 3)
     run(recipe, data, folder, Compute("cpu"), EVERY)
     assert same(folder, undisturbed)
     elsewhere(0)
-    monkeypatch.setattr(blocks, "STALE_S", 0.2)
+    monkeypatch.setattr(schedule, "STALE_S", 0.2)
     (folder / "tune" / "checkpoint.safetensors").unlink()
     with pytest.raises(BadInput, match="000: process 7 on far works on the block; wait for its end"):
         run(recipe, data, folder, Compute("cpu"), EVERY)

@@ -1,23 +1,19 @@
 """Whole runs with blocks: who works on them, and how they are interrupted, changes nothing."""
 
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from two_blocks import EVERY, STEPS, params, same, stop_after
 
 from surfkit import pipeline
 from surfkit.appearance.exposure import Exposure
-from surfkit.blocks import forecast as foresight
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import forecast, schedule, worker
 from surfkit.blocks.block import Block
 from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.cli import main
@@ -25,54 +21,11 @@ from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json
 from surfkit.execute import Inline, Pool
 from surfkit.execute.state import read_state
-from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import load_run, run
 from surfkit.raster.select import select
-from surfkit.readers.data import Data
-from surfkit.recipe import Recipe
 from surfkit.run.stage import Intervals
-from surfkit.testing.synthetic import Flight, photograph, write_colmap
-from surfkit.train import checkpoint
-from surfkit.train import streaming as pieces
+from surfkit.train import checkpoint, streaming
 from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Stage
-
-STEPS = 12
-EVERY = Intervals(checkpoint=4, pictures=0)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory) -> Data:
-    folder = tmp_path_factory.mktemp("scene")
-    write_colmap(folder, photograph(Flight(views=16, width=32, height=24, points=200)))
-    return Data(folder)
-
-
-@pytest.fixture(scope="module")
-def recipe() -> Recipe:
-    """Two blocks, half of the points each; colours learn all degrees in pretraining, and none would while tuning."""
-    stage = Stage(steps=STEPS, sh_every=1_000)
-    return Recipe(
-        pretrain=replace(stage, sh_every=STEPS // 3), partition=QuantileGrid((2, 1)), assign=PictureShare(), tune=stage
-    )
-
-
-@pytest.fixture(scope="module")
-def undisturbed(data, recipe, tmp_path_factory):
-    out = tmp_path_factory.mktemp("undisturbed") / "run"
-    run(recipe, data, out, Compute("cpu"), EVERY)
-    return out
-
-
-def params(out: Path) -> dict[str, torch.Tensor]:
-    """Raw parameters of the merged model."""
-    return checkpoint.load_last(out / "tune" / "checkpoint.safetensors")[0].points.params
-
-
-def same(a: Path, b: Path) -> bool:
-    one, other = params(a), params(b)
-    cloud = (a / "point_cloud.ply").read_bytes() == (b / "point_cloud.ply").read_bytes()
-    return cloud and all(torch.equal(value, other[name]) for name, value in one.items())
 
 
 def test_what_a_run_leaves(undisturbed, data, recipe):
@@ -93,7 +46,7 @@ def test_what_a_run_leaves(undisturbed, data, recipe):
 
 def test_merged_points_lie_in_their_block(undisturbed):
     """ViewCounts from the blocks' own results: what each owns of what it has come to, in their order."""
-    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
     parts = []
     for index in range(2):
         state, _ = checkpoint.load_last(undisturbed / "blocks" / f"{index:03}" / "tune" / "checkpoint.safetensors")
@@ -118,16 +71,16 @@ def test_a_pool_comes_to_the_same_bits(undisturbed, data, recipe, tmp_path):
 
 def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_path, monkeypatch):
     """Ctrl-C between two steps of the second block; then another executor finishes."""
-    train_block = blocks.train_block
+    train_block = schedule.train_block
 
     def stopped(ctx, block):
         if block.index == 1:
             ctx = replace(ctx, intervals=Intervals(checkpoint=4, pictures=0))
-            monkeypatch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
+            monkeypatch.setattr(worker, "optimise", stop_after(worker.optimise, 6))
         return train_block(ctx, block)
 
     with monkeypatch.context() as patch:
-        patch.setattr(blocks, "train_block", stopped)
+        patch.setattr(schedule, "train_block", stopped)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     monkeypatch.undo()
@@ -139,31 +92,9 @@ def test_interrupted_in_a_block_and_continued(undisturbed, data, recipe, tmp_pat
     assert same(tmp_path, undisturbed)
 
 
-def stop_after(optimise, step):
-    """An `optimise` during which SIGINT comes after a step."""
-    from surfkit.run import stage as module
-
-    def stopping(job, state):
-        display = module.Display
-
-        class Interrupting(display):
-            def show(self, done):
-                super().show(done)
-                if done.index == step:
-                    os.kill(os.getpid(), signal.SIGINT)
-
-        module.Display = Interrupting
-        try:
-            return optimise(job, state)
-        finally:
-            module.Display = display
-
-    return stopping
-
-
 def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_path, capsys):
     """The first process of block 0 kills itself in the middle of its steps; the next one goes on."""
-    command = blocks.job_of
+    command = schedule.job_of
 
     def deadly(ctx, block, compute):
         job = command(ctx, block, compute)
@@ -178,7 +109,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
         return job
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(blocks, "job_of", deadly)
+        patch.setattr(schedule, "job_of", deadly)
         run(recipe, data, tmp_path / "run", Compute("cpu", Pool(workers=2)), EVERY)
     assert (
         tmp_path / "killed"
@@ -187,7 +118,7 @@ def test_a_worker_that_is_killed_is_tried_again(undisturbed, data, recipe, tmp_p
 
 
 def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, tmp_path, capsys):
-    optimise = tuning.optimise
+    optimise = worker.optimise
 
     def failing(job, state):
         if job.stage.out.name == "001":
@@ -195,7 +126,7 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
         return optimise(job, state)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuning, "optimise", failing)
+        patch.setattr(worker, "optimise", failing)
         with pytest.raises(Unfinished, match="block 1 failed: numbers are not finite; the others are done") as told:
             run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert told.value.status == 3
@@ -209,9 +140,9 @@ def test_a_block_that_always_fails_leaves_the_others(undisturbed, data, recipe, 
 
 def test_a_block_that_is_said_to_be_done(data, recipe, tmp_path, monkeypatch):
     """By a worker that does not see our disk, say; nothing of its work is here."""
-    command = blocks.job_of
-    monkeypatch.setattr(blocks, "ARRIVE_S", 0.2)
-    monkeypatch.setattr(blocks, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
+    command = schedule.job_of
+    monkeypatch.setattr(schedule, "ARRIVE_S", 0.2)
+    monkeypatch.setattr(schedule, "job_of", lambda *given: replace(command(*given), command=("-c", "pass")))
     with pytest.raises(Unfinished, match="block 1 failed: nothing of its work has come to"):
         run(recipe, data, tmp_path, Compute("cpu", Pool(workers=2)), EVERY)
 
@@ -246,10 +177,10 @@ def test_another_coarse_model_puts_blocks_aside(data, recipe, tmp_path):
     run(longer, data, tmp_path, Compute("cpu"), EVERY)
     assert (tmp_path / "blocks-before" / "000").is_dir()
     assert "blocks are tuned anew" in (tmp_path / "run.json").read_text()
-    before = read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record)
+    before = read_json(tmp_path / "blocks-before" / "plan.json", schedule.Record)
     (tmp_path / "blocks" / "plan.json").unlink()
     run(longer, data, tmp_path, Compute("cpu"), EVERY)
-    assert read_json(tmp_path / "blocks-before" / "plan.json", blocks.Record) == before, "nothing is overwritten"
+    assert read_json(tmp_path / "blocks-before" / "plan.json", schedule.Record) == before, "nothing is overwritten"
     assert (tmp_path / "blocks-before-2" / "000").is_dir() and "blocks-before-2" in (tmp_path / "run.json").read_text()
 
 
@@ -309,7 +240,7 @@ def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
     other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"held\n"
-        assert main(["tune", str(tmp_path / "run"), "0"]) == tuning.BUSY
+        assert main(["tune", str(tmp_path / "run"), "0"]) == worker.BUSY
     finally:
         other.kill()
         other.wait()
@@ -353,18 +284,18 @@ def test_tune_by_hand(undisturbed, tmp_path, capsys):
 
 def test_a_block_begins_with_what_it_owns_and_what_its_views_show(undisturbed, monkeypatch):
     """From pieces of 7 points, against the whole coarse model and pictures of all of it."""
-    monkeypatch.setattr(pieces, "ROWS", 7)
+    monkeypatch.setattr(streaming, "ROWS", 7)
     loaded, _, scene = load_run(undisturbed)
-    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
     rasterizer = select("cpu")[0]
-    ctx = tuning.RunContext(loaded, scene, rasterizer, EVERY, CacheSettings())
+    ctx = worker.RunContext(loaded, scene, rasterizer, EVERY, CacheSettings())
     coarse = checkpoint.load(undisturbed / "pretrain" / "checkpoint.safetensors")
     splats = loaded.recipe.primitive.activate(coarse.points.params, coarse.sh_degree)
     for index in range(2):
         views = [view for view in scene.train if view.name in plan.blocks[index].views][:1]
         wanted = plan.cells.owner(coarse.points.params["means"]) == index
         wanted |= rasterizer.render(splats, views[0].camera, loaded.recipe.pretrain.near).seen
-        begun = tuning.Start(ctx, Block(loaded, plan, index), views)()
+        begun = worker.Start(ctx, Block(loaded, plan, index), views)()
         found = begun.params
         assert begun.sh_degree == coarse.sh_degree == 3
         assert 100 < int(wanted.sum()) and found.keys() == coarse.points.params.keys()
@@ -402,14 +333,14 @@ def test_a_block_is_tuned_without_the_data_set(undisturbed, data, recipe, tmp_pa
 def test_what_a_block_begins_with_is_foretold(undisturbed, data, recipe, tmp_path):
     """Not what it owns: what its views show is drawn, too. Its few views are all looked at here, so it is exact."""
     loaded, _, scene = load_run(undisturbed)
-    plan = read_json(undisturbed / "blocks" / "plan.json", blocks.Record).plan
+    plan = read_json(undisturbed / "blocks" / "plan.json", schedule.Record).plan
     begun = read_state(undisturbed / "blocks" / "000").begun_points
     assert plan.blocks[0].begins == begun > plan.blocks[0].points
-    fresh = tuning.RunContext(replace(loaded, out=tmp_path), scene, select("cpu")[0], EVERY, CacheSettings())
-    memory = [blocks.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes]
+    fresh = worker.RunContext(replace(loaded, out=tmp_path), scene, select("cpu")[0], EVERY, CacheSettings())
+    memory = [schedule.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes]
     Block(fresh.run, plan, 0).write(begun_points=begun + 10)
-    memory.append(blocks.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes)
-    assert memory[1] - memory[0] == 10 * 3 * foresight.POINT_BYTES, "what it has really begun with counts more"
+    memory.append(schedule.job_of(fresh, Block(fresh.run, plan, 0), Compute("cpu")).memory_bytes)
+    assert memory[1] - memory[0] == 10 * 3 * forecast.POINT_BYTES, "what it has really begun with counts more"
 
 
 def test_an_inline_executor_is_the_default(recipe):

@@ -31,7 +31,7 @@ from surfkit.recipe import Recipe
 from surfkit.start.stereo import StereoStart
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import CacheSettings
-from surfkit.train.stage import Stage
+from surfkit.train.stage import Stage, Trainer
 
 SWEEP = PlaneSweep(longest=32, neighbours=2, max_planes=16)
 
@@ -163,9 +163,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
     farm, recipe, tmp_path, own_cache, monkeypatch
 ):
     run(recipe, farm, tmp_path / "whole")
-    from surfkit.run import stage as optimise
-
-    take, steps = optimise.Trainer.step, []
+    take, steps = Trainer.step, []
 
     def stopped(self, state):
         steps.append(1)
@@ -176,7 +174,7 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
     from surfkit.run.stage import Intervals
 
     with monkeypatch.context() as patch:
-        patch.setattr(optimise.Trainer, "step", stopped)
+        patch.setattr(Trainer, "step", stopped)
         with pytest.raises(KeyboardInterrupt):
             run(recipe, farm, tmp_path / "run", intervals=Intervals(checkpoint=2))
     shutil.rmtree(own_cache / "depth")

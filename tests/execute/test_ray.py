@@ -12,10 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 from needs import needs
-from test_blocks import EVERY, data, recipe, same, stop_after, undisturbed  # noqa: F401 (fixtures)
+from two_blocks import EVERY, same, stop_after
 
-from surfkit.blocks import schedule as blocks
-from surfkit.blocks import worker as tuning
+from surfkit.blocks import schedule, worker
 from surfkit.blocks.schedule import Compute, Unfinished
 from surfkit.core.check import BadInput
 from surfkit.execute import Ray
@@ -120,9 +119,10 @@ def test_the_kind_of_failure_that_an_error_means():
 
 def test_the_driver_is_killed(cluster, tmp_path):
     """Ray kills the agents of a driver that is gone; what works for them notices, and saves."""
-    here, folder = str(Path(__file__).parent), str(tmp_path)
+    tests, folder = str(Path(__file__).parents[1]), str(tmp_path)
     code = (
-        f"import sys; sys.path.insert(0, {here!r})\nfrom pathlib import Path\nfrom test_ray import SAVING, job\n"
+        f"import sys; sys.path[:0] = {[tests]}\nfrom pathlib import Path\n"
+        "from execute.test_ray import SAVING, job\n"
         "from surfkit.execute import Ray\n"
         f"list(Ray(address={cluster.address!r}, cpus=1, memory_gb=0.1).run([job(Path({folder!r}), 0, SAVING)]))"
     )
@@ -134,13 +134,13 @@ def test_the_driver_is_killed(cluster, tmp_path):
     wait_for(lambda: not psutil.pid_exists(int((tmp_path / "000" / "began").read_text())))
 
 
-def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):  # noqa: F811
+def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, recipe, workers, tmp_path):
     """Begun by inline, which is interrupted in the first block; the second fails on the cluster; inline does that."""
-    train_block, command = blocks.train_block, blocks.job_of
+    train_block, command = schedule.train_block, schedule.job_of
 
     def stopped(ctx, block):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(tuning, "optimise", stop_after(tuning.optimise, 6))
+            patch.setattr(worker, "optimise", stop_after(worker.optimise, 6))
             return train_block(ctx, block)
 
     def failing(ctx, block, compute):
@@ -148,14 +148,14 @@ def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, r
         return replace(made, needs=(tmp_path / "elsewhere",)) if block.index == 1 else made
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(blocks, "train_block", stopped)
+        patch.setattr(schedule, "train_block", stopped)
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     assert read_state(tmp_path / "blocks" / "000").step == 6
     with (
         pytest.MonkeyPatch.context() as patch,
         pytest.raises(Unfinished, match="1 failed: machine .*elsewhere") as told,
     ):
-        patch.setattr(blocks, "job_of", failing)
+        patch.setattr(schedule, "job_of", failing)
         run(recipe, data, tmp_path, Compute("cpu", workers), EVERY)
     states = [read_state(tmp_path / "blocks" / f"00{at}") for at in (0, 1)]
     assert told.value.status == 3 and [state.status for state in states] == ["done", "failed"]
@@ -164,11 +164,11 @@ def test_begun_here_goes_on_there_and_one_that_always_fails(undisturbed, data, r
     assert same(tmp_path, undisturbed)
 
 
-def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):  # noqa: F811
+def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, monkeypatch, capsys):
     """It is killed while a block is between two steps, which is saved there, and finished on the other node."""
     node = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"], memory=SMALL["memory"])
     agent = node.all_processes["raylet"][0].process.pid
-    reached, gone, command = tmp_path / "reached", tmp_path / "gone", blocks.job_of
+    reached, gone, command = tmp_path / "reached", tmp_path / "gone", schedule.job_of
     code = (
         "import os, psutil, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
         f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
@@ -190,7 +190,7 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
 
     thread = threading.Thread(target=lose)
     thread.start()
-    monkeypatch.setattr(blocks, "job_of", lingering)
+    monkeypatch.setattr(schedule, "job_of", lingering)
     run(recipe, data, tmp_path / "run", Compute("cpu", workers), EVERY)
     thread.join()
     assert gone.exists() and same(tmp_path / "run", undisturbed)
