@@ -1,9 +1,9 @@
 """Measure vector quantisation against faiss: `python bench/vq.py [MODEL.ply]`.
 
 Seconds and distortion of `kmeans` and of the final `nearest` over all vectors, and of faiss-cpu with as many codes,
-iterations, threads and vectors a code, in turns after a warm-up; medians, and the medians of the ratios ours / faiss, as
-other programs may run on the machine. Vectors are random ones in clusters, and the spherical harmonics of a trained model
-where a PLY file is given. faiss is not among the packages that surfkit needs: `pip install faiss-cpu`.
+iterations and threads, in turns after a warm-up; medians, and the medians of the ratios ours / faiss, as other programs
+may run on the machine. Vectors are random ones in clusters, and the spherical harmonics of a trained model where a PLY
+file is given. faiss is not among the packages that surfkit needs: `pip install faiss-cpu`.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def main() -> None:
         parser.error("faiss is not installed; pip install faiss-cpu, then call this again")
     data = {"2000 clusters, 45 dimensions": clustered(options.vectors, 45, 2000)}
     if options.model:
-        data[f"spherical harmonics of {options.model.stem}"] = harmonics(options.model, options.vectors)
+        data[f"spherical harmonics of a model"] = harmonics(options.model, options.vectors)
     figures: dict = {"faiss": faiss.__version__, "rounds": options.rounds}
     for name, vectors in data.items():
         for codes in options.codes:
