@@ -102,7 +102,7 @@ def main() -> None:
         parser.error("faiss is not installed; pip install faiss-cpu, then call this again")
     data = {"2000 clusters, 45 dimensions": clustered(options.vectors, 45, 2000)}
     if options.model:
-        data[f"spherical harmonics of a model"] = harmonics(options.model, options.vectors)
+        data["spherical harmonics of a model"] = harmonics(options.model, options.vectors)
     figures: dict = {"faiss": faiss.__version__, "rounds": options.rounds}
     for name, vectors in data.items():
         for codes in options.codes:
