@@ -1,8 +1,10 @@
 """Vector quantisation: weighted k-means.
 
-Lloyd's iterations from seeds that are drawn in a few rounds, each in proportion to the weighted squared distance to the
-seeds before (k-means||: Bahmani et al. 2012). Assignments are exact and sums are float64 in the order of the vectors, so
-a seed gives the same bits on any number of threads, with any instruction set, and without a compiler.
+Lloyd's iterations from vectors drawn at random. As their result depends much on where they begin, each iteration also
+merges codes that are close to one another, and splits in their place codes whose vectors lie far apart, wherever this
+makes the sum smaller (after Patane and Russo 2001, "The enhanced LBG algorithm"). Assignments are exact and sums are
+float64 in the order of the vectors, so a seed gives the same bits on any number of threads, with any instruction set,
+and without a compiler.
 """
 
 from __future__ import annotations
@@ -14,14 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.compress.nearest import Features, checked, nearest, searching
+from surfkit.compress.nearest import Features, Search, checked, nearest, searching
 from surfkit.core.check import BadInput, expect
 from surfkit.native import module
 
 __all__ = ["kmeans", "nearest"]
 
-ROUNDS = 4
-"""In which the seeds are drawn."""
+HALVINGS = 2
+"""Times that the vectors of a code are halved, each in a better direction."""
 EACH = 64
 """Vectors for each code that the iterations look at, unless told otherwise."""
 FEWEST = 1 << 18
@@ -45,16 +47,16 @@ def kmeans(
     """(codes, D) float32 centroids that make the weighted sum of squared distances to the nearest one small.
 
     Where no more than `codes` different vectors have a weight, the result is these, then others, then copies of the
-    first. A code without vectors is moved to the vector of the largest weighted error. Memory is of the order of the
-    arguments. No number of threads and no instruction set changes a bit, nor does a missing compiler, without which it
-    takes some fifty times longer.
+    first. Codes without vectors, and those that can be spared, are moved to where the weighted error is largest. Memory
+    is of the order of the arguments. No number of threads and no instruction set changes a bit, nor does a missing
+    compiler, without which it takes some fifty times longer.
 
     Args:
         vectors: (N, D) float32.
         codes: Number of centroids, at least 1.
         weights: (N,) not negative; None, or zeros alone, for equal ones.
         seed: Of the vectors looked at and the first centroids.
-        iterations: Times that all centroids are moved to the mean of their vectors; fewer if nothing changes any more.
+        iterations: Times that all centroids are moved; fewer if nothing changes any more.
         sample: Vectors that the iterations look at, drawn at random, at least `codes`; None for 64 a code and at
             least 262,144.
         progress: Is given the number of assignments done, and of all; called several times a second.
@@ -130,7 +132,7 @@ class Lloyd:
     def __post_init__(self) -> None:
         some = Features.of(self.vectors[:SURVEYED]).fitted(self.vectors, self.vectors[: self.codes])
         self.features, self.of_vectors = some, some(self.vectors)
-        self.done, self.all = 0, len(self.vectors) * (ROUNDS - 1 + self.iterations)
+        self.done, self.all = 0, len(self.vectors) * self.iterations
 
     def run(self) -> Tensor:
         """(codes, D) centroids."""
@@ -148,48 +150,125 @@ class Lloyd:
         if self.progress is not None and count:
             self.progress(self.done, self.all)
 
-    def nearest(self, codebook: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) index of the nearest code and (N,) float64 squared distance."""
-        search = searching(codebook, self.features)
-        index, distance = np.empty(len(self.vectors), np.int32), np.empty(len(self.vectors))
-        for rows in search.parts(len(self.vectors)):
-            index[rows], distance[rows] = search.nearest(self.vectors[rows], self.of_vectors[rows])
-            self.report(rows.stop - rows.start)
-        return index, distance
-
     def seeds(self) -> Tensor:
-        """(codes, D) vectors, far from one another."""
-        chosen, error = np.empty(0, np.int64), np.full(len(self.weight), np.inf)
-        worth = self.weight
-        for left in range(ROUNDS, 0, -1):
-            fresh = drawn(worth, (self.codes - len(chosen)) // left, self.generator)
-            chosen = np.concatenate([chosen, fresh])
-            if left > 1 and len(fresh):
-                error = np.minimum(error, self.nearest(self.vectors[torch.from_numpy(fresh)])[1])
-                worth = self.weight * error
-        others = np.setdiff1d(np.arange(len(self.weight)), chosen)[: self.codes - len(chosen)]
+        """(codes, D) vectors, drawn at even steps of the weight; those heavier than a step once."""
+        ends = np.cumsum(self.weight)
+        steps = (np.arange(self.codes) + self.generator.random()) * (ends[-1] / self.codes)
+        chosen = np.unique(np.searchsorted(ends, steps, side="right").clip(0, len(ends) - 1))
+        others = np.setdiff1d(np.arange(len(ends)), chosen)[: self.codes - len(chosen)]
         return self.vectors[torch.from_numpy(np.concatenate([chosen, others]))]
 
     def improved(self, codebook: Tensor) -> Tensor:
-        """Each code at the mean of its vectors, or at a vector far from all codes where it has none."""
-        index, error = self.nearest(codebook)
-        total = sums(self.vectors, self.weight, index, self.codes)
-        dead = np.flatnonzero(total[:, -1] == 0)
-        total[dead, -1] = 1
-        moved = torch.from_numpy((total[:, :-1] / total[:, -1:]).astype(np.float32))
-        if len(dead):
-            worst = np.argsort(-self.weight * error, kind="stable")[: len(dead)]
-            moved[torch.from_numpy(dead)] = self.vectors[torch.from_numpy(worst)]
-        return moved
+        """Each code at the mean of its vectors, after some are merged and others split."""
+        search = searching(codebook, self.features)
+        index, error = self.assigned(search)
+        means = Means.of(sums(self.vectors, self.weight, index, self.codes), codebook)
+        places = means.places.copy()
+        if self.codes > 1:
+            halves = self.halves(index, error, means)
+            centres = torch.from_numpy(places.astype(np.float32))
+            own = torch.arange(self.codes, dtype=torch.int32)
+            close = search.nearest(centres, self.features(centres), own)[0].numpy()
+            relocate(places, means, halves, close)
+        return torch.from_numpy(places.astype(np.float32))
+
+    def assigned(self, search: Search) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) int32 index of the nearest code, and (N,) float64 weighted squared distance."""
+        index, error = np.empty(len(self.vectors), np.int32), np.empty(len(self.vectors))
+        for rows in search.parts(len(self.vectors)):
+            index[rows], error[rows] = search.nearest(self.vectors[rows], self.of_vectors[rows])
+            self.report(rows.stop - rows.start)
+        return index, error * self.weight
+
+    def halves(self, index: np.ndarray, error: np.ndarray, means: Means) -> Means:
+        """The means of both halves of the vectors of each code, first of one half and then of the other.
+
+        They are halved by their direction from the mean: that of the largest error, and then that from half to half.
+        """
+        order = np.argsort(error, kind="stable")
+        farthest = np.zeros(self.codes, np.int64)
+        farthest[index[order]] = order  # the last one stays
+        directions = self.vectors.numpy()[farthest] - means.places
+        for _ in range(HALVINGS):
+            halved = halve(self.vectors, means.places, directions, index)
+            halves = Means.of(sums(self.vectors, self.weight, halved, 2 * self.codes), np.repeat(means.places, 2, 0))
+            directions = halves.places[1::2] - halves.places[::2]
+        return halves
 
 
-def drawn(worth: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Indices of up to `count` items, drawn in proportion to their worth at even steps; none twice."""
-    ends = np.cumsum(worth)
-    if not count or not ends[-1]:
-        return np.empty(0, np.int64)
-    steps = (np.arange(count) + generator.random()) * (ends[-1] / count)
-    return np.unique(np.searchsorted(ends, steps, side="right").clip(0, len(ends) - 1))
+@dataclass(frozen=True)
+class Means:
+    """Of the vectors of each code.
+
+    Attributes:
+        weight: (K,) sum of their weights.
+        places: (K, D) float64 weighted mean; what it was before, where there is none.
+    """
+
+    weight: np.ndarray
+    places: np.ndarray
+
+    @classmethod
+    def of(cls, total: np.ndarray, before: np.ndarray | Tensor) -> Means:
+        """From (K, D + 1) sums."""
+        weight = total[:, -1]
+        mean = total[:, :-1] / np.where(weight > 0, weight, 1)[:, None]
+        return cls(weight, np.where(weight[:, None] > 0, mean, np.asarray(before, np.float64)))
+
+    def parting(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """How much more the sum is when the vectors of two codes have one mean, not two."""
+        together = np.maximum(self.weight[one] + self.weight[other], np.finfo(float).tiny)
+        apart = squares(self.places[one] - self.places[other])
+        return self.weight[one] / together * self.weight[other] * apart
+
+
+def relocate(places: np.ndarray, means: Means, halves: Means, close: np.ndarray) -> None:
+    """Merge codes and split others in their place, as long as this makes the sum of squares smaller.
+
+    Args:
+        places: (K, D) float64 codes, changed.
+        means: Of the vectors of each code.
+        halves: Of both halves of them.
+        close: (K,) another code near each.
+    """
+    codes = np.arange(len(places))
+    cost, gain = means.parting(codes, close), halves.parting(2 * codes, 2 * codes + 1)
+    splits = iter(np.argsort(-gain, kind="stable").tolist())
+    is_changed = np.zeros(len(places), bool)
+    for code in np.argsort(cost, kind="stable").tolist():
+        other, is_alive = close[code], means.weight[code] > 0
+        if is_changed[code] or (is_alive and is_changed[other]):
+            continue
+        is_changed[code] = True
+        is_changed[other] |= is_alive
+        split = next((split for split in splits if not is_changed[split]), None)
+        if split is None or gain[split] <= cost[code]:
+            return
+        if is_alive:
+            one, two = means.weight[code], means.weight[other]
+            places[other] = (one * means.places[code] + two * means.places[other]) / (one + two)
+        places[code], places[split] = halves.places[2 * split], halves.places[2 * split + 1]
+        is_changed[split] = True
+
+
+def squares(rows: np.ndarray) -> np.ndarray:
+    """(N,) float64 sums of the squares of each row, in their order."""
+    total = np.zeros(len(rows))
+    for column in rows.T:
+        total += column * column
+    return total
+
+
+def halve(vectors: Tensor, middles: np.ndarray, directions: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """(N,) int32: twice the code, and one more for vectors ahead of its middle in its direction."""
+    halved = index.copy()
+    if module() is not None:
+        module().halve(vectors.numpy(), middles, directions, halved, torch.get_num_threads())
+        return halved
+    ahead = np.zeros(len(halved))
+    for x, middle, direction in zip(vectors.numpy().T, middles.T, directions.T, strict=True):
+        ahead += (x - middle[index]) * direction[index]
+    return 2 * halved + (ahead > 0)
 
 
 def sums(vectors: Tensor, weight: np.ndarray, index: np.ndarray, codes: int) -> np.ndarray:

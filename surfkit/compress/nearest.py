@@ -148,8 +148,11 @@ class Search(Protocol):
     def parts(self, rows: int) -> Iterator[slice]:
         """Slices of so many vectors, each for one call that takes a fraction of a second."""
 
-    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """As `nearest` of the module, for (N, D) vectors whose (N, F) features are known."""
+    def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As `nearest` of the module, for (N, D) vectors whose (N, F) features are known.
+
+        `without` is the (N,) int32 index of a code that does not count for that vector; there must be another.
+        """
 
 
 class NativeSearch(Search):
@@ -165,9 +168,10 @@ class NativeSearch(Search):
         size = min(ROWS, max(256 * threads, WORK * threads // self.work))
         return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
 
-    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:
         index, distance = torch.empty(len(vectors), dtype=torch.int32), torch.empty(len(vectors))
-        arrays = (array.numpy() for array in (vectors, features, index, distance))
+        given = vectors, features, without, index, distance
+        arrays = (None if array is None else array.numpy() for array in given)
         self.codes.nearest(*arrays, module().kernels_in_use(), torch.get_num_threads())
         return index, distance
 
@@ -186,9 +190,11 @@ class TorchSearch(Search):
         size = max(1, ENTRIES // len(self.codebook))
         return (slice(at, min(rows, at + size)) for at in range(0, rows, size))
 
-    def nearest(self, vectors: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def nearest(self, vectors: Tensor, features: Tensor, without: Tensor | None = None) -> tuple[Tensor, Tensor]:
         centred = vectors.double() - self.mean
         score = self.half - centred @ self.centred.T  # half the squared distance, less that to the mean
+        if without is not None:
+            score[torch.arange(len(score)), without.long()] = torch.inf
         error = (vectors.shape[1] + 16) * 2.0**-53 * (centred.norm(dim=1) + self.reach).square() + 1e-300
         row, code = (score <= (score.amin(1) + 2 * error)[:, None]).nonzero().T
         exact = torch.zeros(len(row), dtype=torch.float64)

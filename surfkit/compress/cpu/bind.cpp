@@ -1,10 +1,12 @@
 // What Python sees of the codebooks: arrays are checked in compress/kmeans.py, which alone calls this.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -18,9 +20,11 @@ namespace {
 
 using Floats = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Order = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Known = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Index = nb::ndarray<int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Distance = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Weights = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Places = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Sums = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
 const NearestKernels& named(const std::string& name) {
@@ -63,8 +67,10 @@ class Codebook {
                   index_.data(), minus_.data(), half_.data(), radius_.data()};
     }
 
-    void nearest(Floats vectors, Floats features, Index index, Distance distance, const std::string& kernels, int threads) const {
-        const NearestJob job{codes_, vectors.data(), features.data(), (int64_t)vectors.shape(0), index.data(), distance.data()};
+    void nearest(Floats vectors, Floats features, std::optional<Known> without, Index index, Distance distance,
+                 const std::string& kernels, int threads) const {
+        const NearestJob job{codes_, vectors.data(), features.data(), without ? without->data() : nullptr,
+                             (int64_t)vectors.shape(0), index.data(), distance.data()};
         const NearestKernels& k = named(kernels);
         nb::gil_scoped_release free;
         const int64_t tiles = (job.rows + k.rows - 1) / k.rows, share = 8;
@@ -81,8 +87,7 @@ class Codebook {
 };
 
 // Weighted sums of the vectors of each code, in the order of the vectors, and of their weights in the last column.
-void sum_by_code(Floats vectors, Weights weights, nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> index,
-                 Sums sums, int threads) {
+void sum_by_code(Floats vectors, Weights weights, Known index, Sums sums, int threads) {
     const int64_t rows = (int64_t)vectors.shape(0), dimensions = (int64_t)vectors.shape(1), codes = (int64_t)sums.shape(0);
     const float* v = vectors.data();
     const double* w = weights.data();
@@ -100,15 +105,34 @@ void sum_by_code(Floats vectors, Weights weights, nb::ndarray<const int32_t, nb:
     });
 }
 
+// Twice the code of each vector, and one more where it lies ahead of the middle of the code in its direction. In place.
+void halve(Floats vectors, Places middles, Places directions, Index index, int threads) {
+    const int64_t rows = (int64_t)vectors.shape(0), dimensions = (int64_t)vectors.shape(1), share = 4096;
+    const float* v = vectors.data();
+    const double *middle = middles.data(), *direction = directions.data();
+    int32_t* code = index.data();
+    nb::gil_scoped_release free;
+    parallel((rows + share - 1) / share, threads, [&](int64_t piece) {
+        for (int64_t row = piece * share; row < std::min(rows, (piece + 1) * share); row++) {
+            const int64_t at = code[row] * dimensions;
+            double ahead = 0;
+            for (int64_t j = 0; j < dimensions; j++)
+                ahead += ((double)v[row * dimensions + j] - middle[at + j]) * direction[at + j];
+            code[row] = 2 * code[row] + (ahead > 0);
+        }
+    });
+}
+
 }  // namespace
 
 void add_compress(nb::module_& m) {
     nb::class_<Codebook>(m, "Codebook")
         .def(nb::init<Floats, Floats, Order>(), nb::arg("values"), nb::arg("features"), nb::arg("order"))
-        .def("nearest", &Codebook::nearest, nb::arg("vectors"), nb::arg("features"), nb::arg("index"), nb::arg("distance"),
-             nb::arg("kernels"), nb::arg("threads"));
+        .def("nearest", &Codebook::nearest, nb::arg("vectors"), nb::arg("features"), nb::arg("without").none(), nb::arg("index"),
+             nb::arg("distance"), nb::arg("kernels"), nb::arg("threads"));
     m.def("sum_by_code", &sum_by_code, nb::arg("vectors"), nb::arg("weights"), nb::arg("index"), nb::arg("sums"),
           nb::arg("threads"));
+    m.def("halve", &halve, nb::arg("vectors"), nb::arg("middles"), nb::arg("directions"), nb::arg("index"), nb::arg("threads"));
 }
 
 }  // namespace surfkit

@@ -72,11 +72,13 @@ struct Search {
     int64_t row;
     const float* vector;
     std::vector<std::pair<float, int32_t>>* close;  // float32 distances and places of codes that may be the nearest
+    int32_t without;
     float slack, tiny;  // bounds of the rounding errors of the float32 distances, relative and absolute
     float least, limit; // of the float32 distances, and what is needed to be the nearest after all
 
     void begin(const NearestJob& j, int64_t r, std::vector<std::pair<float, int32_t>>& c) {
         job = &j, row = r, vector = j.vectors + r * j.codes.dimensions, close = &c;
+        without = j.without ? j.without[r] : -1;
         slack = 1 + 2 * (float)(j.codes.dimensions + 8) * kUnit;
         tiny = (float)(j.codes.dimensions + 8) * std::ldexp(1.0f, -125);
         least = limit = std::numeric_limits<float>::infinity();
@@ -106,6 +108,8 @@ struct Search {
             store(each, sum);
             for (; some; some &= some - 1) {
                 const int lane = __builtin_ctz(some);
+                const int32_t code = job->codes.index[block * kBlock + p * kLanes + lane];
+                if (code < 0 || code == without) continue;
                 close->push_back({each[lane], block * kBlock + p * kLanes + lane});
                 if (each[lane] < least) least = each[lane], limit = least * slack + tiny;
             }
@@ -118,7 +122,7 @@ struct Search {
         int32_t index = -1;
         for (const auto& [rough, place] : *close) {
             const int32_t code = job->codes.index[place];
-            if (rough > limit || code < 0) continue;
+            if (rough > limit) continue;
             const float* value = job->codes.value + (int64_t)(place / kBlock) * dimensions * kBlock + place % kBlock;
             double sum = 0;
             for (int j = 0; j < dimensions; j++) {

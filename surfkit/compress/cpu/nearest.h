@@ -24,9 +24,10 @@ struct NearestJob {
     Codes codes;
     const float* vectors;   // (rows, dimensions)
     const float* features;  // (rows, features)
+    const int32_t* without; // (rows) a code of each row that does not count, or null
     int64_t rows;
     int32_t* index;   // (rows) out
-    float* distance;  // (rows) out, squared
+    float* distance;  // (rows) out, squared; infinite, and -1 the index, where no code counts
 };
 
 // Memory of one thread.
