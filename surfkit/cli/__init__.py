@@ -28,7 +28,7 @@ COMMANDS = {
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
-    "export": "Write the points of a run as PLY, for other programs.",
+    "export": "Write the splats of a run or of a file in another format, for other programs.",
     "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import warnings
 import zipfile
@@ -17,6 +16,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import from_json
 from surfkit.export.bits import from_smallest_three, logits
 from surfkit.export.table import SplatTable
 from surfkit.export.unpack import refuse_implausible
@@ -111,10 +111,11 @@ class _Meta:
 
     def __init__(self, path: Path, member: Callable[[str], bytes]) -> None:
         self.path, self.member = path, member
+        text = member("meta.json").decode("utf-8", "replace")
         try:
-            self.values = json.loads(member("meta.json"))
-        except (ValueError, RecursionError) as error:
-            raise BadInput(f"{path}: damaged: meta.json is no JSON") from error
+            self.values = from_json(text)
+        except BadInput as error:
+            raise BadInput(f"{path}: damaged: meta.json: {error}") from error
         if not isinstance(self.values, dict):
             raise BadInput(f"{path}: meta.json has no entries; write the file again")
 
