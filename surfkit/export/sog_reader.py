@@ -23,6 +23,8 @@ from surfkit.export.unpack import refuse_implausible
 
 SIDE = 16_383
 """Most pixels of a WebP image along a side."""
+GROWTH = 16
+"""Times that files of the archive may grow: images are compressed already."""
 MODELS = {"2dgs": "surfel", "antialiased": "gaussian", "default": "gaussian"}
 
 
@@ -52,7 +54,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         entry = archive.getinfo(name)
     except KeyError as error:
         raise BadInput(f"{path}: no .sog file, or damaged: it has no {name}") from error
-    refuse_implausible(path, entry.compress_size, entry.file_size)
+    refuse_implausible(path, entry.compress_size, entry.file_size, GROWTH)
     return archive.read(entry)
 
 

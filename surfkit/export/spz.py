@@ -253,7 +253,7 @@ def _streams(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
     if not data.startswith(b"\x1f\x8b"):
         raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {MAGIC.decode()}")
     header = _header(path, inflated(path, data, 16, part=True), (1, 2, 3))
-    body, streams, at = inflated(path, data, 16 + sum(header.sizes), part=True), [], 16
+    body, streams, at = inflated(path, data, 16 + sum(header.sizes)), [], 16
     for size in header.sizes:
         streams.append(body[at : at + size])
         at += size
