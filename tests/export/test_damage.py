@@ -90,7 +90,7 @@ def test_cut_off_at_every_place(tmp_path, form):
     path = tmp_path / f"a{form.suffix}"
     form.write(path, table(count=3, degree=1))
     whole = path.read_bytes()
-    for size in {*range(0, len(whole), 7), len(whole) - 1}:
+    for size in {*range(0, len(whole), 13), *range(len(whole) - 9, len(whole))}:
         path.write_bytes(whole[:size])
         with pytest.raises(BadInput):
             form.read(path)
@@ -123,10 +123,8 @@ def test_absurd_counts_take_no_memory(tmp_path):
     most, said = peak(lambda: CompressedPLY().read(tmp_path / "a.ply"))
     assert most < 1 << 20 and "cut off after 0 of 1000000000000 rows of chunk" in said
     (tmp_path / "a.splat").write_bytes(bytes(33))
-    assert (
-        "33 bytes are no .splat file, which has 32 for each splat"
-        in peak(lambda: Splat().read(tmp_path / "a.splat"))[1]
-    )
+    _, said = peak(lambda: Splat().read(tmp_path / "a.splat"))
+    assert "33 bytes are no .splat file, which has 32 for each splat" in said
 
 
 def test_bombs_take_no_memory(tmp_path):
@@ -135,11 +133,8 @@ def test_bombs_take_no_memory(tmp_path):
     stream = zlib.compressobj(9, zlib.DEFLATED, 31)
     bomb = stream.compress(head) + b"".join(stream.compress(bytes(1 << 20)) for _ in range(200)) + stream.flush()
     (tmp_path / "a.spz").write_bytes(bomb)
-    tracemalloc.start()
-    SPZ().read(tmp_path / "a.spz")  # what follows the splats is not looked at
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 4 << 20
+    most, said = peak(lambda: SPZ().read(tmp_path / "a.spz"))
+    assert most < 4 << 20 and "cut off or damaged" in said
     frame = zstandard.ZstdCompressor().compress(bytes(100 << 20))  # says so itself
     head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 10, 0, 12, 0, 5, 32)
     rows = b"".join(struct.pack("<QQ", len(frame), width * 10) for width in (9, 1, 3, 3, 4))
@@ -149,7 +144,7 @@ def test_bombs_take_no_memory(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", b" " * (200 << 20))
     most, said = peak(lambda: SOG().read(tmp_path / "a.sog"))
-    assert most < 300 << 20 and "meta.json" in said
+    assert most < 4 << 20 and "bytes cannot hold 209,715,200" in said
 
 
 def test_images_of_absurd_sizes_take_no_memory(tmp_path, fuzzing):
@@ -164,7 +159,7 @@ def test_images_of_absurd_sizes_take_no_memory(tmp_path, fuzzing):
 
     splats.inside_zip(claim)(tmp_path / "a.sog", Somewhere)
     most, said = peak(lambda: SOG().read(tmp_path / "a.sog"))
-    assert most < 1 << 20 and "bytes cannot hold 1,073,741,824" in said
+    assert most < 16 << 20 and "bytes cannot hold 1,073,741,824" in said
 
 
 def test_names_in_meta_json_stay_in_the_archive(tmp_path):
