@@ -89,7 +89,7 @@ class Export:
             raise BadInput(f"--out {path}: files of the format {name_of(self.format)} end in {suffix}; name it so")
         if suffix and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        if path.resolve() == self.source.resolve():
+        if path.exists() and self.source.exists() and path.samefile(self.source):
             raise BadInput(f"--out {path}: this is the file that is read; name another")
         return path
 

@@ -4,6 +4,7 @@
 """
 
 import gzip
+import os
 import shutil
 import struct
 import sys
@@ -29,7 +30,7 @@ from .models import table
 hypothesis = needs("hypothesis")
 BENCH = Path(__file__).parents[2] / "bench"
 NAMES = ("compressed-ply", "ply", "sog", "splat", "spz", "spz-4")
-CASES = 300
+CASES = int(os.environ.get("SURFKIT_FUZZ_CASES", "300"))
 MOST = 64 << 20
 """Bytes that reading a damaged file of some tens of kilobytes may take."""
 
