@@ -13,6 +13,8 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from . import splats
+
 BYTES = (
     b"\xff" * 8, b"\0" * 8, b"\xff\xff\xff\x7f", struct.pack("<Q", 2**33), struct.pack("<Q", 2**62),
     struct.pack("<d", float("nan")), struct.pack("<d", float("inf")), struct.pack("<d", 1e308), b"\n", b"\0", b" ",
@@ -291,7 +293,21 @@ TEXT = (
     lines(lambda text, at, damage: text.pop(at)),
     lines(lambda text, at, damage: text.insert(at, text[damage.what % len(text)])),
 )
+
+
+def somewhere(content: bytes, damage: Damage) -> bytes:
+    """Bytes written over others at a place, or the content cut off there."""
+    at = int(damage.at * (min(len(content), 64) if damage.what % 2 else len(content)))
+    return content[:at] if damage.what % 11 == 0 else over(content, at, damage)
+
+
 BY_ENDING = {
+    ".spz": (*[splats.inside_gzip(somewhere)] * 14,),
+    ".sog": (
+        *[splats.inside_zip(splats.in_json(node), json_only=True)] * 8,
+        *[splats.inside_zip(somewhere)] * 4,
+        *[splats.inside_zip(splats.sized)] * 4,
+    ),
     ".txt": TEXT,
     ".ply": TEXT,
     ".jsonl": (*TEXT, *[event] * 6),

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from . import splats
 from .data import arrays, blender, colmap, lenses, matrixcity, nerfstudio, odm, pictures
 
 OUTPUT, MEMORY = "the output", "the memory"
@@ -96,7 +97,23 @@ SWEEP = tuple(
     )
 )  # fmt: skip
 DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
+EXPORTS = (".ply", ".compressed.ply", ".sog", ".splat", ".spz")
+
+
+def exports(name: str) -> Target:
+    """A file of splats of a format, written in all others."""
+
+    def make(here: Path) -> None:
+        splats.write_model(here / "data", name)
+
+    found = next(suffix for key, suffix in SUFFIXES.items() if name.startswith(key))
+    words = tuple(f"export {{here}}/data/model{found} --out {{here}}/out/model{suffix}" for suffix in EXPORTS)
+    return Target(make, words, ("data/model*",))
+
+
+SUFFIXES = {"compressed-ply": ".compressed.ply", "ply": ".ply", "sog": ".sog", "splat": ".splat", "spz": ".spz"}
 TARGETS = {
+    **{f"splats-{name}": exports(name) for name in splats.FORMATS},
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
     "photographs": Target(colmap, (TRAIN,), ("data/images/*",)),

@@ -2,54 +2,127 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
+from surfkit.cli.recipes import ARGV
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
-from surfkit.export.ply import write_splats
+from surfkit.core.memory import size
+from surfkit.core.registry import choice, name_of
+from surfkit.export.base import Format
+from surfkit.export.files import format_for, format_of, has_suffix
+from surfkit.export.ply import PLY
+from surfkit.export.table import SplatTable, Tile
 from surfkit.pipeline import loaded
-from surfkit.primitives.model import SplatModel
-from surfkit.run.folder import Run, refuse_no_run
+from surfkit.run.folder import refuse_no_run
 from surfkit.run.method import splats_of
-from surfkit.scene.scene import Scene
+from surfkit.run.notes import collect_notes
+from surfkit.scene.scene import Frame
 from surfkit.train.faults import full_disk_in_one_line
+
+
+def named_format() -> Format:
+    """The format of the file name after --out on the command line, if no format is chosen; else PLY."""
+    words = ARGV.get()
+    if any(word.startswith("format:") for word in words):
+        return PLY()  # is not used
+    for at, word in enumerate(words):
+        flag, _, value = word.partition("=")
+        if flag == "--out" and (value := value or "".join(words[at + 1 : at + 2])):
+            return format_for(Path(value))
+    return PLY()
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write the points of a finished run as PLY, in the data set's own frame, for SuperSplat and other viewers."""
+    """Write the splats of a finished run, or of a file of another program, in a format that viewers open.
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Folder that `surfkit train` made."""
+    Coordinates are those of the data set. Examples: `surfkit export RUN --out scene.spz`, `surfkit export scene.sog
+    --format ply`, `surfkit export RUN format:spz --format.version 4`.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_OR_FILE")]
+    """Folder that `surfkit train` made, or a file of splats in any format that can be read."""
+
+    format: Annotated[Format, choice(Format)] = field(default_factory=named_format)
+    """Format of the file; by default that of the suffix of --out, or ply."""
 
     out: Path | None = None
-    """File to write, ending in .ply; RUN/point_cloud.ply by default."""
+    """File to write; by default RUN/point_cloud with the suffix of the format, or beside FILE."""
 
     strict_2dgs: bool = False
-    """Leave out the third scale of surfels, as programs written for 2DGS alone expect."""
+    """Leave out the third scale of surfels, as programs written for 2DGS alone expect; ply only."""
+
+    def __post_init__(self) -> None:
+        if self.strict_2dgs and not isinstance(self.format, PLY):
+            raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
 
     def run(self) -> None:
-        """Write the file."""
-        refuse_no_run(self.run_folder)
-        with locked(self.run_folder) if self.out is None else nullcontext(), full_disk_in_one_line(self.run_folder):
-            with loaded(self.run_folder, "cpu") as (ctx, made):
-                self._write(ctx.run, splats_of(ctx.run, made), ctx.scene)
+        """Write the file, and say what is in it."""
+        form, path = self._format(), self._path()
+        with collect_notes(), self._opened() as (table, frame), full_disk_in_one_line(path.parent):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            form.write(path, table, frame, _tree(table) if form.wants_tree else None)
+        told = form.rounding(table)
+        print(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
+        if any(frame.shift):
+            print(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
-    def _write(self, run: Run, splats: SplatModel, scene: Scene) -> None:
-        path = self.out or run.cloud
-        if path.suffix.lower() != ".ply":
-            raise BadInput(f"--out {path}: only .ply files can be written; end the name in .ply")
-        if path.exists() and self.out is not None and path.is_dir():
+    def _format(self) -> Format:
+        return replace(self.format, strict_2dgs=True) if self.strict_2dgs else self.format
+
+    def _path(self) -> Path:
+        """Where to write; BadInput for a place that the format cannot have."""
+        suffix, path = self.format.suffix, self.out
+        if path is None and self.source.is_dir():
+            return self.source / (f"point_cloud{suffix}" if suffix else name_of(self.format))
+        if path is None:
+            path = self.source.with_name(_stem(self.source) + (suffix or f"-{name_of(self.format)}"))
+        if suffix and path.suffix.lower() != f".{suffix.rpartition('.')[2]}":  # of .compressed.ply, .ply is enough
+            raise BadInput(f"--out {path}: files of the format {name_of(self.format)} end in {suffix}; name it so")
+        if suffix and path.is_dir():
             raise BadInput(f"--out {path}: a folder; name a file")
-        table = splats.primitive.table(splats.params).in_input_frame(scene.frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_splats(path, table, strict_2dgs=self.strict_2dgs, frame=scene.frame)
-        print(f"wrote {len(splats):,} points to {path}")
+        if path.exists() and self.source.exists() and path.samefile(self.source):
+            raise BadInput(f"--out {path}: this is the file that is read; name another")
+        return path
+
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[SplatTable, Frame]]:
+        """Within, the splats in the frame of the input, and that frame."""
+        if not self.source.is_dir():
+            table = format_of(self.source).read(self.source)
+            yield table, Frame.of_positions(table.means.numpy())
+            return
+        refuse_no_run(self.source)
+        with locked(self.source) if self.out is None else nullcontext(), loaded(self.source, "cpu") as (ctx, made):
+            splats = splats_of(ctx.run, made)
+            yield splats.primitive.table(splats.params).in_input_frame(ctx.scene.frame), ctx.scene.frame
+
+
+def _stem(path: Path) -> str:
+    """The name of a file without the suffix of its format."""
+    form = format_of(path)
+    return path.name[: -len(form.suffix)] if form.suffix and has_suffix(path, form) else path.stem
+
+
+def _tree(table: SplatTable) -> Tile:
+    """All splats in one tile."""
+    means = table.means.double().numpy() if len(table) else np.zeros((1, 3))
+    return Tile(table, means.min(0), means.max(0))
+
+
+def _size(path: Path) -> str:
+    """Of a file, or of all files in a folder, in words."""
+    files = [path] if path.is_file() else [inner for inner in path.rglob("*") if inner.is_file()]
+    count = sum(file.stat().st_size for file in files)
+    return size(count) if count >= 1e7 else f"{count / 1e6:.2g} MB"
 
 
 COMMAND = Export

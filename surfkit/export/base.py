@@ -16,7 +16,7 @@ HEAD = 4096
 
 
 class Format(Component):
-    """A file format of splats, by the name that `--format` of `surfkit export` takes.
+    """A file format of splats; `surfkit export` takes `format:NAME`.
 
     Programs that know ellipsoids only are given surfels as thin ellipsoids (`SplatTable.ellipsoid_log_scales`); `read`
     makes surfels of them again (`as_surfels`, `as_surfels_if_thin`).

@@ -67,7 +67,7 @@ class CompressedPLY(Format):
             for words in packed:
                 file.write(words.tobytes())
             for rows in _batches(order) if rest else ():
-                values = (table.sh_rest[rows].numpy() * np.float32(32) + 128).clip(0, 255).astype(np.uint8)
+                values = (table.sh_rest[rows].clamp(-4, 4).numpy() * np.float32(32) + 128).clip(0, 255).astype(np.uint8)
                 file.write(values.transpose(0, 2, 1).tobytes())  # all of red, then green, then blue
 
     def read(self, path: Path) -> SplatTable:
@@ -122,7 +122,7 @@ def _packed(part: SplatTable) -> tuple[np.ndarray, np.ndarray]:
     bounds, places = [], []
     for values in groups:
         low, high = (end.reduceat(values, starts).astype(np.float32) for end in (np.minimum, np.maximum))
-        span = np.where(high > low, high - low, 1)
+        span = np.where(high > low, high.astype(np.float64) - low, 1)
         bounds += [low, high]
         places.append(((values - low[chunk]) / span[chunk]).clip(0, 1))
     color = np.concatenate([places[2], sigmoid(part.opacity_logits.numpy())[:, None]], 1)

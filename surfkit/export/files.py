@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import components, find, name_of
+from surfkit.core.registry import components, name_of
 from surfkit.export.base import HEAD, Format
 from surfkit.export.table import SplatTable
 
@@ -37,25 +37,24 @@ def format_of(path: Path) -> Format:
     found = [form for form in known if form.knows(path, head)]
     if not found:
         raise BadInput(f"{path}: no file of splats of a known format; known: {_listed(known)}")
-    return max(found, key=lambda form: _has_suffix(path, form))
+    return max(found, key=lambda form: has_suffix(path, form))
 
 
-def format_for(path: Path, name: str | None = None) -> Format:
-    """The format to write a file in: that of a name, or else that of the file name.
+def format_for(path: Path) -> Format:
+    """The format that the name of a file to be written asks for.
 
     Raises:
-        BadInput: No format has this name or this suffix.
+        BadInput: No format has this suffix.
     """
-    if name is not None:
-        return find(Format, name)()
     known = [cls() for cls in components(Format).values()]
-    found = [form for form in known if form.suffix and _has_suffix(path, form)]
+    found = [form for form in known if form.suffix and has_suffix(path, form)]
     if not found:
         raise BadInput(f"{path}: no format of splats has this suffix; known: {_listed(known)}; or give --format NAME")
     return max(found, key=lambda form: len(form.suffix))  # .compressed.ply ends in .ply too
 
 
-def _has_suffix(path: Path, form: Format) -> bool:
+def has_suffix(path: Path, form: Format) -> bool:
+    """Whether the name of a file ends as those of a format do."""
     return path.name.lower().endswith(form.suffix)
 
 

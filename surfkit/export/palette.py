@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-BINS = 1 << 16
+BINS = 1 << 12
 """Of the histogram that single values are counted in."""
-COARSE = 1 << 11
-"""Of the histogram that the codes begin with."""
-ROUNDS = 30
-"""Passes of Lloyd's algorithm over single values."""
+EVEN = 4
+"""One of so many codes for single values is spent on even distances, so that rare ones, such as the scales of large
+splats, are off by at most EVEN / size of the span; the others follow the density of the values."""
 PASSES = 6
 """Passes of Lloyd's algorithm over rows."""
 SAMPLE = 64
@@ -19,7 +18,7 @@ BLOCK = 1 << 22
 
 
 def codebook(values: np.ndarray, size: int) -> np.ndarray:
-    """The values that others are rounded to with the least squared error: 1-D k-means on a histogram.
+    """The values that others are rounded to.
 
     Args:
         values: Finite numbers, any shape.
@@ -37,18 +36,12 @@ def codebook(values: np.ndarray, size: int) -> np.ndarray:
     low, high = float(values.min()), float(values.max())
     bins = np.minimum((values - low) * (BINS / (high - low)), BINS - 1).astype(np.int64)
     count, total = (np.bincount(bins, weight, BINS) for weight in (None, values))
-    coarse = count.reshape(COARSE, -1).sum(1) ** (1 / 3)  # how dense the best codes lie, if they are many
-    spread, edges = np.concatenate([[0], np.cumsum(coarse)]), np.linspace(low, high, COARSE + 1)
-    codes = np.interp((np.arange(size) + 0.5) / size * spread[-1], spread, edges)
-    used = count > 0
-    count, total = count[used], total[used]
-    centre = total / count
-    counts, totals = (np.concatenate([[0], np.cumsum(each)]) for each in (count, total))
-    for _ in range(ROUNDS):
-        ends = np.concatenate([[0], np.searchsorted(centre, (codes[1:] + codes[:-1]) / 2), [len(centre)]])
-        inside = np.diff(counts[ends])
-        codes = np.where(inside > 0, np.diff(totals[ends]) / np.maximum(inside, 1), codes)
-    return np.sort(codes).astype(np.float32)
+    dense = count ** (1 / 3)  # the density of the codes with the least mean error, where they are many
+    share = np.cumsum(dense / dense.sum() * (1 - 1 / EVEN) + 1 / EVEN / BINS)
+    codes = np.interp((np.arange(size) + 0.5) / size, share, low + (np.arange(BINS) + 1) * (high - low) / BINS)
+    label = nearest(low + (np.arange(BINS) + 0.5) * (high - low) / BINS, codes)
+    inside, sums = (np.bincount(label, weight, size) for weight in (count, total))
+    return np.sort(np.where(inside > 0, sums / np.maximum(inside, 1), codes)).astype(np.float32)
 
 
 def nearest(values: np.ndarray, codes: np.ndarray) -> np.ndarray:
@@ -66,9 +59,10 @@ def palette(rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (K, D) float32 codes, K at most `size`, and the (N,) int32 code of each row.
     """
-    if len(rows) <= size:
-        return rows.copy(), np.arange(len(rows), dtype=np.int32)
     draw = np.random.default_rng(0)
+    _, first, label = np.unique(rows @ draw.normal(size=rows.shape[1]), return_index=True, return_inverse=True)
+    if len(first) <= size and np.array_equal(rows[first][label], rows):
+        return rows[first], label.astype(np.int32)
     groups = max(1, round(size**0.5))
     _, group = _lloyd(rows, groups, draw)
     order = np.argsort(group, kind="stable")
@@ -100,18 +94,25 @@ def _lloyd(rows: np.ndarray, size: int, draw: np.random.Generator) -> tuple[np.n
         return rows.copy(), np.arange(len(rows), dtype=np.int32)
     sample = rows[np.sort(draw.choice(len(rows), min(len(rows), SAMPLE * size), replace=False))]
     codes = sample[np.sort(draw.choice(len(sample), size, replace=False))]
+    length = (sample**2).sum(1)
     for _ in range(PASSES):
-        label = _assigned(sample, codes)
+        label, value = _assigned(sample, codes)
         order = np.argsort(label, kind="stable")
         there, starts = np.unique(label[order], return_index=True)
         count = np.diff([*starts, len(sample)])[:, None]
         codes[there] = np.add.reduceat(sample[order], starts, axis=0) / count
-    return codes, _assigned(rows, codes)
+        if len(there) < size:  # codes of no row begin again at the rows that are farthest from theirs
+            unused = np.setdiff1d(np.arange(size), there)
+            codes[unused] = sample[np.argsort(-(length + 2 * value), kind="stable")[: len(unused)]]
+    return codes, _assigned(rows, codes)[0]
 
 
-def _assigned(rows: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """(N,) the nearest code of each row, int32."""
-    half, label, step = (codes**2).sum(1) / 2, np.empty(len(rows), np.int32), max(1, BLOCK // len(codes))
+def _assigned(rows: np.ndarray, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) the nearest code of each row, int32, and half of its squared distance but for the length of the row."""
+    half, step = (codes**2).sum(1) / 2, max(1, BLOCK // len(codes))
+    label, value = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
     for start in range(0, len(rows), step):
-        label[start : start + step] = (half - rows[start : start + step] @ codes.T).argmin(1)
-    return label
+        some = half - rows[start : start + step] @ codes.T
+        label[start : start + step] = best = some.argmin(1)
+        value[start : start + step] = np.take_along_axis(some, best[:, None], 1)[:, 0]
+    return label, value

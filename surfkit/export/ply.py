@@ -53,9 +53,9 @@ class PLY(Format):
 
     def read(self, path: Path) -> SplatTable:
         """See `Format.read`."""
-        table = read_splats(path)
+        table = read_splats(path).without_infinities()
         table.refuse_unsound(path)
-        return table
+        return table.as_surfels_if_thin(1e-5)
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""

@@ -36,6 +36,8 @@ ROW = 64
 """Rows of the palette in one line of its image."""
 THIN_CODES = 16
 """Codes of the codebook that the third scale of surfels is left: viewers need it flat, not exact."""
+LIMIT = 64.0
+"""Largest coefficient of degrees 1 to 3; real ones are about 1."""
 COARSE = 4
 """A share of the median scale by which positions may be rounded without a warning."""
 
@@ -102,7 +104,7 @@ class SOG(Format):
         """What stands for the coefficients of higher degree."""
         count = table.sh_rest.shape[1]
         most = min(self.palette, 2 ** int(math.log2(len(table))))
-        rows, label = palette(table.sh_rest.flatten(1).numpy()[order], most)
+        rows, label = palette(table.sh_rest.flatten(1).clamp(-LIMIT, LIMIT).numpy()[order], most)
         codes = codebook(rows, 256)
         lines = -(-len(rows) // ROW)
         picture = np.zeros((lines * ROW, count, 3), np.uint8)
@@ -119,7 +121,7 @@ class SOG(Format):
         means = table.means.double().numpy()
         low, high, _ = _positions(means)
         apart = float(np.median((1 + np.abs(means)) * (high - low)) / 65_535)
-        scale = math.exp(float(table.log_scales[:, :2].median()))
+        scale = table.median_scale()
         if apart > scale / COARSE:
             rounded = f"{apart:.3g} apart, {apart / scale:.2g} x the median scale of the splats"
             emit(Warned(f"{path}: positions are {rounded}; --format ply or spz keeps more of such a large scene"))

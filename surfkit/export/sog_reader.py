@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import warnings
 import zipfile
@@ -17,12 +16,15 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import from_json
 from surfkit.export.bits import from_smallest_three, logits
 from surfkit.export.table import SplatTable
 from surfkit.export.unpack import refuse_implausible
 
 SIDE = 16_383
 """Most pixels of a WebP image along a side."""
+GROWTH = 16
+"""Times that files of the archive may grow: images are compressed already."""
 MODELS = {"2dgs": "surfel", "antialiased": "gaussian", "default": "gaussian"}
 
 
@@ -52,7 +54,7 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         entry = archive.getinfo(name)
     except KeyError as error:
         raise BadInput(f"{path}: no .sog file, or damaged: it has no {name}") from error
-    refuse_implausible(path, entry.compress_size, entry.file_size)
+    refuse_implausible(path, entry.compress_size, entry.file_size, GROWTH)
     return archive.read(entry)
 
 
@@ -111,10 +113,11 @@ class _Meta:
 
     def __init__(self, path: Path, member: Callable[[str], bytes]) -> None:
         self.path, self.member = path, member
+        text = member("meta.json").decode("utf-8", "replace")
         try:
-            self.values = json.loads(member("meta.json"))
-        except (ValueError, RecursionError) as error:
-            raise BadInput(f"{path}: damaged: meta.json is no JSON") from error
+            self.values = from_json(text)
+        except BadInput as error:
+            raise BadInput(f"{path}: damaged: meta.json: {error}") from error
         if not isinstance(self.values, dict):
             raise BadInput(f"{path}: meta.json has no entries; write the file again")
 

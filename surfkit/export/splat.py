@@ -45,7 +45,7 @@ class Splat(Format):
                 rows = np.empty(len(part), ROW)
                 rows["xyz"] = means[part]
                 rows["scales"] = scales[part].double().exp().clamp(SMALLEST, float(np.finfo(np.float32).max))
-                colors = 0.5 + SH_C0 * table.sh0.detach().cpu()[part].float().numpy()
+                colors = 0.5 + SH_C0 * table.sh0.detach().cpu()[part].float().clamp(-9, 9).numpy()
                 rows["rgba"][:, :3] = to_bytes(255 * colors)
                 rows["rgba"][:, 3] = to_bytes(255 * opacities[part.numpy()])
                 rows["rot"] = to_bytes(128 * unit(table.quats.detach().cpu()[part].numpy()) + 128)

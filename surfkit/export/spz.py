@@ -107,8 +107,8 @@ class SPZ(Format):
         """Digits after the point; BadInput if the positions have no place, a warning if they are rounded much."""
         reach = float(table.means.abs().max()) if len(table) else 1.0
         most = min(23, math.floor(math.log2((2**23 - 1) / max(reach, 2.0**-23))))
-        scale = math.exp(float(table.log_scales[:, :2].float().median())) if len(table) else 1.0
-        wanted = math.ceil(math.log2(FINE / max(scale, 1e-30)))
+        scale = table.median_scale()
+        wanted = math.ceil(math.log2(FINE / scale))
         bits = self.fractional_bits if self.fractional_bits is not None else max(0, min(most, wanted))
         if bits > most:
             raise BadInput(
@@ -126,7 +126,7 @@ class SPZ(Format):
         return [
             (table.means, lambda means: _positions(means, bits)),
             (table.opacity_logits, lambda logits: to_bytes(255 * sigmoid(logits))),
-            (table.sh0, lambda sh0: to_bytes(255 * (COLOR * sh0 + 0.5))),
+            (table.sh0, lambda sh0: to_bytes(255 * (COLOR * sh0.clip(-9, 9) + 0.5))),
             (table.ellipsoid_log_scales(), lambda scales: to_bytes((scales - SMALLEST) / STEP)),
             (table.quats, _rotations if self.version > 2 else _short_rotations),
             *(rest if table.sh_degree else ()),
@@ -253,7 +253,7 @@ def _streams(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
     if not data.startswith(b"\x1f\x8b"):
         raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {MAGIC.decode()}")
     header = _header(path, inflated(path, data, 16, part=True), (1, 2, 3))
-    body, streams, at = inflated(path, data, 16 + sum(header.sizes), part=True), [], 16
+    body, streams, at = inflated(path, data, 16 + sum(header.sizes)), [], 16
     for size in header.sizes:
         streams.append(body[at : at + size])
         at += size

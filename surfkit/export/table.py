@@ -20,6 +20,10 @@ THIN = 10.0
 """Where a file does not say so, splats are surfels only if their third scale is this many times smaller than the
 others."""
 
+LARGEST = 1e18
+"""No value of a splat lies further from 0: squares of larger ones have no place in float32."""
+OPAQUE = 18.0
+"""The logit of an opacity that is 1 in float32."""
 COLUMNS = ("means", "quats", "log_scales", "opacity_logits", "sh0", "sh_rest")
 """Tensors of a table, a row for each splat."""
 
@@ -95,6 +99,17 @@ class SplatTable:
         thin = (third - expected).abs().max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
         return self.as_surfels() if thin else self
 
+    def without_infinities(self) -> SplatTable:
+        """The same splats, where some programs write infinite logits for opacities of 0 and 1, and infinitely thin
+        scales, with finite ones that draw the same."""
+        logits, scales = self.opacity_logits, self.log_scales
+        smallest = torch.where(scales.isfinite(), scales, math.inf).amin(1, keepdim=True) + math.log(THINNESS)
+        return replace(
+            self,
+            opacity_logits=torch.where(logits.isinf(), logits.sign() * OPAQUE, logits),
+            log_scales=torch.where(scales.isneginf(), smallest, scales),
+        )
+
     def file_means(self, frame: Frame | None) -> Tensor:
         """(N, 3) positions for a file of few bits: float64 without the shift of the frame, where there is one."""
         means = self.means.detach().cpu()
@@ -103,17 +118,20 @@ class SplatTable:
         return means.double() - torch.tensor(frame.shift, dtype=torch.float64)
 
     def refuse_unsound(self, where: object) -> None:
-        """BadInput if a value is NaN or Inf; `where` is the file or the format that the message names."""
+        """BadInput if a value is NaN, Inf or beyond LARGEST; `where` is the file that the message names."""
         for name in COLUMNS:
             column = getattr(self, name)
             if not column.numel():
                 continue
             least, most = torch.aminmax(column)  # NaN wins, and no mask of the whole column is made
-            if not torch.isfinite(least + most * 0):
-                row = int((~torch.isfinite(column)).nonzero()[0, 0])
-                raise BadInput(
-                    f"{where}: {name} of splat {row} of {len(self)} has NaN or Inf; remove such splats first"
-                )
+            if not (-LARGEST <= least and most <= LARGEST):
+                row = int((~(column.abs() <= LARGEST)).nonzero()[0, 0])
+                what = f"{name} of splat {row} of {len(self)} has NaN, Inf or a value beyond {LARGEST:g}"
+                raise BadInput(f"{where}: {what}; remove such splats first")
+
+    def median_scale(self) -> float:
+        """Median radius in the plane of surfels, or along the first two axes of ellipsoids; 1 without splats."""
+        return math.exp(min(max(float(self.log_scales[:, :2].median()), -60.0), 60.0)) if len(self) else 1.0
 
     def on_cpu(self) -> SplatTable:
         """The same splats on the CPU and without gradients: positions as they are, all else in float32."""

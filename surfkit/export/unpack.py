@@ -11,28 +11,30 @@ from surfkit.core.check import BadInput
 
 MOST = 1024
 """Times that compressed bytes may grow: about what gzip can do, far more than splats do."""
+BEHIND = 1 << 16
+"""Bytes of extensions that may follow the splats in a gzip stream."""
 SMALL = 1 << 22
 """Bytes that may be allocated whatever the size of the file."""
 
 
-def refuse_implausible(path: Path, packed: int, size: int) -> None:
-    """BadInput if a file says that some of its bytes become more than they can."""
-    if size > MOST * packed + SMALL:
+def refuse_implausible(path: Path, packed: int, size: int, most: int = MOST) -> None:
+    """BadInput if a file says that some of its bytes become more than `most` times as many."""
+    if size > most * packed + SMALL:
         raise BadInput(f"{path}: damaged: {packed:,} bytes cannot hold {size:,}; write or copy it again")
 
 
 def inflated(path: Path, data: bytes, size: int, part: bool = False) -> bytes:
-    """The first `size` bytes of a gzip stream; `part` leaves out the check that nothing follows."""
+    """The first `size` bytes of a gzip stream; `part` leaves out the check of its end."""
     refuse_implausible(path, len(data), size)
     stream = zlib.decompressobj(31)
     try:
-        found = stream.decompress(data, size) if size else b""
+        found = stream.decompress(data, size)
+        if not part and not stream.eof:
+            stream.decompress(stream.unconsumed_tail, BEHIND)
     except zlib.error as error:
         raise BadInput(f"{path}: damaged: {error}; write or copy it again") from error
-    if len(found) < size:
-        raise BadInput(f"{path}: cut off: {len(found):,} of {size:,} bytes; write or copy it again")
-    if not part and (stream.unconsumed_tail or not stream.eof):
-        raise BadInput(f"{path}: damaged: more than {size:,} bytes; write or copy it again")
+    if len(found) < size or not (part or stream.eof):
+        raise BadInput(f"{path}: cut off or damaged: not the {size:,} bytes that its header asks for; copy it again")
     return found
 
 

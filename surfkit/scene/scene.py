@@ -96,6 +96,16 @@ class Frame:
             raise BadInput("all training cameras and points lie in one place; a scene needs views from several places")
         return cls(origin, float(1 / extent), shift=_shift(origin, extent))
 
+    @classmethod
+    def of_positions(cls, xyz: np.ndarray) -> Frame:
+        """The frame of splats or points whose data set is not known: (N, 3) positions as they are, with a shift where
+        they lie far from 0."""
+        if not len(xyz):
+            return cls(np.zeros(3), 1.0)
+        middle = np.median(xyz.astype(np.float64), axis=0)
+        extent = float(np.median(np.linalg.norm(xyz - middle, axis=1))) or 1.0
+        return cls(np.zeros(3), 1.0, shift=_shift(middle, extent))
+
     @property
     def local_metres(self) -> float | None:
         """Metres per local unit, or None where the data set does not say."""

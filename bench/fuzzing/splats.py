@@ -1,0 +1,88 @@
+"""Files of splats of every format, and ways to damage what is compressed in them."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+FORMATS = {"compressed-ply": {}, "ply": {}, "sog": {}, "splat": {}, "spz": {"version": 3}, "spz-4": {"version": 4}}
+"""Names of formats that are damaged, and their settings."""
+SIZES = (0, 1, 2, 3, 15, 255, 256, 2**14 - 1)
+"""Widths and heights that an image may claim."""
+
+
+def write_model(folder: Path, name: str) -> Path:
+    """A file of 600 splats."""
+    from surfkit.core.registry import find
+    from surfkit.export.base import Format
+    from surfkit.testing.files import splat_table
+
+    form = find(Format, name.removesuffix("-4"))(**FORMATS[name])
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"model{form.suffix}"
+    form.write(path, splat_table("surfel", 600, 1))
+    return path
+
+
+def inside_gzip(change: Callable[[bytes, Any], bytes]) -> Callable[[Path, Any], None]:
+    """A way that changes what is compressed in a gzip file."""
+
+    def way(path: Path, damage: Any) -> None:
+        try:
+            content = gzip.decompress(path.read_bytes())
+        except (OSError, EOFError, ValueError, zlib.error):  # it is of version 4, or damaged already
+            return
+        path.write_bytes(gzip.compress(change(content, damage), 1))
+
+    return way
+
+
+def inside_zip(change: Callable[[bytes, Any], bytes], json_only: bool = False) -> Callable[[Path, Any], None]:
+    """A way that changes one of the files in an archive."""
+
+    def way(path: Path, damage: Any) -> None:
+        try:
+            with zipfile.ZipFile(path) as archive:
+                members = {name: archive.read(name) for name in archive.namelist()}
+        except Exception:  # it is damaged already
+            return
+        names = [name for name in sorted(members) if name.endswith(".json") == json_only]
+        if not names:
+            return
+        name = names[damage.what // 7 % len(names)]
+        members[name] = change(members[name], damage)
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED if damage.what % 3 else zipfile.ZIP_STORED) as archive:
+            for each, content in members.items():
+                archive.writestr(each, content)
+        path.write_bytes(file.getvalue())
+
+    return way
+
+
+def sized(content: bytes, damage: Any) -> bytes:
+    """A WebP image that claims another size."""
+    if len(content) < 25 or content[12:16] != b"VP8L":
+        return content
+    width, height = SIZES[damage.what % len(SIZES)], SIZES[int(damage.at * (len(SIZES) - 0.01))]
+    bits = struct.unpack_from("<I", content, 21)[0] & ~0xFFFFFFF | width | height << 14
+    return content[:21] + struct.pack("<I", bits) + content[25:]
+
+
+def in_json(change: Callable[[Any, Any], Any]) -> Callable[[bytes, Any], bytes]:
+    """A change of a node of JSON, as one of bytes."""
+
+    def way(content: bytes, damage: Any) -> bytes:
+        try:
+            return json.dumps(change(json.loads(content), damage)).encode("utf-8", "replace")
+        except (ValueError, RecursionError):  # it is damaged already
+            return content
+
+    return way
