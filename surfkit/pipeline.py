@@ -3,45 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from surfkit.blocks.schedule import Compute, tune_blocks
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.core.events import FileWritten, MemoryTaken, Warned, emit, say
+from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import name_of
 from surfkit.core.schedule import rescale
-from surfkit.evaluate.images.lpips import networks
-from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
-from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
 from surfkit.evaluate.metrics import read_metrics
 from surfkit.export.cameras import write_cameras
 from surfkit.export.ply import write_splats
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
-from surfkit.readers.masks import mask_cache
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, discard_results, note_metrics, read_data, read_record, refuse_file, refuse_no_run
+from surfkit.run.folder import Run, discard_results, read_data, refuse_file, refuse_no_run
 from surfkit.run.journal import record_events
 from surfkit.run.lod import has_levels, make_wanted_levels
+from surfkit.run.measure import evaluate, measure_compressed
 from surfkit.run.mesh import MeshOutput, has_mesh, make_mesh, mesh_input
 from surfkit.run.method import (
     is_begun,
     method_input,
-    not_drawn,
     optimised,
     reconstruct,
     reopened,
@@ -55,16 +48,12 @@ from surfkit.run.resume import refuse_changed, refuse_other_run, write_run_files
 from surfkit.run.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.run.start import InitialPoints, align_priors
 from surfkit.scene.memory import cache_bytes
-from surfkit.scene.photos import photo_cache
-from surfkit.scene.scene import Scene, View
+from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import CacheSettings, read_ahead
 from surfkit.train.meter import Meter
 from surfkit.train.stage import MOST_STEPS, StageState
-
-AHEAD = 8
-"""Photographs in memory while held-out ones are measured: each is needed once."""
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
@@ -252,88 +241,6 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
             make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
     except BadInput as error:
         emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
-
-
-def evaluate(
-    run: Run,
-    made: Reconstruction,
-    scene: Scene,
-    meter: Meter | None = None,
-    lpips_weights: str = "auto",
-) -> dict[str, Any]:
-    """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.
-
-    Where nothing draws them, there is no PSNR, and the metrics say why.
-
-    Args:
-        run: The run.
-        made: What it has come to.
-        scene: Its data.
-        meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
-        lpips_weights: See `surfkit.evaluate.images.lpips.networks`.
-    """
-    sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
-    perceptual, lacking = networks(lpips_weights, min(sides)) if sides and made.draw else ((), None)
-    colors = made.draw_color or made.draw
-    ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
-
-    def show(view: View, photo: Tensor, maps: Maps) -> None:
-        write_picture(picture_path(run.pictures, view.name), panel(photo, maps))
-
-    with meter.adding("pictures") if meter else nullcontext():
-        if made.draw is None:
-            measured = not_drawn(run)
-        else:
-            measured = evaluate_views(
-                scene.held_out,
-                photo_cache(scene.held_out, ahead),
-                made.draw,
-                timed=colors,
-                show=show,
-                correct_color=made.correct_color,
-                masks=mask_cache(scene.held_out, ahead),
-                networks=perceptual,
-            )
-    if lacking is not None:
-        measured["images"]["lpips_not_measured"] = lacking
-    if meter:
-        emit(MemoryTaken(meter.report()))
-    record = read_record(run.out)
-    memory = record.get("memory_bytes") or {}
-    metrics = {
-        **measured,
-        "fps": measured["fps"] or (frames_per_second(scene.train, colors) if colors else None),
-        "points": None if made.splats is None else len(made.splats),
-        "steps": made.steps,
-        "seconds": made.seconds,
-        "cpu_seconds": made.cpu_seconds,
-        "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
-        "peak_memory_bytes": max(made.peak_memory_bytes or 0, memory.get("peak", 0)) or None,
-        "memory_bytes": memory,
-        **({"method": dict(made.facts)} if made.facts else {}),
-    }
-    return note_metrics(run.metrics, metrics)
-
-
-def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str = "gpu") -> dict[str, Any]:
-    """Measure the compressed model of a run as the run itself, and return all the metrics of the run.
-
-    They lie in its folder; those of the run say in short what became of size, quality and speed.
-    """
-    run, (inner, small) = ctx.run, decompressed(ctx, made)
-    found = evaluate(inner.run, small, ctx.scene, lpips_weights=lpips_weights)
-    return note_compressed(run, found)
-
-
-def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
-    """Say in the metrics of a run in short what those of its compressed model say, and return them."""
-    record = read_json(run.compressed_record, dict[str, Any])
-    facts = {name: record[name] for name in ("compressor", "bytes", "ply_bytes")}
-    facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
-    facts["fps"] = found.get("fps")
-    if "geometry" in found:
-        facts["geometry"] = {name: found["geometry"][name] for name in ("precision", "recall", "f1")}
-    return note_metrics(run.metrics, {"compressed": facts})
 
 
 def opened(out: Path) -> Run:

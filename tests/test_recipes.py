@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from surfkit.cli.recipes import recipes
+from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.pipeline import with_steps
@@ -70,12 +71,11 @@ def test_published_settings_of_the_other_recipes():
     assert absolute.signal.absolute and (absolute.densify.threshold, absolute.densify.small) == (4e-4, 0.001)
     trim = trimmed.prune[0]
     assert (trim.ratio, trim.start, trim.until, trim.every, trimmed.steps) == (0.1, 31_000, 37_000, 500, 37_000)
-    assert (light.prune[0].at, light.prune[0].ratio, light.prune[0].power, light.steps) == (
-        (30_000,),
-        0.66,
-        0.1,
-        35_000,
-    )
+    pruned, distilled = known["lightgaussian"].refine
+    drop = pruned.stage.prune[0]
+    assert (drop.at, drop.ratio, drop.power) == ((0,), 0.66, 0.1) and distilled.sh_degree == 2
+    assert (light.steps, pruned.stage.steps, distilled.stage.steps) == (30_000, 5_000, 5_000)
+    assert known["lightgaussian"].compress == Vectree(ratio=0.6, codes=8192)
 
 
 def test_citygs2_t_begins_its_blocks_from_the_first_7000_steps_of_the_same_pretraining():

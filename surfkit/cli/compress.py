@@ -19,12 +19,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
-from surfkit.pipeline import loaded, measure_compressed
+from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
 from surfkit.run.compress import Target, compress_run, fitted, write_compressed
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
+from surfkit.run.measure import measure_compressed
 from surfkit.run.notes import collect_notes
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars

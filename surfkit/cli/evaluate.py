@@ -15,7 +15,7 @@ from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.method.base import Reconstruction
-from surfkit.pipeline import evaluate, loaded, note_compressed, opened
+from surfkit.pipeline import loaded, opened
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
@@ -23,6 +23,7 @@ from surfkit.report.regions import Distance, Zones, measure_zones, rendered_dept
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
 from surfkit.run.lod import load_levels, measure_levels
+from surfkit.run.measure import evaluate, note_compressed
 from surfkit.run.method import refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Scene

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from surfkit import pipeline
 from surfkit.appearance import Exposure
 from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
@@ -28,6 +27,7 @@ from surfkit.recipes.city import FIRST
 from surfkit.refine import DistilSH, PruneAndRecover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
+from surfkit.run import measure
 from surfkit.run.folder import Run
 from surfkit.run.stage import Intervals, drawing, return_to_checkpoint
 from surfkit.testing import check_refine
@@ -224,9 +224,9 @@ def test_what_is_known_is_not_told_again(data, recipe, tmp_path, capsys):
 @pytest.mark.parametrize(("taught", "corrected"), [(True, True), (False, False)])
 def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkeypatch, taught, corrected):
     """By the last stage that was shown any: one that is taught keeps what was learnt of them."""
-    found, original = [], pipeline.evaluate_views
+    found, original = [], measure.evaluate_views
     monkeypatch.setattr(
-        pipeline, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
+        measure, "evaluate_views", lambda *a, **k: found.append(k["correct_color"]) or original(*a, **k)
     )
     stage = Stage(steps=2, sh_every=1)
     refine = (DistilSH if taught else PruneAndRecover)(stage=stage)

@@ -1,0 +1,109 @@
+"""What a run has come to, measured on the held-out photographs."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from typing import Any
+
+from torch import Tensor
+
+from surfkit.core.codec import read_json
+from surfkit.core.events import MemoryTaken, emit
+from surfkit.evaluate.images.lpips import networks
+from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
+from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
+from surfkit.method.base import Reconstruction
+from surfkit.raster.api import Maps
+from surfkit.readers.masks import mask_cache
+from surfkit.run.compress import decompressed
+from surfkit.run.context import RunContext
+from surfkit.run.folder import Run, note_metrics, read_record
+from surfkit.run.method import not_drawn
+from surfkit.scene.photos import photo_cache
+from surfkit.scene.scene import Scene, View
+from surfkit.train.meter import Meter
+
+AHEAD = 8
+"""Photographs in memory while held-out ones are measured: each is needed once."""
+
+
+def evaluate(
+    run: Run,
+    made: Reconstruction,
+    scene: Scene,
+    meter: Meter | None = None,
+    lpips_weights: str = "auto",
+) -> dict[str, Any]:
+    """Measure on the held-out photographs, write pictures and metrics, and return all the metrics there are.
+
+    Where nothing draws them, there is no PSNR, and the metrics say why.
+
+    Args:
+        run: The run.
+        made: What it has come to.
+        scene: Its data.
+        meter: Of a run that is being made; without one, what memory was taken by stays as it was measured then.
+        lpips_weights: See `surfkit.evaluate.images.lpips.networks`.
+    """
+    sides = [min(view.camera.width, view.camera.height) for view in scene.held_out]
+    perceptual, lacking = networks(lpips_weights, min(sides)) if sides and made.draw else ((), None)
+    colors = made.draw_color or made.draw
+    ahead = AHEAD * max((3 * view.camera.width * view.camera.height for view in scene.held_out), default=0)
+
+    def show(view: View, photo: Tensor, maps: Maps) -> None:
+        write_picture(picture_path(run.pictures, view.name), panel(photo, maps))
+
+    with meter.adding("pictures") if meter else nullcontext():
+        if made.draw is None:
+            measured = not_drawn(run)
+        else:
+            measured = evaluate_views(
+                scene.held_out,
+                photo_cache(scene.held_out, ahead),
+                made.draw,
+                timed=colors,
+                show=show,
+                correct_color=made.correct_color,
+                masks=mask_cache(scene.held_out, ahead),
+                networks=perceptual,
+            )
+    if lacking is not None:
+        measured["images"]["lpips_not_measured"] = lacking
+    if meter:
+        emit(MemoryTaken(meter.report()))
+    record = read_record(run.out)
+    memory = record.get("memory_bytes") or {}
+    metrics = {
+        **measured,
+        "fps": measured["fps"] or (frames_per_second(scene.train, colors) if colors else None),
+        "points": None if made.splats is None else len(made.splats),
+        "steps": made.steps,
+        "seconds": made.seconds,
+        "cpu_seconds": made.cpu_seconds,
+        "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
+        "peak_memory_bytes": max(made.peak_memory_bytes or 0, memory.get("peak", 0)) or None,
+        "memory_bytes": memory,
+        **({"method": dict(made.facts)} if made.facts else {}),
+    }
+    return note_metrics(run.metrics, metrics)
+
+
+def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str = "gpu") -> dict[str, Any]:
+    """Measure the compressed model of a run as the run itself, and return all the metrics of the run.
+
+    They lie in its folder; those of the run say in short what became of size, quality and speed.
+    """
+    run, (inner, small) = ctx.run, decompressed(ctx, made)
+    found = evaluate(inner.run, small, ctx.scene, lpips_weights=lpips_weights)
+    return note_compressed(run, found)
+
+
+def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
+    """Say in the metrics of a run in short what those of its compressed model say, and return them."""
+    record = read_json(run.compressed_record, dict[str, Any])
+    facts = {name: record[name] for name in ("compressor", "bytes", "ply_bytes")}
+    facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
+    facts["fps"] = found.get("fps")
+    if "geometry" in found:
+        facts["geometry"] = {name: found["geometry"][name] for name in ("precision", "recall", "f1")}
+    return note_metrics(run.metrics, {"compressed": facts})
