@@ -9,7 +9,8 @@ import torch
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
-from surfkit.export.models import existing_model, model_file, read_any, read_local, warn_of_no_fit
+from surfkit.export.files import read_splat_file
+from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
 from surfkit.export.table import SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
@@ -68,7 +69,7 @@ class SplatStart(Start):
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
-        return len(read_any(existing_model(self.file, "start.file")))
+        return len(read_splat_file(existing_model(self.file, "start.file")))
 
     def _table(self, scene: Scene) -> SplatTable:
         path = existing_model(self.file, "start.file")

@@ -160,9 +160,9 @@ def test_what_it_cannot_begin_at(data, trained, tmp_path):
         run(going_on(tmp_path / "none.ply"), data, tmp_path / "out")
     path = like_3dgs(tmp_path / "a.ply", read(data))
     table = read_splats(path)
-    table.sh0[3] = torch.nan
+    table.quats[3] = 0
     write_splats(path, table)
-    with pytest.raises(BadInput, match=r"1 of 250 splats have a colour that is NaN or Inf, splat 3 is the first"):
+    with pytest.raises(BadInput, match=r"1 of 250 splats have a rotation of length 0, splat 3 is the first"):
         run(going_on(path), data, tmp_path / "out")
     assert not (tmp_path / "out" / "recipe.json").exists()
 
