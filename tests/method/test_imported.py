@@ -1,6 +1,7 @@
 """Splats from files as runs: the pictures and figures of where they came from, and what is wrong in one line."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from surfkit.method.imported import SplatImport
 from surfkit.pipeline import loaded, run, with_steps
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.readers.data import Data
+from surfkit.readers.fingerprint import changed_file, fingerprint
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.testing import check_method
@@ -211,6 +213,17 @@ def test_a_file_that_has_changed_is_refused_and_one_that_is_gone_is_not_needed(d
     like_3dgs(path, read(data), degree=1)
     with pytest.raises(BadInput, match="has changed since the run began"):
         imported(path, data, tmp_path / "out")
+
+
+def test_every_byte_of_a_file_counts(data, tmp_path):
+    path, scene = tmp_path / "large.bin", read(data)
+    path.write_bytes(bytes(300_000))
+    before = fingerprint(scene, files=[path])
+    with path.open("rb+") as file:
+        file.seek(100_000)
+        file.write(b"1")
+    os.utime(path, ns=(0, 0))
+    assert changed_file(before, fingerprint(scene, before, files=[path])) == str(path)
 
 
 def test_it_is_meshed_by_the_mesher_of_the_recipe(data, trained, tmp_path):
