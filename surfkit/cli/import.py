@@ -33,7 +33,8 @@ class Import:
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """File of splats, such as a PLY file of 3DGS or 2DGS, or the folder of a finished run."""
+    """File of splats of any format that `surfkit components format` lists, such as a PLY file of 3DGS or 2DGS, or the
+    folder of a finished run."""
 
     data: Path
     """Data set that the splats were made from: images/ and a COLMAP model in sparse/0, or another layout."""

@@ -20,11 +20,6 @@ MOST_VIEWS = 64
 """Training views that are searched for splats, evenly spaced."""
 
 
-def read_any(path: Path) -> SplatTable:
-    """The splats of a file, in the frame of the file."""
-    return read_splat_file(path)
-
-
 def model_file(path: Path) -> Path:
     """The file that a path names: itself, or the points in the folder of a run."""
     return path / "point_cloud.ply" if path.is_dir() else path
@@ -54,7 +49,7 @@ def read_local(path: Path, frame: Frame) -> SplatTable:
     Raises:
         BadInput: No file of splats, or one without splats, or with values that cannot be drawn.
     """
-    table = read_any(path)
+    table = read_splat_file(path)
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
@@ -64,25 +59,18 @@ def read_local(path: Path, frame: Frame) -> SplatTable:
 
 def refuse_unsound(path: Path, table: SplatTable) -> None:
     """BadInput for splats of a file that cannot be drawn."""
+    table.refuse_unsound(path)
+    scales = table.log_scales.exp()
     wrong = {
-        "a position that is NaN or Inf": ~finite(table.means),
-        "a rotation that is NaN or Inf": ~finite(table.quats),
         "a rotation of length 0": ~(table.quats.norm(dim=1) > 0),
-        "a scale that is NaN, Inf or 0": ~finite(table.log_scales.exp()) | (table.log_scales.exp() <= 0).any(1),
-        "an opacity that is NaN, or a logit that is Inf": ~finite(table.opacity_logits[:, None]),
-        "a colour that is NaN or Inf": ~finite(table.sh0) | ~finite(table.sh_rest.flatten(1)),
+        "a scale of 0 or beyond float32": ~((scales > 0) & scales.isfinite()).all(1),
     }
     for what, rows in wrong.items():
         if count := int(rows.sum()):
             raise BadInput(
                 f"{path}: {count:,} of {len(table):,} splats have {what}, splat {int(rows.nonzero()[0])} is the first; "
-                "remove them in the program that made the file, or with `splat-transform --filter-nan`"
+                "remove them in the program that made the file"
             )
-
-
-def finite(values: Tensor) -> Tensor:
-    """(N,) bool, whether all numbers of a row are finite."""
-    return values.isfinite().all(1)
 
 
 def _lacking_offset(means: Tensor, frame: Frame) -> Tensor:

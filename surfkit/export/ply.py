@@ -22,6 +22,9 @@ from surfkit.scene.scene import Frame
 CHUNK = 1 << 16
 """Rows in memory while writing."""
 
+GATHERED = 1 << 12
+"""Rows at a time while reading: a megabyte."""
+
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -142,9 +145,9 @@ def read_splats(path: Path) -> SplatTable:
     surfel = mode == "2dgs" or "scale_2" not in names
 
     def gathered(*wanted: str) -> Tensor:
-        return torch.from_numpy(np.stack([rows[name].astype(np.float32) for name in wanted], axis=1))
+        return torch.from_numpy(columns_of(rows, wanted))
 
-    coefficients = gathered(*ordered) if rest else torch.zeros(len(rows), 0)
+    interleaved = [ordered[at + channel * (rest // 3)] for at in range(rest // 3) for channel in range(3)]
     return SplatTable(
         kind="surfel" if surfel else "gaussian",
         means=torch.from_numpy(
@@ -154,9 +157,19 @@ def read_splats(path: Path) -> SplatTable:
         log_scales=gathered("scale_0", "scale_1", *([] if surfel else ["scale_2"])),
         opacity_logits=gathered("opacity")[:, 0],
         sh0=gathered("f_dc_0", "f_dc_1", "f_dc_2"),
-        sh_rest=coefficients.reshape(len(rows), 3, rest // 3).transpose(1, 2).contiguous(),
+        sh_rest=gathered(*interleaved).reshape(len(rows), rest // 3, 3),
         antialias=mode == "mip",
     )
+
+
+def columns_of(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(N, len(names)) float32 columns of a record array: a few rows at a time, so that each is read once."""
+    found = np.empty((len(rows), len(names)), np.float32)
+    for start in range(0, len(rows), GATHERED):
+        part = np.asarray(rows[start : start + GATHERED])
+        for at, name in enumerate(names):
+            found[start : start + GATHERED, at] = part[name]
+    return found
 
 
 def _tags(comments: Sequence[str]) -> dict[str, str]:

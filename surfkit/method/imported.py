@@ -24,7 +24,7 @@ class SplatImport(Method):
     """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
 
     def __post_init__(self) -> None:
-        if self.file is not None:
+        if self.file is not None:  # a run may be resumed from another working folder
             object.__setattr__(self, "file", self.file.resolve())
 
     def files(self) -> tuple[Path, ...]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.export.table import THINNESS, SplatTable
+from surfkit.export.table import SplatTable
 from surfkit.primitives.columns import EXP, RATES, SIGMOID, Column
 from surfkit.primitives.init import SH_C0
 from surfkit.primitives.points import Columns
@@ -42,7 +41,7 @@ def raw_columns(what: str, columns: Mapping[str, Column], table: SplatTable) -> 
                 f"{' or '.join(map(str, shapes))} values; it needs a `from_table` of its own, or choose another"
             )
     axes, rest = columns["scales"].shape[0], columns["sh_rest"].shape[0] if "sh_rest" in columns else 0
-    log_scales, quats = with_axes(table.log_scales, table.quats, axes)
+    log_scales, quats = with_axes(table, axes)
     sh_rest = torch.nn.functional.pad(table.sh_rest[:, :rest], (0, 0, 0, max(0, rest - table.sh_rest.shape[1])))
     scales, opacities = columns["scales"].activation, columns["opacities"].activation
     logits = table.opacity_logits
@@ -57,13 +56,13 @@ def raw_columns(what: str, columns: Mapping[str, Column], table: SplatTable) -> 
     return {name: found[name].float().contiguous().clone() for name in RATES if name in columns}
 
 
-def with_axes(log_scales: Tensor, quats: Tensor, axes: int) -> tuple[Tensor, Tensor]:
-    """(N, axes) logarithms of scales and (N, 4) rotations of splats with 2 or 3 axes."""
-    there = log_scales.shape[1]
-    if there == axes:
+def with_axes(table: SplatTable, axes: int) -> tuple[Tensor, Tensor]:
+    """(N, axes) logarithms of scales and (N, 4) rotations of splats that shall have 2 or 3 axes."""
+    log_scales, quats = table.log_scales, table.quats
+    if axes == 3:
+        return table.ellipsoid_log_scales(), quats
+    if log_scales.shape[1] == 2:
         return log_scales, quats
-    if there == 2:
-        return torch.cat([log_scales, log_scales.amin(1, keepdim=True) + math.log(THINNESS)], 1), quats
     order = torch.tensor([[1, 2], [2, 0], [0, 1]])  # the axes left, so that the others stay right-handed
     thinnest = log_scales[:, [2, 0, 1]].argmin(1)  # the third where several are equally thin
     thinnest = torch.tensor([2, 0, 1])[thinnest]

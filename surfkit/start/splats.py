@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,8 +10,9 @@ import torch
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
-from surfkit.export.models import existing_model, model_file, read_any, read_local, warn_of_no_fit
-from surfkit.export.table import SplatTable
+from surfkit.export.files import read_splat_file
+from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
+from surfkit.export.table import THIN, SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
 from surfkit.scene.scene import Cloud, Scene
@@ -28,7 +30,7 @@ class SplatStart(Start):
     """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
 
     def __post_init__(self) -> None:
-        if self.file is not None:
+        if self.file is not None:  # a run may be resumed from another working folder
             object.__setattr__(self, "file", self.file.resolve())
 
     def files(self) -> tuple[Path, ...]:
@@ -43,9 +45,10 @@ class SplatStart(Start):
         warn_of_no_fit(path, table, scene)
         splats = primitive.activate(params, 0)
         what, name = f"{path}: its {table.kind}s", f"primitive:{name_of(primitive)}"
-        if splats.kind != table.kind:
-            thinner = " without their thinnest axis" if splats.kind == "surfel" else ""
-            emit(Warned(f"{what} become {splats.kind}s{thinner}, as the recipe has {name}; pictures will differ"))
+        flatter = table.log_scales.shape[1] == 3 and params["scales"].shape[1] == 2
+        if splats.kind != table.kind or (flatter and not is_thin(table)):
+            lost = " without their thinnest axis" if flatter else ""
+            emit(Warned(f"{what} become {splats.kind}s{lost}, as the recipe has {name}; pictures will differ"))
         elif splats.antialias != table.antialias:
             flag = "--primitive.antialias" if table.antialias else "--primitive.no-antialias"
             emit(Warned(f"{what} were trained {'with' if table.antialias else 'without'} antialias; add {flag}"))
@@ -68,8 +71,14 @@ class SplatStart(Start):
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
-        return len(read_any(existing_model(self.file, "start.file")))
+        return len(read_splat_file(existing_model(self.file, "start.file")))
 
     def _table(self, scene: Scene) -> SplatTable:
         path = existing_model(self.file, "start.file")
         return read_local(path, scene.frame)
+
+
+def is_thin(table: SplatTable) -> bool:
+    """Whether most ellipsoids are flat: THIN times thinner along one axis than along the others."""
+    ordered = table.log_scales.sort(1).values
+    return bool((ordered[:, 1] - ordered[:, 0]).median() >= math.log(THIN))

@@ -57,7 +57,10 @@ def test_a_file_becomes_a_run_folder(given, here, capsys):
     ):
         assert main([str(word) for word in words]) == 0, words
     torch.testing.assert_close(read_splats(here / "again.ply").means, read_splats(path).means, rtol=1e-5, atol=1e-4)
-    words = ["train", "recipe:3dgs", "start:splats", "--start.file", out, "--data", data, "--steps", 2, "--out", "more"]
+    assert main(["compress", str(out), "compress:packed"]) == 0
+    (compressed,) = out.rglob("*.surfkit")
+    words = ["train", "recipe:3dgs", "start:splats", "--start.file", compressed, "--data", data, "--steps", 2]
+    words += ["pretrain.densify:none", "--out", "more"]
     assert main([str(word) for word in words]) == 0
     assert json.loads((here / "more" / "metrics.json").read_text())["points"] == 250
 
@@ -76,7 +79,8 @@ def test_mistakes_are_one_line(given, here, capsys):
     assert "--data PATH missing" in one_line(["import", path], capsys)
     assert "FILE" in one_line(["import", "--data", data], capsys)
     assert "a folder without point_cloud.ply" in one_line(["import", data, "--data", data], capsys)
-    assert "no PLY file" in one_line(["import", data / "sparse/0/cameras.txt", "--data", data], capsys)
+    line = one_line(["import", data / "sparse/0/cameras.txt", "--data", data], capsys)
+    assert "no file of splats of a known format; known: " in line
     table = read_splats(path)
     table.quats[2] = 0
     write_splats(here / "zero.ply", table)

@@ -27,6 +27,7 @@ from surfkit.recipes.city import FIRST
 from surfkit.refine import DistilSH, PruneAndRecover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
+from surfkit import pipeline
 from surfkit.run import measure
 from surfkit.run.folder import Run
 from surfkit.run.stage import Intervals, drawing, return_to_checkpoint

@@ -134,6 +134,17 @@ def test_discs_become_ellipsoids_and_back_with_a_note(data, trained, tmp_path):
     assert abs(back["images"]["psnr"] - trained[1]["images"]["psnr"]) < 2
 
 
+@pytest.mark.parametrize("thin", [False, True])
+def test_ellipsoids_that_are_pressed_flat_are_told_unless_they_are_flat(data, tmp_path, thin):
+    path = like_3dgs(tmp_path / "a.ply", read(data))
+    if thin:
+        table = read_splats(path)
+        table.log_scales[:, 1] -= 8
+        write_splats(path, table)
+    run(going_on(path, "flat3dgs", steps=1), data, tmp_path / "out")
+    assert ("gaussians become gaussians without their thinnest axis" in notes(tmp_path / "out")) != thin
+
+
 def test_harmonics_that_are_cut_and_another_antialias_are_told(data, tmp_path):
     path = like_3dgs(tmp_path / "a.ply", read(data))
     run(going_on(path, "3dgs", steps=1, primitive=Gaussian3D(sh_degree=1, antialias=True)), data, tmp_path / "out")
@@ -160,9 +171,9 @@ def test_what_it_cannot_begin_at(data, trained, tmp_path):
         run(going_on(tmp_path / "none.ply"), data, tmp_path / "out")
     path = like_3dgs(tmp_path / "a.ply", read(data))
     table = read_splats(path)
-    table.sh0[3] = torch.nan
+    table.quats[3] = 0
     write_splats(path, table)
-    with pytest.raises(BadInput, match=r"1 of 250 splats have a colour that is NaN or Inf, splat 3 is the first"):
+    with pytest.raises(BadInput, match=r"1 of 250 splats have a rotation of length 0, splat 3 is the first"):
         run(going_on(path), data, tmp_path / "out")
     assert not (tmp_path / "out" / "recipe.json").exists()
 
