@@ -26,6 +26,8 @@ SLOTS = {
     "losses": "loss",
     "filters": "filter",
     "regularizers": "regularizer",
+    "compress": "compressor",
+    "lod": "levels-of-detail",
 }
 """Kinds of parts whose slot in a recipe or a command has another name."""
 TUTORIAL = ROOT / "docs" / "plugins.md"
