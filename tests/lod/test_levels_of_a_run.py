@@ -20,6 +20,7 @@ from surfkit.pipeline import loaded, run, with_steps
 from surfkit.primitives import Surfel2D
 from surfkit.readers.data import Data
 from surfkit.recipe import Recipe
+from surfkit.run.folder import discard_results
 from surfkit.run.lod import load_levels, make_levels
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -113,6 +114,12 @@ def test_more_steps_or_another_recipe_make_them_again(copy, data, recipe):
     assert json.loads((copy / "lod" / "lod.json").read_text())["steps"] == 8
     with loaded(copy, "cpu") as (ctx, made):
         load_levels(ctx.run, made.splats)
+
+
+def test_further_steps_discard_them(copy):
+    with loaded(copy, "cpu") as (ctx, _):
+        discard_results(ctx.run, ctx.run.pretrain)
+    assert not (copy / "lod" / "lod.json").exists()
 
 
 def test_interrupted_and_continued(copy, monkeypatch):

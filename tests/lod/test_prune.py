@@ -19,6 +19,8 @@ CELLS = 4
 @pytest.fixture(scope="module")
 def built():
     given = lod_input(count=800)
+    params = given.model.params | {"scales": given.model.params["scales"] + torch.tensor([0.0, 1.0])}
+    given = replace(given, model=replace(given.model, params=params))
     return given, PrunedLevels(tile_points=200, steps=0).build(given)
 
 
