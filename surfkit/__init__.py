@@ -76,7 +76,7 @@ _HOME = {
     "surfkit.train.stage": ("Stage",),
     "surfkit.refine.base": ("Refine",),
     "surfkit.lod.base": ("LevelsOfDetail", "LodInput"),
-    "surfkit.lod.tree": ("Block", "Blocks", "LodTree"),
+    "surfkit.lod.tree": ("LodBlock", "LodBlocks", "LodTree"),
     "surfkit.recipe": ("Recipe",),
     "surfkit.report.ablation": ("Row", "Table"),
 }

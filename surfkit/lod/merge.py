@@ -16,7 +16,7 @@ from surfkit.lod.cut import cut, depth_for
 from surfkit.lod.moments import alike, merged_model, refuse_unmergeable, rows_of
 from surfkit.lod.pairs import groups, summed
 from surfkit.lod.refine import contributions, refined
-from surfkit.lod.tree import Block, LodTree
+from surfkit.lod.tree import LodBlock, LodTree
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.model import SplatModel
 
@@ -109,14 +109,14 @@ def block_errors(known: Moments, ends: np.ndarray) -> np.ndarray:
     return np.sqrt(np.add.reduceat(weights * spread, ends[:-1]) / np.add.reduceat(weights, ends[:-1]))
 
 
-def blocks(limits: list[np.ndarray], errors: list[np.ndarray]) -> list[Block]:
+def blocks(limits: list[np.ndarray], errors: list[np.ndarray]) -> list[LodBlock]:
     """The blocks of all levels, the root first; `limits` and `errors` of each level, the finest first."""
-    found: list[Block] = []
+    found: list[LodBlock] = []
     above = -1
     for level in range(len(limits) - 1, -1, -1):
         begin, ends = len(found), limits[level]
         for at in range(len(ends) - 1):
             parent = above + at // 2 if above >= 0 else -1
-            found.append(Block(level, int(ends[at]), int(ends[at + 1]), parent, float(errors[level][at])))
+            found.append(LodBlock(level, int(ends[at]), int(ends[at + 1]), parent, float(errors[level][at])))
         above = begin
     return found

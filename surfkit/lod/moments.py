@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -156,9 +158,21 @@ def merged_model(model: SplatModel, labels: np.ndarray, weights: np.ndarray) -> 
         else:
             each = columns[name].activation.value(raw.detach()).double().cpu().numpy().reshape(len(raw), -1)
             value = summed(each * weights[:, None], labels) / total[:, None]
-        value = torch.from_numpy(np.ascontiguousarray(value)).view(-1, *raw.shape[1:])
-        params[name] = columns[name].activation.inverse(value).to(raw)
+        value = torch.from_numpy(np.ascontiguousarray(value)).view(len(total), *raw.shape[1:])
+        with one_thread():
+            params[name] = columns[name].activation.inverse(value).to(raw)
     return replace(model, params=params)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Within, torch computes in one thread: it rounds the last elements of each thread's share in another way."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def alike(splats: Splats, weights: np.ndarray) -> Alike:

@@ -20,7 +20,7 @@ from surfkit.lod.base import LevelsOfDetail, LodInput
 from surfkit.lod.cut import cut, depth_for
 from surfkit.lod.moments import rows_of
 from surfkit.lod.refine import refined
-from surfkit.lod.tree import Block, LodTree
+from surfkit.lod.tree import LodBlock, LodTree
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
 from surfkit.train.views import ViewContributions
@@ -127,15 +127,15 @@ def sights(levels: Sequence[SplatModel], ends: Sequence[np.ndarray]) -> list[np.
     return found
 
 
-def chains(ends: Sequence[np.ndarray], errors: Sequence[np.ndarray]) -> Iterator[Block]:
+def chains(ends: Sequence[np.ndarray], errors: Sequence[np.ndarray]) -> Iterator[LodBlock]:
     """The blocks: the whole coarsest level, below it each of its parts, and below these the same in finer levels."""
     coarsest, count = len(ends) - 1, len(ends[0]) - 1
     before = 0
     if count > 1:
-        yield Block(coarsest, 0, int(ends[-1][-1]), -1, float(errors[-1].max()))
+        yield LodBlock(coarsest, 0, int(ends[-1][-1]), -1, float(errors[-1].max()))
         before = 1
     for level in range(coarsest, -1, -1):
         for at in range(count):
             above = before - 1 if level == coarsest else before + (coarsest - level - 1) * count + at
             parent = above if count > 1 or level < coarsest else -1
-            yield Block(level, int(ends[level][at]), int(ends[level][at + 1]), parent, float(errors[level][at]))
+            yield LodBlock(level, int(ends[level][at]), int(ends[level][at + 1]), parent, float(errors[level][at]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from surfkit.lod.tree import Blocks, LodTree
+from surfkit.lod.tree import LodBlocks, LodTree
 from surfkit.primitives.model import SplatModel
 
 SLACK = 1e-9
@@ -39,7 +39,7 @@ def _wrong_levels(tree: LodTree, model: SplatModel, sizes: np.ndarray) -> str | 
     return None
 
 
-def _wrong_tree(blocks: Blocks, sizes: np.ndarray) -> str | None:
+def _wrong_tree(blocks: LodBlocks, sizes: np.ndarray) -> str | None:
     if {len(value) for value in (blocks.level, blocks.first, blocks.last, blocks.parent, blocks.error)} != {
         len(blocks)
     }:
@@ -61,7 +61,7 @@ def _wrong_tree(blocks: Blocks, sizes: np.ndarray) -> str | None:
     return None
 
 
-def _wrong_boxes(blocks: Blocks) -> str | None:
+def _wrong_boxes(blocks: LodBlocks) -> str | None:
     boxes, count = (blocks.low, blocks.high), len(blocks)
     if any(box.shape != (count, 3) for box in boxes) or blocks.reach.shape != (count,):
         return "the columns of its blocks have different lengths"

@@ -20,7 +20,7 @@ MARGIN_PX = 3.0
 
 
 @dataclass(frozen=True)
-class Block:
+class LodBlock:
     """Some rows of one level, before its box is known.
 
     Attributes:
@@ -39,11 +39,11 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Blocks:
+class LodBlocks:
     """B blocks as arrays; a parent comes before its children, and the root is the first.
 
     Attributes:
-        level, first, last, parent: (B,) int64, see `Block`.
+        level, first, last, parent: (B,) int64, see `LodBlock`.
         error: (B,) float64, local units; 0 for blocks without children, and never below that of a child.
         low, high: (B, 3) float64 corners of boxes with the centres of all splats of the block and below it.
         reach: (B,) float64, how far these splats extend beyond their centres at most, local units.
@@ -124,10 +124,10 @@ class LodTree:
 
     order: np.ndarray
     levels: tuple[SplatModel, ...]
-    blocks: Blocks
+    blocks: LodBlocks
 
     @classmethod
-    def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[Block]) -> LodTree:
+    def of(cls, order: np.ndarray, levels: Sequence[SplatModel], blocks: Sequence[LodBlock]) -> LodTree:
         """The tree of a list of blocks, the root first and parents before children.
 
         Boxes are found, and the errors of parents are raised to those of their children.
@@ -146,7 +146,7 @@ class LodTree:
             low[up], high[up] = np.minimum(low[up], low[at]), np.maximum(high[up], high[at])
             reach[up], error[up] = max(reach[up], reach[at]), max(error[up], error[at])
         rows = {n: np.array([getattr(b, n) for b in blocks], np.int64) for n in ("level", "first", "last", "parent")}
-        return cls(order, tuple(levels), Blocks(**rows, error=error, low=low, high=high, reach=reach))
+        return cls(order, tuple(levels), LodBlocks(**rows, error=error, low=low, high=high, reach=reach))
 
     @cached_property
     def joined(self) -> Splats:
@@ -166,7 +166,7 @@ class LodTree:
         return torch.from_numpy(np.concatenate(found) if found else np.zeros(0, np.int64))
 
     def seen(self, camera: Camera, pixels: float) -> Splats:
-        """The splats to draw for a camera; see `Blocks.front`."""
+        """The splats to draw for a camera; see `LodBlocks.front`."""
         rows = self.rows(self.blocks.front(camera, pixels, self.levels[0].near)).to(self.joined.means.device)
         return self.joined.take(rows)
 

@@ -25,7 +25,7 @@ from surfkit.evaluate.images.measure import Draw, evaluate_views, frames_per_sec
 from surfkit.lod.base import LevelsOfDetail, LodInput
 from surfkit.lod.moments import rows_of
 from surfkit.lod.sound import fault
-from surfkit.lod.tree import Blocks, LodTree
+from surfkit.lod.tree import LodBlocks, LodTree
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
@@ -122,7 +122,7 @@ def _forget(run: Run) -> None:
 
 def _write(folder: Path, tree: LodTree) -> list[str]:
     """Write the tree and each level after the first, and give the names of the files."""
-    arrays = {field.name: getattr(tree.blocks, field.name) for field in fields(Blocks)}
+    arrays = {field.name: getattr(tree.blocks, field.name) for field in fields(LodBlocks)}
     content = {BLOCKS: safetensors.numpy.save(arrays | {"order": tree.order})}
     for number, level in enumerate(tree.levels[1:], 1):
         params = {name: value.detach().cpu().contiguous() for name, value in level.params.items()}
@@ -166,7 +166,7 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
     try:
         arrays = safetensors.numpy.load_file(run.lod / BLOCKS)
         order = arrays.pop("order")
-        blocks = Blocks(**arrays)
+        blocks = LodBlocks(**arrays)
         names = [run.lod / f"level{number}.safetensors" for number in range(1, len(points))]
         coarse = [safetensors.torch.load_file(path) for path in names]
         if len(order) != len(model):

@@ -89,7 +89,8 @@ def difference_but_length(run: Run, there: Any) -> tuple[str, Any, Any] | None:
     old = replace(load(Recipe, there, f"{run.out / 'recipe.json'}"), about=run.recipe.about)
     if dump(replace(old, pretrain=replace(old.pretrain, steps=now))) == dump(run.recipe):
         return None
-    return first_difference(dump(rescale_like(old, now / before, run.recipe)), dump(run.recipe))
+    scaled = rescale_like(old, now / before, run.recipe)
+    return first_difference(dump(replace(scaled, lod=run.recipe.lod)), dump(run.recipe))  # these are as they are now
 
 
 def first_difference(old: Any, new: Any, at: str = "") -> tuple[str, Any, Any] | None:

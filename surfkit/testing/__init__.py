@@ -7,6 +7,7 @@ of the part's kind. A part that breaks it raises AssertionError with a sentence 
 from surfkit.testing.data_sets import check_depth_layout, check_split
 from surfkit.testing.executors import check_executor
 from surfkit.testing.files import check_format
+from surfkit.testing.levels import check_levels_of_detail
 from surfkit.testing.method import check_method
 from surfkit.testing.parts import check, check_component
 from surfkit.testing.pictures import check_appearance, check_depth_estimator, check_loss, check_regularizer
@@ -33,6 +34,7 @@ __all__ = [
     "check_executor",
     "check_filter",
     "check_format",
+    "check_levels_of_detail",
     "check_loss",
     "check_mesher",
     "check_method",

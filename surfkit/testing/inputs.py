@@ -14,10 +14,13 @@ from torch.nn.functional import normalize
 
 from surfkit.densify.base import Contribution, Step
 from surfkit.depth.base import DepthInput
+from surfkit.lod.base import LodInput
 from surfkit.losses.base import Neighbour, Target
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.overlap import Depths
 from surfkit.partition.base import CoarseModel
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Points
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.raster.api import Maps, Splats
@@ -192,6 +195,19 @@ def coarse_model(count: int = 1_500, seed: int = 0) -> CoarseModel:
     at = [(-0.8 + 1.6 * i / 5, -0.8 + 1.6 * j / 4) for j in range(5) for i in range(6)]
     views = tuple(View(f"{i:02}.png", above(*xy), path=None) for i, xy in enumerate(at))
     return CoarseModel(discs, views, select("cpu")[0], 0.01)
+
+
+def lod_input(primitive: Primitive | None = None, count: int = 400) -> LodInput:
+    """A model of a survey, as it is before its first step, and the cameras; its folder is not there.
+
+    Args:
+        primitive: What it is made of; surfels of degree 1 if None.
+        count: Sparse points of the survey.
+    """
+    truth, primitive = survey(points=count), primitive or Surfel2D(sh_degree=1)
+    params = primitive.init(truth.scene.cloud, torch.Generator().manual_seed(0))
+    model = SplatModel(primitive, params, primitive.sh_degree)
+    return LodInput(model, truth.scene.train, select("cpu")[0], truth.scene.frame, 0, Path("levels"))
 
 
 def mesh_input(kind: str = "surfel", count: int = 900, views: int = 14, **changes: Any) -> MeshInput:

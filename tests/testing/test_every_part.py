@@ -7,6 +7,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.registry import kebab, kind_of, offered
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.execute.slurm import Slurm
+from surfkit.lod import MergedLevels, PrunedLevels
 from surfkit.mesh.poisson import Poisson
 from surfkit.primitives.base import Primitive
 from surfkit.readers.base import Reader
@@ -15,6 +16,8 @@ from surfkit.testing import check
 OFFERED = {f"{kebab(kind_of(cls).__name__)}:{name}": cls for _, name, cls in offered("surfkit_components")}
 QUICK = {
     "mesher:poisson": Poisson(octree=5, points=5_000),
+    "levels-of-detail:merge": MergedLevels(tile_points=100, steps=3),
+    "levels-of-detail:prune": PrunedLevels(tile_points=100, steps=3),
     "executor:slurm": Slurm(cluster="debug"),
     "depth-estimator:patch-match": PatchMatch(neighbours=6, passes=1),
 }
