@@ -12,9 +12,10 @@ the list is missing. The figures go to bench/results/readers.json, pictures to t
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,9 @@ from splats import Bounds, Splats, difference, precision, read_ply, representabl
 
 from surfkit.core.check import BadInput  # noqa: E402
 from surfkit.export.files import read_splat_file  # noqa: E402
+
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""What programs turn the content of a tile by: y up, as glTF has it, becomes z up."""
 
 FEW = 2_000
 """Splats of the files that splat-transform compresses as SOG: on a CPU it takes minutes for more."""
@@ -121,7 +125,7 @@ def validated(path: Path, program: str, read: Callable[[Path], list[dict]]) -> R
 
 
 def gltf_compared(path: Path, reference: Splats) -> Row:
-    """All attributes of a GLB as three.js reads them, in the primitive's own axes, and that its extensions are named."""
+    """All attributes of a GLB as three.js reads them, in the axes of its primitive, and the extensions that it names."""
     program = "three.js"
     try:
         got, said = programs.three(path)
@@ -134,13 +138,56 @@ def gltf_compared(path: Path, reference: Splats) -> Row:
             bounds = tables.spz_bounds(said["spz_head"], reference)
         shares = difference(wanted, got, bounds)
         worst = max(shares, key=shares.get)
-        lacks = [name for name in ("KHR_gaussian_splatting", *(["KHR_gaussian_splatting_compression_spz_2"] * packed)) if name not in said["used"]]
+        lacks = [
+            name
+            for name in ("KHR_gaussian_splatting", *(["KHR_gaussian_splatting_compression_spz_2"] * packed))
+            if name not in said["used"]
+        ]
         is_turn = np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3)) and np.linalg.det(matrix[:3, :3]) > 0
-        faults = [f"extensionsUsed lacks {name}" for name in lacks] + ["the node's matrix is no rotation"] * (not is_turn)
+        faults = [f"extensionsUsed lacks {name}" for name in lacks] + ["the node's matrix is no rotation"] * (
+            not is_turn
+        )
         note = "; ".join([f"{len(got):,} splats; {worst}", *faults])
         return Row(path.name, program, shares[worst] <= 1 and not faults, shares[worst], note)
     except (Missing, ValueError, OSError, KeyError) as error:
         return failed(path, program, error)
+
+
+def leaves(tile: dict) -> list[dict]:
+    """The tiles of full detail below a tile of tileset.json."""
+    children = tile.get("children", [])
+    return [leaf for child in children for leaf in leaves(child)] if children else [tile]
+
+
+def tiles_compared(folder: Path, reference: Splats) -> Row:
+    """All attributes of the tiles of full detail, and that each box contains the splats of its tile."""
+    program = "three.js"
+    try:
+        tiles = [
+            tile for tile in leaves(json.loads((folder / "tileset.json").read_text())["root"]) if "content" in tile
+        ]
+        parts, digits, faults = [], [], []
+        for tile in tiles:
+            got, said = programs.three(folder / tile["content"]["uri"])
+            matrix = np.array(said["matrix"]).reshape(4, 4).T
+            if not np.allclose(Z_UP @ matrix[:3, :3], np.eye(3), atol=1e-9):
+                faults.append(f"{tile['content']['uri']}: its node does not turn z up to y up")
+            parts.append(tables.replace(got, means=got.means + np.linalg.inv(matrix[:3, :3]) @ matrix[:3, 3]))
+            digits.append(said["spz_head"] if said.get("spz") else None)
+            box = np.array(tile["boundingVolume"]["box"]).reshape(4, 3)
+            if (np.abs((parts[-1].means - box[0]) @ np.linalg.inv(box[1:])) > 1 + 1e-6).any():
+                faults.append(f"{tile['content']['uri']}: splats outside of its box")
+        got = Splats(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Splats)))
+        bounds, wanted = precision("gltf", folder, reference), reference
+        if all(digits):
+            coarse = min(digits, key=lambda head: head["fractional_bits"])
+            bounds, wanted = tables.spz_bounds(coarse, reference), representable(reference, "spz")
+        shares = difference(wanted, got, bounds)
+        worst = max(shares, key=shares.get)
+        note = "; ".join([f"{len(got):,} splats in {len(tiles)} tiles; {worst}", *faults])[:300]
+        return Row(folder.name, program, shares[worst] <= 1 and not faults, shares[worst], note)
+    except (Missing, ValueError, OSError, KeyError) as error:
+        return failed(folder, program, error)
 
 
 def read_by_others(folder: Path, reference: Splats) -> list[Row]:
@@ -163,7 +210,8 @@ def read_by_others(folder: Path, reference: Splats) -> list[Row]:
                 rows.append(placed(path, "trimesh", reference, programs.trimesh_points))
                 rows.append(placed(path, "Open3D", reference, programs.open3d_points))
         elif (path / "tileset.json").is_file():
-            rows.append(validated(path / "tileset.json", "3d-tiles-validator", programs.tiles_messages))
+            rows.append(validated(path, "3d-tiles-validator", lambda p: programs.tiles_messages(p / "tileset.json")))
+            rows.append(tiles_compared(path, reference))
     return rows
 
 
@@ -208,7 +256,13 @@ def agreed(path: Path, program: str, read: Callable[[Path], Splats]) -> Row:
         theirs = read(path)
         shares = difference(ours(path), theirs, SAME)
         worst = max(shares, key=shares.get)
-        return Row(path.name, program, shares[worst] <= 1, shares[worst], f"{len(theirs):,} splats; surfkit against it; {worst}")
+        return Row(
+            path.name,
+            program,
+            shares[worst] <= 1,
+            shares[worst],
+            f"{len(theirs):,} splats; surfkit against it; {worst}",
+        )
     except (Missing, ValueError, BadInput, OSError, KeyError) as error:
         return failed(path, program, error)
 
@@ -217,7 +271,9 @@ def write_few(model: Path, out: Path) -> None:
     """The first splats of a PLY file, byte for byte."""
     rows = tables.elements(model)["vertex"]
     head = model.read_bytes().partition(b"end_header\n")[0].decode()
-    short = "\n".join(f"element vertex {min(FEW, len(rows))}" if w.startswith("element vertex") else w for w in head.splitlines())
+    short = "\n".join(
+        f"element vertex {min(FEW, len(rows))}" if w.startswith("element vertex") else w for w in head.splitlines()
+    )
     out.write_bytes(short.encode() + b"\nend_header\n" + rows[:FEW].tobytes())
 
 
@@ -235,7 +291,13 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="PLY file of a trained model")
     parser.add_argument("--folder", type=Path, default=None, help="of the exports; beside the model by default")
     parser.add_argument("--exported", action="store_true", help="the files are there; do not export again")
-    parser.add_argument("--pictures", type=Path, default=None, metavar="RUN", help="draw the files in web viewers from a held-out camera of RUN")
+    parser.add_argument(
+        "--pictures",
+        type=Path,
+        default=None,
+        metavar="RUN",
+        help="draw the files in web viewers from a held-out camera of RUN",
+    )
     options = parser.parse_args()
     folder = options.folder or options.model.parent / "exports"
     if not options.exported:

@@ -22,6 +22,8 @@ def variants() -> dict[str, Format]:
     if "gltf" in found:
         made |= {"model.glb": found["gltf"](), "model.spz.glb": found["gltf"](compress="spz")}
         made["model.z.glb"] = replace(found["gltf"](), up="z")
+    if "tiles3d" in found:
+        made["model.tiles"] = found["tiles3d"](georeference=False, most_splats=8_000)
     return made
 
 
@@ -30,8 +32,10 @@ def write_all(model: Path, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     table = read_splat_file(model)
     for name, form in variants().items():
-        form.write(folder / name, table)
-        print(f"{name:24}{(folder / name).stat().st_size:>12,} bytes")
+        path = folder / name
+        form.write(path, table)
+        size = sum(file.stat().st_size for file in path.rglob("*")) if path.is_dir() else path.stat().st_size
+        print(f"{name:24}{size:>12,} bytes")
 
 
 def main() -> None:

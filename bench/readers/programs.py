@@ -117,7 +117,7 @@ def _forge() -> Any:
 
 
 def three(path: Path) -> tuple[Splats | None, dict]:
-    """The GLTFLoader of three.js (MIT), and what it says of the file. The SPZ blob goes through the library of Niantic."""
+    """The GLTFLoader of three.js (MIT), and what it says of the file. SPZ data go through the library of Niantic."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / ("read.same.spz")
         said = json.loads(node(HERE / "gltf.mjs", path, out))
@@ -135,7 +135,9 @@ def tiles_messages(tileset: Path) -> list[dict]:
     """What the 3D Tiles validator of Cesium (Apache-2.0) says of a tileset, without what it repeats of glTF files."""
     main = os.environ.get(VALIDATOR) or MODULES / "3d-tiles-validator/build/main.js"
     if not Path(main).is_file():
-        raise Missing(f"3d-tiles-validator is missing: npm install --no-save 3d-tiles-validator, or {VALIDATOR}=.../build/main.js")
+        raise Missing(
+            f"3d-tiles-validator is missing: npm install --no-save 3d-tiles-validator, or {VALIDATOR}=.../build/main.js"
+        )
     with TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         node(main, "--tilesetFile", tileset, "--reportFile", report)
@@ -152,10 +154,8 @@ def _leaves(issues: list[dict]) -> list[dict]:
 
 def _is_name_of_splats(issue: dict) -> bool:
     """The messages that validate.mjs leaves out too."""
-    said = issue.get("message", "")
-    return issue.get("type") == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and "KHR_gaussian_splatting:" in json.dumps(issue) or (
-        "UNSUPPORTED_EXTENSION" in json.dumps(issue) and "KHR_gaussian_splatting" in said
-    )
+    names = issue.get("message") == "Invalid attribute name." and "/KHR_gaussian_splatting:" in issue.get("path", "")
+    return names or "not supported by the validator: 'KHR_gaussian_splatting" in issue.get("message", "")
 
 
 def trimesh_points(path: Path) -> np.ndarray:

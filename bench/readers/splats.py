@@ -13,7 +13,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 C0 = 0.28209479177387814
-TYPES = {"float": "<f4", "float32": "<f4", "double": "<f8", "uint": "<u4", "uint32": "<u4", "uchar": "u1", "uint8": "u1"}
+TYPES = {
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "uchar": "u1",
+    "uint8": "u1",
+}
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,9 @@ def elements(path: Path) -> dict[str, np.ndarray]:
 def read_ply(path: Path) -> Splats:
     """The splats of a PLY file in the layout of 3DGS."""
     rows = elements(path)["vertex"]
-    columns = {stem: [n for n in rows.dtype.names if n.startswith(stem)] for stem in ("scale_", "rot_", "f_dc_", "f_rest_")}
+    columns = {
+        stem: [n for n in rows.dtype.names if n.startswith(stem)] for stem in ("scale_", "rot_", "f_dc_", "f_rest_")
+    }
 
     def stack(names):
         ordered = sorted(names, key=lambda name: int(name.rsplit("_", 1)[1]))
@@ -135,7 +145,7 @@ def rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def alike(quats: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Of the 8 quaternions of the same ellipsoid (half turns about its axes, signs), those nearest to the wanted ones."""
+    """Of the 8 quaternions of an ellipsoid (half turns about its axes, signs), those nearest to the wanted ones."""
     w, x, y, z = quats.T
     same = np.stack([(w, x, y, z), (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)]).transpose(2, 0, 1)  # (N, 4, 4)
     near = np.einsum("nkc,nc->nk", same, wanted)
@@ -164,9 +174,15 @@ def partners(reference: Splats, got: Splats, bounds: Bounds) -> np.ndarray:
 
     def scaled(splats: Splats) -> np.ndarray:
         units = [np.maximum(np.median(getattr(bounds, n)), 1e-6) for n in ("means", "log_scales", "alpha", "dc")]
-        parts = (splats.means, splats.log_scales[:, :axes].clip(-9, 5), splats.alpha[:, None], splats.dc.clip(-1.7, 1.7))
+        parts = (
+            splats.means,
+            splats.log_scales[:, :axes].clip(-9, 5),
+            splats.alpha[:, None],
+            splats.dc.clip(-1.7, 1.7),
+        )
         directions = rotations(splats.quats)
-        lines = np.einsum("nik,njk->nkij", directions, directions)[:, :, *np.triu_indices(3)]  # the same for an axis and its opposite
+        lines = np.einsum("nik,njk->nkij", directions, directions)  # the same for an axis and its opposite
+        lines = lines[(slice(None), slice(None), *np.triu_indices(3))]
         parts = [part / unit for part, unit in zip(parts, units, strict=True)]
         return np.concatenate([*parts, lines.reshape(len(splats), -1) / max(0.01, float(np.median(bounds.quats)))], 1)
 
@@ -221,7 +237,9 @@ def representable(splats: Splats, form: str) -> Splats:
     """The splats with all values brought into the range that a format has."""
     if form == "spz":
         dc = splats.dc.clip(-0.5 / 0.15, 0.5 / 0.15)
-        return replace(splats, log_scales=splats.log_scales.clip(-10, 255 / 16 - 10), dc=dc, rest=splats.rest.clip(-1, 127 / 128))
+        return replace(
+            splats, log_scales=splats.log_scales.clip(-10, 255 / 16 - 10), dc=dc, rest=splats.rest.clip(-1, 127 / 128)
+        )
     if form == "splat":
         return replace(splats, dc=splats.dc.clip(-0.5 / C0, 0.5 / C0))
     if form == "compressed-ply":
@@ -244,7 +262,14 @@ def precision(form: str, path: Path, reference: Splats) -> Bounds:
             return np.stack([0.505 * e / c for e, c in zip(extent, counts, strict=True)], 1) + 1e-5
 
         colours = step("", "rgb", (255,) * 3) / C0
-        return Bounds(step("", "xyz", (2047, 1023, 2047)), step("scale_", "xyz", (2047, 1023, 2047)), 0.004, 0.51 / 255, colours, 1 / 32)
+        return Bounds(
+            step("", "xyz", (2047, 1023, 2047)),
+            step("scale_", "xyz", (2047, 1023, 2047)),
+            0.004,
+            0.51 / 255,
+            colours,
+            1 / 32,
+        )
     if form == "sog":
         return sog_precision(path, reference)
     return Bounds(1e-6, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6)
@@ -290,4 +315,3 @@ def spz_head(path: Path) -> dict[str, int]:
     head = gzip.decompress(data)[:16] if data[:2] == b"\x1f\x8b" else data[:16]
     version, count = (int(x) for x in np.frombuffer(head, "<u4", 2, 4))
     return {"version": version, "points": count, "degree": head[12], "fractional_bits": head[13]}
-
