@@ -125,7 +125,7 @@ def validated(path: Path, program: str, read: Callable[[Path], list[dict]]) -> R
 
 
 def gltf_compared(path: Path, reference: Splats) -> Row:
-    """All attributes of a GLB as three.js reads them, in the axes of its primitive, and the extensions that it names."""
+    """All attributes of a GLB as three.js reads them, in the axes of its primitive, and the extensions it names."""
     program = "three.js"
     try:
         got, said = programs.three(path)

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
@@ -176,9 +178,9 @@ def partners(reference: Splats, got: Splats, bounds: Bounds) -> np.ndarray:
         units = [np.maximum(np.median(getattr(bounds, n)), 1e-6) for n in ("means", "log_scales", "alpha", "dc")]
         parts = (
             splats.means,
-            splats.log_scales[:, :axes].clip(-9, 5),
+            splats.log_scales[:, :axes],
             splats.alpha[:, None],
-            splats.dc.clip(-1.7, 1.7),
+            splats.dc,
         )
         directions = rotations(splats.quats)
         lines = np.einsum("nik,njk->nkij", directions, directions)  # the same for an axis and its opposite
@@ -197,11 +199,26 @@ def partners(reference: Splats, got: Splats, bounds: Bounds) -> np.ndarray:
             taken[order[mine]] = True
     if (order < 0).any():
         raise ValueError(f"{(order < 0).sum()} splats have no partner of their own in the reference")
-    wrong = np.flatnonzero(order != near[:, 0])  # another one was nearer; exchange partners where that is better
-    group = np.flatnonzero(np.isin(order, np.union1d(order[wrong], near[wrong])))
-    ours, theirs = scaled(got)[group], scaled(reference)[order[group]]
-    if len(group) <= 5000:
-        order[group] = order[group][linear_sum_assignment(cdist(ours, theirs, "sqeuclidean"))[1]]
+    return exchanged(order, near, scaled(got), scaled(reference))
+
+
+def exchanged(order: np.ndarray, near: np.ndarray, ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Partners exchanged within groups of splats that are near the same ones, such as clones, for the least squares."""
+    holder = np.empty(len(theirs), np.int64)
+    holder[order] = np.arange(len(order))
+    wrong = np.flatnonzero(order != near[:, 0])
+    place = (near[wrong] == order[wrong, None]).argmax(1)
+    links = [(row, holder[other]) for row, last in zip(wrong, place, strict=True) for other in near[row, :last]]
+    if not links:
+        return order
+    rows, others = np.array(links).T
+    graph = coo_matrix((np.ones(len(rows)), (rows, others)), (len(order), len(order)))
+    group = connected_components(graph, directed=False)[1]
+    order = order.copy()
+    for name in np.unique(group[wrong]):
+        members = np.flatnonzero(group == name)
+        costs = cdist(ours[members], theirs[order[members]], "sqeuclidean")
+        order[members] = order[members][linear_sum_assignment(costs)[1]]
     return order
 
 
