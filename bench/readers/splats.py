@@ -174,18 +174,16 @@ def partners(reference: Splats, got: Splats, bounds: Bounds) -> np.ndarray:
     if np.all(np.abs(got.means - reference.means) <= bounds.means + 1e-9):
         return order
 
+    has_rest = bool(got.rest.shape[1] and np.isfinite(bounds.rest).all())
+    names = ("means", "log_scales", "alpha", "dc", *(["rest"] * has_rest))
+    units = [np.maximum(np.median(getattr(bounds, name)), 1e-6) for name in names]
+
     def scaled(splats: Splats) -> np.ndarray:
-        units = [np.maximum(np.median(getattr(bounds, n)), 1e-6) for n in ("means", "log_scales", "alpha", "dc")]
-        parts = (
-            splats.means,
-            splats.log_scales[:, :axes],
-            splats.alpha[:, None],
-            splats.dc,
-        )
+        parts = [splats.means, splats.log_scales[:, :axes], splats.alpha[:, None], splats.dc, splats.rest[:, ::5]]
+        parts = [part / unit for part, unit in zip(parts, units, strict=False)]
         directions = rotations(splats.quats)
         lines = np.einsum("nik,njk->nkij", directions, directions)  # the same for an axis and its opposite
         lines = lines[(slice(None), slice(None), *np.triu_indices(3))]
-        parts = [part / unit for part, unit in zip(parts, units, strict=True)]
         return np.concatenate([*parts, lines.reshape(len(splats), -1) / max(0.01, float(np.median(bounds.quats)))], 1)
 
     some = min(16, len(reference))
