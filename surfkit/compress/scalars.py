@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, stream, to_whole
+from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, multiples, stream
 from surfkit.compress.octree import BITS, Leaf
 from surfkit.compress.streams import Streams
 from surfkit.core.check import BadInput
@@ -104,7 +104,9 @@ class LogSteps(OneColumn, Encoding):
         """See `Encoding.encode`."""
         numbers, activation = flat(values, self.column).astype(np.float64), kinds[self.column].activation
         if activation is not EXP:
-            numbers = activation.value(torch.from_numpy(numbers)).clamp_min(1e-30).log().numpy()
+            numbers = activation.value(torch.from_numpy(numbers)).log().numpy()
+            if not np.isfinite(numbers).all():
+                raise BadInput(f"{self.column}: lengths of 0 or less have no logarithm; choose compress:float16")
         return from_whole(self.column, np.rint(numbers / self.step))
 
     def decode(
@@ -112,7 +114,8 @@ class LogSteps(OneColumn, Encoding):
     ) -> Columns:
         """See `Encoding.decode`."""
         kind = kinds[self.column]
-        numbers = to_whole(streams, self.column, count, kind.width) * self.step
+        exact = kind.dtype if kind.activation is EXP else torch.float64
+        numbers = multiples(streams, self.column, count, kind.width, self.step, exact)
         if kind.activation is not EXP:
             numbers = kind.activation.inverse(torch.from_numpy(numbers).exp()).numpy()
         return {self.column: kind.rows(numbers)}
@@ -175,7 +178,7 @@ class SmallestThree(OneColumn, Encoding):
             rest = np.abs(numbers) * self.step
             spare = 1 - (rest**2).sum(1)
             worst = rest.argmax(1)
-            wrong = rows[rest[rows, worst] ** 2 >= spare * (1 - 1e-9)]
+            wrong = rows[rest[rows, worst] ** 2 >= spare * (1 - 1e-6)]
             numbers[wrong, worst[wrong]] -= np.sign(numbers[wrong, worst[wrong]])
         return {f"{self.column}.largest": largest[:, None].astype(np.uint8)} | from_whole(self.column, numbers)
 
@@ -184,7 +187,7 @@ class SmallestThree(OneColumn, Encoding):
     ) -> Columns:
         """See `Encoding.decode`."""
         largest = stream(streams, f"{self.column}.largest", count, 1)[:, 0] % 4
-        rest = to_whole(streams, self.column, count, 3) * self.step
+        rest = multiples(streams, self.column, count, 3, self.step, torch.float64)
         quats, rows = np.zeros((count, 4)), np.arange(count)
         quats[rows, largest] = np.sqrt(np.maximum(1 - (rest**2).sum(1), 0))
         quats[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4] = rest
