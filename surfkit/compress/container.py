@@ -6,7 +6,7 @@ import mmap
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -236,18 +236,21 @@ class ModelFile:
 def in_threads(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """The results of `work` for items in their order, on as many threads as torch has, with few at a time in memory."""
     threads = torch.get_num_threads()
-    with ThreadPoolExecutor(threads) as pool:
-        waiting = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > threads:
+    waiting: deque[Future[R]] = deque()
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            try:
+                for item in items:
+                    waiting.append(pool.submit(work, item))
+                    if len(waiting) > threads:
+                        yield waiting.popleft().result()
+                while waiting:
                     yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for each in waiting:
-                each.cancel()
+            finally:
+                for each in waiting:
+                    each.cancel()
+    finally:
+        torch.set_num_threads(threads)  # that of a thread is what threads to come begin with
 
 
 def refuse_not_finite(values: Columns) -> None:

@@ -93,6 +93,9 @@ class Cells(OneColumn, Encoding):
 class LogSteps(OneColumn, Encoding):
     """Lengths as multiples of a step of their logarithm: they come back off by a factor of exp(step / 2) at most."""
 
+    column: str = "scales"
+    """Name of the column."""
+
     step: float = 0.1
     """Difference of the natural logarithms of lengths that can be told apart."""
 
@@ -124,6 +127,9 @@ class LogSteps(OneColumn, Encoding):
 @dataclass(frozen=True)
 class Levels(OneColumn, Encoding):
     """Activated values from 0 to 1 as evenly spaced levels: they come back off by 1 / (2 levels) at most."""
+
+    column: str = "opacities"
+    """Name of the column."""
 
     levels: int = 256
     """How many values can be told apart."""
@@ -159,6 +165,9 @@ class SmallestThree(OneColumn, Encoding):
     would not be the largest any more.
     """
 
+    column: str = "quats"
+    """Name of the column."""
+
     step: float = 0.01
     """Difference of components that can be told apart."""
 
@@ -186,7 +195,7 @@ class SmallestThree(OneColumn, Encoding):
         self, streams: Streams, kinds: Mapping[str, ColumnType], leaf: Leaf, count: int, tables: Tables
     ) -> Columns:
         """See `Encoding.decode`."""
-        largest = stream(streams, f"{self.column}.largest", count, 1)[:, 0] % 4
+        largest = (stream(streams, f"{self.column}.largest", count, 1)[:, 0] % 4).astype(np.int64)
         rest = multiples(streams, self.column, count, 3, self.step, torch.float64)
         quats, rows = np.zeros((count, 4)), np.arange(count)
         quats[rows, largest] = np.sqrt(np.maximum(1 - (rest**2).sum(1), 0))

@@ -22,6 +22,8 @@ QUICK = {
 CANNOT = ("needs the package", "surfkit was installed without")
 """What errors say of parts that this machine cannot use."""
 ELSEWHERE = {
+    "encoding:codes": "tests/compress/test_encodings.py has codebooks for it",
+    "encoding:principal-components": "tests/compress/test_encodings.py has a basis for it",
     "executor:ray": "tests/test_ray.py has a cluster for it",
     "method:splats": "tests/test_pipeline.py and most others train with it",
     "method:import": "tests/method/test_imported.py has a file for it",
