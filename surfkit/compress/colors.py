@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, stream, to_whole
+from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, multiples, stream
 from surfkit.compress.octree import Leaf
 from surfkit.compress.scalars import bits_float, float_bits
 from surfkit.compress.streams import Streams
@@ -69,7 +69,10 @@ class PrincipalComponents(Encoding):
     ) -> Columns:
         """See `Encoding.decode`."""
         basis, mean = _basis(tables, width(kinds))
-        return colors((to_whole(streams, "sh", count, len(basis)) * self.step) @ basis.T + mean, kinds)
+        found = multiples(streams, "sh", count, len(basis), self.step)
+        numbers = found @ basis.T.astype(found.dtype)
+        numbers += mean.astype(found.dtype)
+        return colors(numbers, kinds)
 
 
 def principal_components(numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -80,6 +83,8 @@ def principal_components(numbers: np.ndarray) -> dict[str, np.ndarray]:
         mean += part.sum(0)
         square += part.T @ part
     mean = (mean / max(1, len(numbers))).astype(np.float32)
+    if not np.isfinite(square).all():
+        raise BadInput("spherical harmonics: NaN or Inf, or numbers whose squares are; such a model is of no use")
     covariance = square / max(1, len(numbers)) - np.outer(mean, mean)
     basis = np.linalg.eigh(covariance)[1][:, ::-1]
     return {"sh.basis": np.ascontiguousarray(basis.astype(np.float32)), "sh.mean": mean[None]}

@@ -6,7 +6,7 @@ import mmap
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from surfkit.compress.base import Compressor, Plan, kinds_of
-from surfkit.compress.encoding import ColumnType
+from surfkit.compress.encoding import ColumnType, stream
 from surfkit.compress.index import (
     HEAD,
     TABLE_TYPES,
@@ -30,6 +30,7 @@ from surfkit.compress.index import (
     place_of,
     read_index,
     refuse_unencoded,
+    table_shape,
 )
 from surfkit.compress.octree import MOST, Leaf, leaves
 from surfkit.compress.streams import packed, unpacked
@@ -51,6 +52,7 @@ def write_model(
     compressor: Compressor,
     frame: Frame | None = None,
     progress: Callable[[int, int], None] | None = None,
+    most: int = MOST,
 ) -> int:
     """Write a model as its plan says; the bytes of the file, which appears only when it is complete.
 
@@ -63,13 +65,15 @@ def write_model(
         compressor: Named in the file.
         frame: Of the data set that the model lies in.
         progress: Told how many points of how many are done.
+        most: Points of a leaf.
 
     Raises:
         BadInput: A column that is NaN or Inf, or that an encoding has no place for.
     """
     kinds, points = kinds_of(model), model.primitive.per_point(model.params)
     refuse_unencoded(plan.encodings, kinds)
-    shared = {f"shared.{name}": model.params[name].numpy() for name in sorted(model.primitive.shared())}
+    shared = {f"shared.{name}": model.params[name].detach().numpy() for name in sorted(model.primitive.shared())}
+    refuse_not_finite({name: torch.from_numpy(value) for name, value in shared.items()})
     with replacing(path) as file:
         file.write(b"\0" * HEAD.size)
         tables = {
@@ -87,7 +91,7 @@ def write_model(
             return leaf, packed(streams)
 
         entries, done = [], 0
-        for leaf, data in in_threads(coded, leaves(points["means"].numpy())):
+        for leaf, data in in_threads(coded, leaves(points["means"].numpy(), most)):
             block = _append(file, data)
             entries.append(LeafEntry(len(leaf.rows), leaf.exponent, leaf.corner, leaf.finest, block))
             done += len(leaf.rows)
@@ -149,11 +153,12 @@ class ModelFile:
         found = {}
         for name, entry in self.index.tables.items():
             with self._naming(f"table {name}"):
-                rows = entry.shape[0] if entry.shape else 1
-                numbers = unpacked(self._block(entry.block), max(rows, 1)).get("table")
-                if numbers is None or numbers.dtype != np.dtype(TABLE_TYPES[entry.dtype]):
-                    raise BadInput("it is missing, or of another type")
+                rows, components = table_shape(entry.shape)
+                numbers = stream(unpacked(self._block(entry.block), rows), "table", rows, components)
+                if numbers.dtype != np.dtype(TABLE_TYPES[entry.dtype]):
+                    raise BadInput(f"numbers of another type than {entry.dtype}")
                 found[name] = np.frombuffer(numbers.tobytes(), entry.dtype).reshape(entry.shape)
+                refuse_not_finite({name: torch.from_numpy(found[name].copy())} if name.startswith("shared.") else {})
         return found
 
     def leaf(self, at: int) -> Columns:
@@ -167,9 +172,10 @@ class ModelFile:
         found: Columns = {}
         tables = self.tables
         with self._naming(f"leaf {at} of {len(self.index.leaves)}"):
-            streams = unpacked(self._block(entry.block), max(entry.points, MOST))
-            for encoding in self.index.encodings:
-                found |= encoding.decode(streams, self.kinds, leaf, entry.points, tables)
+            streams = unpacked(self._block(entry.block), entry.points)
+            with np.errstate(all="ignore"):  # what overflows is refused below
+                for encoding in self.index.encodings:
+                    found |= encoding.decode(streams, self.kinds, leaf, entry.points, tables)
             refuse_not_finite(found)
         return found
 
@@ -222,32 +228,35 @@ class ModelFile:
         """Within, BadInput and what else damaged bytes lead to is told with the name of the file and its part."""
         try:
             yield
-        except (BadInput, ValueError, OverflowError, IndexError) as error:
+        except (ValueError, OverflowError, LookupError) as error:
             where = f"{self.path}: {part}: " if part else f"{self.path}: "
-            raise BadInput(f"{where}{error}; copy or write the file again") from error
+            raise BadInput(f"{where}{' '.join(str(error).split())}; copy or write the file again") from error
 
 
 def in_threads(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """The results of `work` for items in their order, on as many threads as torch has, with few at a time in memory."""
     threads = torch.get_num_threads()
-    with ThreadPoolExecutor(threads) as pool:
-        waiting = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(work, item))
-                if len(waiting) > threads:
+    waiting: deque[Future[R]] = deque()
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            try:
+                for item in items:
+                    waiting.append(pool.submit(work, item))
+                    if len(waiting) > threads:
+                        yield waiting.popleft().result()
+                while waiting:
                     yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            for each in waiting:
-                each.cancel()
+            finally:
+                for each in waiting:
+                    each.cancel()
+    finally:
+        torch.set_num_threads(threads)  # that of a thread is what threads to come begin with
 
 
 def refuse_not_finite(values: Columns) -> None:
     """BadInput if a column has NaN or Inf."""
     for name, value in values.items():
-        if value.is_floating_point() and not value.isfinite().all():
+        if value.is_floating_point() and not value.sum().isfinite() and not value.isfinite().all():
             raise BadInput(f"{name}: NaN or Inf in {int((~value.isfinite()).sum())} places; such a model is of no use")
 
 
@@ -261,7 +270,7 @@ def _table_bytes(name: str, value: np.ndarray) -> bytes:
     if str(value.dtype) not in TABLE_TYPES:
         raise TypeError(f"table {name}: {value.dtype}; types are {', '.join(TABLE_TYPES)}")
     rows = np.frombuffer(value.tobytes(), TABLE_TYPES[str(value.dtype)])
-    return packed({"table": rows.reshape(value.shape[0] if value.ndim else 1, -1)})
+    return packed({"table": rows.reshape(table_shape(value.shape))})
 
 
 def read_model(path: Path) -> tuple[SplatModel, Frame | None]:

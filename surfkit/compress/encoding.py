@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from surfkit.compress.octree import Leaf
-from surfkit.compress.streams import Streams
+from surfkit.compress.streams import Stored, Streams
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.primitives.columns import IDENTITY, Activation
@@ -20,6 +20,7 @@ from surfkit.primitives.points import Columns
 
 Tables = Mapping[str, np.ndarray]
 """Arrays that all leaves share, such as codebooks."""
+MOST_STEPS = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class ColumnType:
 
     def rows(self, numbers: np.ndarray) -> Tensor:
         """(n, width) numbers as values of this column."""
-        return torch.from_numpy(np.array(numbers)).to(self.dtype).view(len(numbers), *self.shape)
+        return torch.from_numpy(np.array(numbers, order="C")).to(self.dtype).view(len(numbers), *self.shape)
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Encoding(Component):
 def flat(values: Columns, name: str) -> np.ndarray:
     """(n, width) numbers of a column."""
     numbers = values[name].detach().cpu()
-    return numbers.reshape(len(numbers), -1).numpy()
+    return numbers.reshape(len(numbers), math.prod(numbers.shape[1:])).numpy()
 
 
 def stream(streams: Streams, name: str, rows: int, components: int) -> np.ndarray:
@@ -92,32 +93,52 @@ def stream(streams: Streams, name: str, rows: int, components: int) -> np.ndarra
     if found is None or found.shape != (rows, components):
         what = "is missing" if found is None else f"is {found.shape[0]} x {found.shape[1]}"
         raise BadInput(f"stream {name} {what}; {rows} x {components} are needed")
-    return found
+    return found.numbers() if isinstance(found, Stored) else found
 
 
 def from_whole(name: str, numbers: np.ndarray) -> Streams:
-    """Streams of (n, components) whole numbers of any sign, as differences from their medians."""
-    if len(numbers) and not np.abs(numbers).max() < 2**30:
-        raise BadInput(f"{name}: values of more than 2^30 steps; take longer steps, or compress:float16")
-    middle = np.median(numbers, 0, keepdims=True).round() if len(numbers) else np.zeros((1, numbers.shape[1]))
+    """Streams of (n, components) whole numbers of any sign, as differences from their medians.
+
+    Raises:
+        BadInput: Numbers of 2^22 or more, whose multiples of a step float32 does not tell apart.
+    """
+    if numbers.size and not np.abs(numbers).max() < MOST_STEPS:
+        raise BadInput(f"{name}: values of more than 2^22 steps; take longer steps, or compress:float16")
+    middle = np.median(numbers, 0, keepdims=True).round() if numbers.size else np.zeros((1, numbers.shape[1]))
     return {f"{name}.middle": _smallest(_zigzag(middle)), name: _smallest(_zigzag(numbers - middle))}
 
 
-def to_whole(streams: Streams, name: str, rows: int, components: int) -> np.ndarray:
-    """(rows, components) int64 numbers that `from_whole` made streams of."""
+def multiples(
+    streams: Streams, name: str, rows: int, components: int, step: float, dtype: torch.dtype | None = None
+) -> np.ndarray:
+    """(rows, components) multiples of a step that `from_whole` made streams of, rounded to a float type.
+
+    By default float32 if all numbers have 16 bits, which is enough for sums of products of them, and float64 if not.
+    """
     middle, numbers = stream(streams, f"{name}.middle", 1, components), stream(streams, name, rows, components)
-    return _signed(middle) + _signed(numbers)
+    short = middle.dtype.itemsize <= 2 and numbers.dtype.itemsize <= 2
+    single = short if dtype is None else dtype == torch.float32
+    found = np.empty((components, rows), np.float32 if single else np.float64)
+    for at, first in enumerate(_signed(middle)[0]):
+        codes = numbers[:, at]
+        if codes.dtype.itemsize > 2:
+            found[at] = (first + _signed(codes)) * step
+        elif rows:
+            values = ((first + _signed(np.arange(int(codes.max()) + 1))) * step).astype(found.dtype)
+            np.take(values, codes, out=found[at], mode="clip")
+    return found.T
 
 
 def _zigzag(numbers: np.ndarray) -> np.ndarray:
     """0, -1, 1, -2, ... as 0, 1, 2, 3, ..., in 32 bits."""
-    numbers = numbers.astype(np.int64)
-    return np.where(numbers < 0, -2 * numbers - 1, 2 * numbers).astype(np.uint32)
+    numbers = numbers.astype(np.int32)
+    return ((numbers << 1) ^ (numbers >> 31)).view(np.uint32)
 
 
 def _signed(numbers: np.ndarray) -> np.ndarray:
+    """The int64 numbers of `_zigzag`."""
     numbers = numbers.astype(np.int64)
-    return np.where(numbers & 1, -(numbers + 1) // 2, numbers // 2)
+    return (numbers >> 1) ^ -(numbers & 1)
 
 
 def _smallest(numbers: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@
     u64 u64   where the index begins, and its bytes
     u64       bytes of the whole file
     u32 u32   CRC-32 of the index, and 0
-    ...       blocks: the streams of a leaf or of a table
+    ...       blocks, one after the other without gaps: the streams of a table or of a leaf
     index     JSON in UTF-8, as one Zstandard frame
 
 Numbers are little endian.
@@ -15,6 +15,7 @@ Numbers are little endian.
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -23,6 +24,7 @@ from typing import Any
 
 from surfkit.compress.encoding import ColumnType, Encoding
 from surfkit.compress.octree import MOST
+from surfkit.compress.streams import MOST_COMPONENTS
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, from_json, load
 from surfkit.primitives.base import Primitive
@@ -33,8 +35,14 @@ VERSION = 1
 HEAD = struct.Struct("<8sIIQQQII")
 MOST_INDEX = 1 << 28
 """Bytes of an index that is read."""
-MOST_POINTS_A_BYTE = 1_000
-"""A file that claims more is damaged: even points that are all alike take more room."""
+MOST_INDEX_A_BYTE, LEAST_INDEX = 64, 1 << 16
+"""Bytes of JSON for each stored byte of an index, and what is allowed in any case: real ones have 10 or fewer."""
+MOST_POINTS_A_BYTE = 1 << 12
+"""Of a leaf: one that claims more is damaged, as even points that are all alike take more room."""
+MOST_NUMBERS_A_BYTE = 1 << 17
+"""Of a table, likewise."""
+MOST_AXES = 8
+"""Of a table."""
 TABLE_TYPES = {"float16": "u2", "float32": "u4", "float64": "u8", "uint8": "u1", "uint16": "u2"}
 
 
@@ -90,6 +98,12 @@ class Place:
     crs: str | None
     shift: tuple[float, float, float]
 
+    def refuse_unsound(self) -> None:
+        """BadInput for a frame that nothing can lie in."""
+        lengths = [self.scale] if self.metres is None else [self.scale, self.metres]
+        if not all(map(math.isfinite, (*self.origin, *self.shift))) or not all(0 < each < math.inf for each in lengths):
+            raise BadInput("a frame whose numbers are NaN, Inf, or lengths of 0 or less")
+
 
 @dataclass(frozen=True)
 class Index:
@@ -118,12 +132,14 @@ class Index:
     tables: dict[str, TableEntry]
     leaves: tuple[LeafEntry, ...]
 
-    def refuse_unsound(self, size: int) -> None:
-        """BadInput if the index does not describe a file of `size` bytes."""
+    def refuse_unsound(self, start: int) -> None:
+        """BadInput if the index does not describe a file in which it begins at byte `start`."""
         if self.points != sum(leaf.points for leaf in self.leaves):
             raise BadInput(f"its leaves have {sum(leaf.points for leaf in self.leaves)} points, not {self.points}")
-        if self.points > MOST_POINTS_A_BYTE * size:
-            raise BadInput(f"{self.points} points cannot be in {size} bytes")
+        if self.sh_degree not in range(self.primitive.sh_degree + 1) or not 0 <= self.near < math.inf:
+            raise BadInput(f"sh_degree {self.sh_degree} or near {self.near:g} that no model has")
+        if self.frame is not None:
+            self.frame.refuse_unsound()
         declared, shared = self.primitive.columns(), self.primitive.shared()
         wanted = {name: column.shape for name, column in declared.items() if name not in shared}
         if wanted != {name: column.shape for name, column in self.columns.items()}:
@@ -135,15 +151,23 @@ class Index:
         if lacking:
             raise BadInput(f"table {min(lacking)} is missing")
         for name, table in self.tables.items():
-            if table.dtype not in TABLE_TYPES or any(axis < 0 for axis in table.shape):
-                raise BadInput(f"table {name}: {table.dtype} {table.shape}; types are {', '.join(TABLE_TYPES)}")
+            fits = all(axis >= 0 for axis in table.shape) and len(table.shape) <= MOST_AXES
+            if not fits or math.prod(table.shape) > MOST_NUMBERS_A_BYTE * table.block.length:
+                raise BadInput(f"table {name}: a shape of {table.shape} in {table.block.length} bytes")
+            if table.dtype not in TABLE_TYPES:
+                raise BadInput(f"table {name}: numbers of {table.dtype}; types are {', '.join(TABLE_TYPES)}")
         for at, leaf in enumerate(self.leaves):
-            fits = 0 < leaf.points <= MOST and abs(leaf.exponent) < 1000 and leaf.finest <= leaf.exponent
+            fits = 0 < leaf.points <= min(MOST, MOST_POINTS_A_BYTE * leaf.block.length)
+            fits &= abs(leaf.exponent) < 1000 and leaf.finest <= leaf.exponent
             if not fits or any(abs(corner) > 1 << 54 for corner in leaf.corner):
                 raise BadInput(f"leaf {at}: {leaf.points} points in a cube of side 2^{leaf.exponent} at {leaf.corner}")
+        end = HEAD.size
         for block in [*(table.block for table in self.tables.values()), *(leaf.block for leaf in self.leaves)]:
-            if block.offset < HEAD.size or block.length < 0 or block.offset + block.length > size:
-                raise BadInput("a block lies outside of the file")
+            if block.offset != end or block.length < 0:
+                raise BadInput(f"a block of {block.length} bytes begins at {block.offset}, not at {end}")
+            end += block.length
+        if end != start:
+            raise BadInput(f"its blocks end at {end}, not at {start} where the index begins")
 
 
 def place_of(frame: Frame | None) -> Place | None:
@@ -160,6 +184,12 @@ def refuse_unencoded(encodings: tuple[Encoding, ...], columns: Mapping[str, Colu
     wrong = [name for name in columns if taken.count(name) != 1] + [name for name in taken if name not in columns]
     if wrong:
         raise BadInput(f"column {wrong[0]} must be taken by one encoding; they take {', '.join(taken)}")
+
+
+def table_shape(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and components of the stream of a table: its last axis gives the components, if it has 4096 or fewer."""
+    components = shape[-1] if shape and 0 < shape[-1] <= MOST_COMPONENTS else 1
+    return math.prod(shape) // components, components
 
 
 def index_bytes(index: Index) -> bytes:
@@ -195,14 +225,16 @@ def read_index(data: memoryview) -> Index:
         raise BadInput("its head is damaged (checksum)")
     if size != len(data):
         raise BadInput(f"has {len(data)} bytes, not {size}: cut off, or not copied whole")
-    if length > MOST_INDEX or start + length > size or zlib.crc32(data[start : start + length]) != crc:
+    if start < HEAD.size or start + length != size or zlib.crc32(data[start : start + length]) != crc:
         raise BadInput("its index is damaged (checksum)")
     part = data[start : start + length]
     try:
-        if zstandard.frame_content_size(part) > MOST_INDEX:
-            raise BadInput("an index of more than 256 MB")
-        index = load(Index, from_json(zstandard.ZstdDecompressor().decompress(part).decode()))
-        index.refuse_unsound(size)
+        unpacked = zstandard.frame_content_size(part)
+        if unpacked > min(MOST_INDEX, LEAST_INDEX + MOST_INDEX_A_BYTE * length):
+            raise BadInput(f"{unpacked} bytes of JSON in {length} bytes")
+        text = zstandard.ZstdDecompressor().decompress(part, allow_extra_data=False)
+        index = load(Index, from_json(text.decode()))
+        index.refuse_unsound(start)
     except (zstandard.ZstdError, UnicodeDecodeError, BadInput) as error:
         raise BadInput(f"its index cannot be used: {error}") from error
     return index

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from surfkit.core.check import BadInput
+
 MOST = 1 << 17
 """Points of a leaf."""
 BITS = 16
@@ -20,6 +22,8 @@ LEVELS = 21
 """Of the tree at most: 3 x 21 bits number its smallest cells."""
 DIGITS = {4: 22, 8: 51}
 """Cells are at least 2^-22 of the largest coordinate in float32, 2^-51 in float64: their centres can be told apart."""
+LARGEST = 2.0**200
+"""Coordinates below it are taken: more than all of float32."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Leaf:
         exponent: Its side is 2^exponent.
         corner: The corner with the smallest coordinates, in half sides.
         finest: Cells of a side below 2^finest are of no use, as floats round more than that.
-        rows: (n,) int64 of its points, along the Morton curve through cells of 2^-BITS of the side.
+        rows: (n,) int64 of its points, along the Morton curve through the smallest cells that the leaf can have.
     """
 
     exponent: int
@@ -49,8 +53,12 @@ class Leaf:
         return self.low + math.ldexp(1.0, self.exponent)
 
     def cell_exponent(self, wanted: int) -> int:
-        """The exponent of the cells of positions, of those that can be had the nearest to the one that is wanted."""
-        return min(max(wanted, self.finest, self.exponent - LEVELS + 1), self.exponent)
+        """The exponent of the cells of positions, of those that can be had the nearest to the one that is wanted.
+
+        Cells are a quarter of the side or smaller, unless floats round more than that: larger ones would move points so
+        far that they come to lie in other leaves.
+        """
+        return max(min(max(wanted, self.exponent - LEVELS + 1), self.exponent - 2), self.finest)
 
     def codes(self, positions: np.ndarray, exponent: int) -> np.ndarray:
         """(n,) uint64 Morton codes of the cells of side 2^exponent that (n, 3) positions in the leaf lie in."""
@@ -66,10 +74,15 @@ def leaves(positions: np.ndarray, most: int = MOST) -> Iterator[Leaf]:
     """The leaves of an octree over (N, 3) positions, float32 or float64, each of `most` points or fewer.
 
     They come along a Morton curve. Memory beside the positions: about 32 bytes a point.
+
+    Raises:
+        BadInput: Coordinates that are NaN, or too large.
     """
     if not len(positions):
         return
     low, high = positions.min(0), positions.max(0)
+    if not (np.abs(np.array([low, high], np.float64)) < LARGEST).all():
+        raise BadInput("positions that are NaN, Inf or beyond 2^200; such a model is of no use")
     top = _top(low, high)
     first = cells(low[None], top - 1)[0]
     largest = max(abs(int(index) + more) for index in first for more in (0, 2))
@@ -95,7 +108,7 @@ def leaves(positions: np.ndarray, most: int = MOST) -> Iterator[Leaf]:
         leaf = Leaf(top - level, tuple(corner.tolist()), finest)
         for begin in range(start, stop, most):
             rows = order[begin : min(begin + most, stop)]
-            fine = leaf.codes(positions[rows], leaf.cell_exponent(leaf.exponent - BITS))
+            fine = leaf.codes(positions[rows], leaf.cell_exponent(leaf.exponent - LEVELS))
             yield Leaf(leaf.exponent, leaf.corner, finest, rows[np.argsort(fine, kind="stable")])
 
     yield from below(0, 0, 0, len(positions))
@@ -108,8 +121,9 @@ def cells(positions: np.ndarray, exponent: int) -> np.ndarray:
 
 def _top(low: np.ndarray, high: np.ndarray) -> int:
     """The exponent of the tree's cube: two cells on each axis are the smallest that hold all points."""
-    magnitude = max(float(np.abs(low).max()), float(np.abs(high).max()), 1e-30)
-    least = math.frexp(magnitude)[1] - DIGITS[low.dtype.itemsize] + 2
+    above, below = max(float(high.max()), 1e-30), max(-float(low.min()), 1e-30)
+    below = math.nextafter(below, 0)  # a cell has its lower border: -1 and what is nearest above it must count alike
+    least = max(math.frexp(above)[1], math.frexp(below)[1]) - DIGITS[low.dtype.itemsize] + 2
     exponent = max(least, math.frexp(float((high.astype(np.float64) - low).max()))[1] + 1)
     while exponent > least and (cells(high, exponent - 1) - cells(low, exponent - 1)).max() <= 1:
         exponent -= 1

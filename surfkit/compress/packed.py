@@ -74,7 +74,7 @@ def shape_encodings(
     """
     kinds, found = kinds_of(model), {}
     found["means",] = Cells("means", None if position is None else position_exponent(model, position, scale))
-    if "scales" in kinds:
+    if "scales" in kinds and _are_lengths(model, kinds["scales"]):
         found["scales",] = LogSteps("scales", scale)
     if kinds.get("quats", ColumnType(())).shape == (4,):
         found["quats",] = SmallestThree("quats", min(rotation, 0.25))
@@ -91,15 +91,26 @@ def encodings_of(kinds: dict[str, ColumnType], found: dict[tuple[str, ...], Enco
 
 def position_exponent(model: SplatModel, share: float, step: float) -> int:
     """The side of cubes, 2^it, that is `share` of the median radius or less; the same for radii rounded to `step`."""
-    if "scales" not in model.params or not len(model):
+    kind = kinds_of(model).get("scales")
+    if kind is None or not _are_lengths(model, kind) or not len(model):
         return -1000  # as small as floats are
-    kind = kinds_of(model)["scales"]
     radii = model.params["scales"].reshape(len(model), -1)
-    logs = radii if kind.activation is EXP else kind.activation.value(radii).clamp_min(1e-30).log()
+    logs = radii if kind.activation is EXP else kind.activation.value(radii).log()
     rounded = np.rint(logs.amin(1).double().numpy() / step) * step
-    return math.floor((float(np.median(rounded)) + math.log(share)) / math.log(2) + 1e-6)
+    median = float(np.median(rounded))
+    if not math.isfinite(median):
+        raise BadInput("scales: NaN or Inf; such a model is of no use")
+    return math.floor((median + math.log(share)) / math.log(2) + 1e-6)
+
+
+def _are_lengths(model: SplatModel, kind: ColumnType) -> bool:
+    if kind.activation is EXP or not len(model):
+        return True
+    return bool(kind.activation.value(model.params["scales"].min().double()) > 0)
 
 
 def _within_0_and_1(model: SplatModel, kind: ColumnType) -> bool:
+    if not len(model):
+        return True
     values = kind.activation.value(torch.stack([model.params["opacities"].min(), model.params["opacities"].max()]))
     return bool((values >= 0).all() and (values <= 1).all())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, stream, to_whole
+from surfkit.compress.encoding import ColumnType, Encoding, Tables, flat, from_whole, multiples, stream
 from surfkit.compress.octree import BITS, Leaf
 from surfkit.compress.streams import Streams
 from surfkit.core.check import BadInput
@@ -93,6 +93,9 @@ class Cells(OneColumn, Encoding):
 class LogSteps(OneColumn, Encoding):
     """Lengths as multiples of a step of their logarithm: they come back off by a factor of exp(step / 2) at most."""
 
+    column: str = "scales"
+    """Name of the column."""
+
     step: float = 0.1
     """Difference of the natural logarithms of lengths that can be told apart."""
 
@@ -104,7 +107,9 @@ class LogSteps(OneColumn, Encoding):
         """See `Encoding.encode`."""
         numbers, activation = flat(values, self.column).astype(np.float64), kinds[self.column].activation
         if activation is not EXP:
-            numbers = activation.value(torch.from_numpy(numbers)).clamp_min(1e-30).log().numpy()
+            numbers = activation.value(torch.from_numpy(numbers)).log().numpy()
+            if not np.isfinite(numbers).all():
+                raise BadInput(f"{self.column}: lengths of 0 or less have no logarithm; choose compress:float16")
         return from_whole(self.column, np.rint(numbers / self.step))
 
     def decode(
@@ -112,7 +117,8 @@ class LogSteps(OneColumn, Encoding):
     ) -> Columns:
         """See `Encoding.decode`."""
         kind = kinds[self.column]
-        numbers = to_whole(streams, self.column, count, kind.width) * self.step
+        exact = kind.dtype if kind.activation is EXP else torch.float64
+        numbers = multiples(streams, self.column, count, kind.width, self.step, exact)
         if kind.activation is not EXP:
             numbers = kind.activation.inverse(torch.from_numpy(numbers).exp()).numpy()
         return {self.column: kind.rows(numbers)}
@@ -121,6 +127,9 @@ class LogSteps(OneColumn, Encoding):
 @dataclass(frozen=True)
 class Levels(OneColumn, Encoding):
     """Activated values from 0 to 1 as evenly spaced levels: they come back off by 1 / (2 levels) at most."""
+
+    column: str = "opacities"
+    """Name of the column."""
 
     levels: int = 256
     """How many values can be told apart."""
@@ -156,6 +165,9 @@ class SmallestThree(OneColumn, Encoding):
     would not be the largest any more.
     """
 
+    column: str = "quats"
+    """Name of the column."""
+
     step: float = 0.01
     """Difference of components that can be told apart."""
 
@@ -175,7 +187,7 @@ class SmallestThree(OneColumn, Encoding):
             rest = np.abs(numbers) * self.step
             spare = 1 - (rest**2).sum(1)
             worst = rest.argmax(1)
-            wrong = rows[rest[rows, worst] ** 2 >= spare * (1 - 1e-9)]
+            wrong = rows[rest[rows, worst] ** 2 >= spare * (1 - 1e-6)]
             numbers[wrong, worst[wrong]] -= np.sign(numbers[wrong, worst[wrong]])
         return {f"{self.column}.largest": largest[:, None].astype(np.uint8)} | from_whole(self.column, numbers)
 
@@ -183,8 +195,8 @@ class SmallestThree(OneColumn, Encoding):
         self, streams: Streams, kinds: Mapping[str, ColumnType], leaf: Leaf, count: int, tables: Tables
     ) -> Columns:
         """See `Encoding.decode`."""
-        largest = stream(streams, f"{self.column}.largest", count, 1)[:, 0] % 4
-        rest = to_whole(streams, self.column, count, 3) * self.step
+        largest = (stream(streams, f"{self.column}.largest", count, 1)[:, 0] % 4).astype(np.int64)
+        rest = multiples(streams, self.column, count, 3, self.step, torch.float64)
         quats, rows = np.zeros((count, 4)), np.arange(count)
         quats[rows, largest] = np.sqrt(np.maximum(1 - (rest**2).sum(1), 0))
         quats[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4] = rest

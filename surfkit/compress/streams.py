@@ -1,10 +1,11 @@
 """Arrays of whole numbers as bytes: one plane for each byte of each component, each coded by Zstandard.
 
 A plane holds numbers of one kind, so that the entropy coder sees their distribution; what is all zero takes no room.
+docs/surfkit_file.md describes the bytes.
 
     u8   streams
     then for each stream
-        u8   length of its name, and the name in ASCII
+        u8   length of its name in bytes, and the name in UTF-8
         u8   bytes of a number: 1, 2, 4 or 8
         u32  components
         u32  rows
@@ -12,13 +13,15 @@ A plane holds numbers of one kind, so that the entropy coder sees their distribu
              for a plane that is stored as it is
     then the planes, one after the other, as Zstandard frames with their size
 
-All numbers are little endian and unsigned.
+All numbers are little endian and unsigned. Planes of more than `MOST_EMPTY` rows are never left out, so that nobody
+needs more than about 2^17 times the memory of the bytes that are read.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,7 +31,63 @@ LEVEL = 15
 """Of Zstandard."""
 AS_IT_IS = 1 << 31
 MOST_COMPONENTS = 4096
-Streams = dict[str, np.ndarray]
+MOST_EMPTY = 1 << 17
+"""Rows of a plane that takes no room."""
+MOST_ROWS_A_BYTE = 1 << 15
+"""Of a Zstandard frame: it repeats a byte at most so often for each of its own."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A stream as it lies in a file: its numbers are decoded when they are asked for, once its shape is known to fit.
+
+    Attributes:
+        name: Of the stream.
+        dtype: Of its numbers.
+        shape: (rows, components).
+        planes: Stored bytes of each plane, component by component, lowest byte first.
+        coded: Whether each of them is a Zstandard frame.
+    """
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, int]
+    planes: tuple[memoryview, ...] = field(repr=False)
+    coded: tuple[bool, ...] = field(repr=False)
+
+    def numbers(self) -> np.ndarray:
+        """(rows, components) numbers, the rows of each component one after the other in memory.
+
+        Raises:
+            BadInput: Damaged.
+        """
+        (rows, components), size = self.shape, self.dtype.itemsize
+        found = np.zeros((components, rows), self.dtype)
+        split = found.view(np.uint8).reshape(components, rows, size)
+        for at, (part, coded) in enumerate(zip(self.planes, self.coded, strict=True)):
+            if len(part):
+                split[at // size, :, at % size] = self._plane(part, coded)
+        return found.T
+
+    def _plane(self, part: memoryview, coded: bool) -> np.ndarray:
+        import zstandard
+
+        if coded:
+            try:
+                size = zstandard.frame_content_size(part)
+                if size == self.shape[0] <= MOST_EMPTY + MOST_ROWS_A_BYTE * len(part):
+                    part = zstandard.ZstdDecompressor().decompress(part, allow_extra_data=False)
+                else:
+                    part = part[:0]
+            except zstandard.ZstdError as error:
+                raise BadInput(f"stream {self.name}: {error}") from error
+        if len(part) != self.shape[0]:
+            raise BadInput(f"stream {self.name} has a plane of another size")
+        return np.frombuffer(part, np.uint8)
+
+
+Streams = Mapping[str, np.ndarray | Stored]
+"""Arrays by name, (rows, components) of an unsigned type each; those of a file are not decoded yet."""
 
 
 def packed(streams: Mapping[str, np.ndarray]) -> bytes:
@@ -38,14 +97,18 @@ def packed(streams: Mapping[str, np.ndarray]) -> bytes:
     coder = zstandard.ZstdCompressor(level=LEVEL)
     head, body = [struct.pack("<B", len(streams))], []
     for name, numbers in streams.items():
-        if numbers.dtype.kind != "u" or numbers.ndim != 2:
-            raise TypeError(f"stream {name}: {numbers.dtype} {numbers.shape}; it must be unsigned with two axes")
+        if numbers.dtype.kind != "u" or numbers.ndim != 2 or numbers.shape[1] > MOST_COMPONENTS:
+            raise TypeError(
+                f"stream {name}: {numbers.dtype} {numbers.shape}; it must be unsigned, with two axes and at most "
+                f"{MOST_COMPONENTS} components"
+            )
         rows, components = numbers.shape
         size = numbers.dtype.itemsize
-        head.append(struct.pack("<B", len(name)) + name.encode("ascii") + struct.pack("<BII", size, components, rows))
+        title = name.encode()
+        head.append(struct.pack("<B", len(title)) + title + struct.pack("<BII", size, components, rows))
         split = np.ascontiguousarray(numbers.astype(f"<u{size}", copy=False).T).view(np.uint8)
         for plane in split.reshape(components, rows, size).transpose(0, 2, 1).reshape(components * size, rows):
-            if not plane.any():
+            if rows <= MOST_EMPTY and not plane.any():
                 head.append(struct.pack("<I", 0))
                 continue
             plain = plane.tobytes()
@@ -56,51 +119,36 @@ def packed(streams: Mapping[str, np.ndarray]) -> bytes:
     return b"".join(head + body)
 
 
-def unpacked(data: bytes | memoryview, most_rows: int) -> Streams:
-    """The arrays of `packed`.
+def unpacked(data: bytes | memoryview, most_rows: int) -> dict[str, Stored]:
+    """The streams of `packed`, not decoded yet.
 
     Raises:
         BadInput: Damaged, or an array of more than `most_rows` rows; without the name of the file.
     """
-    import zstandard
-
-    coder = zstandard.ZstdDecompressor()
+    data, found, at = memoryview(data), {}, 1
     try:
-        shapes, at = _heads(data, most_rows)
-        streams = {}
-        for name, size, components, rows, lengths in shapes:
-            planes = np.zeros((components * size, rows), np.uint8)
-            for plane, length in zip(planes, lengths, strict=True):
-                stored = length & ~AS_IT_IS
-                part = data[at : at + stored]
-                at += stored
-                if len(part) < stored:
-                    raise BadInput(f"stream {name} is cut off")
-                if length & AS_IT_IS:
-                    plane[:] = np.frombuffer(part, np.uint8)
-                elif length:
-                    if zstandard.frame_content_size(part) != rows:
-                        raise BadInput(f"stream {name} has a plane of another size")
-                    plane[:] = np.frombuffer(coder.decompress(part), np.uint8)
-            split = planes.reshape(components, size, rows).transpose(2, 0, 1).tobytes()
-            streams[name] = np.frombuffer(split, f"<u{size}").reshape(rows, components)
-    except (struct.error, ValueError, UnicodeDecodeError, zstandard.ZstdError) as error:
-        raise BadInput(str(error) or "damaged streams") from error
+        for _ in range(struct.unpack_from("<B", data)[0]):
+            length = struct.unpack_from("<B", data, at)[0]
+            name = bytes(data[at + 1 : at + 1 + length]).decode()
+            size, components, rows = struct.unpack_from("<BII", data, at + 1 + length)
+            at += 1 + length + 9
+            if size not in (1, 2, 4, 8) or components > MOST_COMPONENTS or rows > most_rows or name in found:
+                raise BadInput(f"stream {name!r} has {rows} x {components} numbers of {size} bytes, or is there twice")
+            found[name] = (size, components, rows, struct.unpack_from(f"<{components * size}I", data, at))
+            at += 4 * components * size
+    except (struct.error, UnicodeDecodeError) as error:
+        raise BadInput("the heads of its streams are damaged") from error
+    streams = {}
+    for name, (size, components, rows, lengths) in found.items():
+        ends = [at := at + (length & ~AS_IT_IS) for length in lengths]
+        starts = [end - (length & ~AS_IT_IS) for end, length in zip(ends, lengths, strict=True)]
+        if at > len(data):
+            raise BadInput(f"stream {name} is cut off")
+        if rows > MOST_EMPTY and 0 in lengths:
+            raise BadInput(f"stream {name} of {rows} rows lacks a plane")
+        planes = tuple(data[start:end] for start, end in zip(starts, ends, strict=True))
+        coded = tuple(length < AS_IT_IS for length in lengths)
+        streams[name] = Stored(name, np.dtype(f"<u{size}"), (rows, components), planes, coded)
     if at != len(data):
         raise BadInput(f"{len(data) - at} bytes after the last stream")
     return streams
-
-
-def _heads(data: bytes | memoryview, most_rows: int) -> tuple[list[tuple[str, int, int, int, tuple[int, ...]]], int]:
-    """Name, bytes of a number, components, rows and lengths of planes of each stream, and where the planes begin."""
-    found, at = [], 1
-    for _ in range(data[0] if len(data) else 0):
-        length = struct.unpack_from("<B", data, at)[0]
-        name = bytes(data[at + 1 : at + 1 + length]).decode("ascii")
-        size, components, rows = struct.unpack_from("<BII", data, at + 1 + length)
-        at += 1 + length + 9
-        if size not in (1, 2, 4, 8) or components > MOST_COMPONENTS or rows > most_rows:
-            raise BadInput(f"stream {name!r} has {rows} x {components} numbers of {size} bytes")
-        found.append((name, size, components, rows, struct.unpack_from(f"<{components * size}I", data, at)))
-        at += 4 * components * size
-    return found, at

@@ -4,6 +4,7 @@
 of the part's kind. A part that breaks it raises AssertionError with a sentence that says what is wrong.
 """
 
+from surfkit.testing.compress import check_compressor, check_encoding
 from surfkit.testing.data_sets import check_depth_layout, check_split
 from surfkit.testing.executors import check_executor
 from surfkit.testing.files import check_format
@@ -28,9 +29,11 @@ __all__ = [
     "check_appearance",
     "check_assign",
     "check_component",
+    "check_compressor",
     "check_densify",
     "check_depth_estimator",
     "check_depth_layout",
+    "check_encoding",
     "check_executor",
     "check_filter",
     "check_format",
