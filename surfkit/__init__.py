@@ -43,6 +43,7 @@ _HOME = {
     "surfkit.compress.base": ("Compressor", "Plan"),
     "surfkit.compress.encoding": ("ColumnType", "Encoding"),
     "surfkit.compress.octree": ("Leaf",),
+    "surfkit.compress.streams": ("Stored",),
     "surfkit.primitives.base": ("Primitive", "harmonics", "rotated"),
     "surfkit.primitives.columns": ("EXP", "IDENTITY", "SIGMOID", "Activation", "Column", "standard_columns"),
     "surfkit.primitives.edit": ("Edit",),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from surfkit import pipeline
 from surfkit.appearance import Exposure
 from surfkit.blocks.schedule import Compute
 from surfkit.core.check import BadInput
@@ -27,7 +28,6 @@ from surfkit.recipes.city import FIRST
 from surfkit.refine import DistilSH, PruneAndRecover, Refine
 from surfkit.refine.light import DISTILLATION, RECOVERY
 from surfkit.report.status import status
-from surfkit import pipeline
 from surfkit.run import measure
 from surfkit.run.folder import Run
 from surfkit.run.stage import Intervals, drawing, return_to_checkpoint

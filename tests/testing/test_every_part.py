@@ -28,7 +28,6 @@ ELSEWHERE = {
     "executor:ray": "tests/execute/test_ray.py has a cluster for it",
     "encoding:codes": "tests/compress/test_encodings.py has codebooks for it",
     "encoding:principal-components": "tests/compress/test_encodings.py has a basis for it",
-    "executor:ray": "tests/test_ray.py has a cluster for it",
     "method:splats": "tests/test_pipeline.py and most others train with it",
     "method:import": "tests/method/test_imported.py has a file for it",
     "start:splats": "tests/start/test_splats.py has a file for it",
