@@ -22,8 +22,6 @@ from surfkit.export.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
 
 ROW = np.dtype([("xyz", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
-OTHERS = (b"ply\n", b"ply\r", b"\x1f\x8b", b"NGSP", b"PK\x03\x04", b"glTF")
-"""What other files begin with: a position would be no number that occurs."""
 SMALLEST = float(np.finfo(np.float32).tiny)
 """Scales of 0 are read as this, which has a logarithm."""
 
@@ -78,8 +76,8 @@ class Splat(Format):
         return table.as_surfels_if_thin(1e-5)
 
     def knows(self, path: Path, head: bytes) -> bool:
-        """See `Format.knows`. There is nothing to know it by but its name, and that it begins as no other format."""
-        return path.suffix.lower() == self.suffix and not head.startswith(OTHERS)
+        """See `Format.knows`. There is nothing to know it by but its name."""
+        return path.suffix.lower() == self.suffix
 
     def rounding(self, table: SplatTable) -> str:
         """See `Format.rounding`."""
