@@ -13,6 +13,7 @@ import tyro
 
 from surfkit.cli.recipes import ARGV
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
 from surfkit.core.memory import size
 from surfkit.core.registry import choice, name_of
@@ -21,7 +22,9 @@ from surfkit.export.files import format_for, format_of, has_suffix
 from surfkit.export.ply import PLY
 from surfkit.export.table import SplatTable, Tile
 from surfkit.pipeline import loaded
-from surfkit.run.folder import refuse_no_run
+from surfkit.primitives.model import SplatModel
+from surfkit.run.folder import Run, refuse_no_run
+from surfkit.run.lod import load_levels
 from surfkit.run.method import splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
@@ -67,9 +70,9 @@ class Export:
     def run(self) -> None:
         """Write the file, and say what is in it."""
         form, path = self._format(), self._path()
-        with collect_notes(), self._opened() as (table, frame), full_disk_in_one_line(path.parent):
+        with collect_notes(), self._opened() as (table, frame, tree), full_disk_in_one_line(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-            form.write(path, table, frame, _tree(table) if form.wants_tree else None)
+            form.write(path, table, frame, tree)
         told = form.rounding(table)
         print(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
         if any(frame.shift):
@@ -94,16 +97,24 @@ class Export:
         return path
 
     @contextmanager
-    def _opened(self) -> Iterator[tuple[SplatTable, Frame]]:
-        """Within, the splats in the frame of the input, and that frame."""
+    def _opened(self) -> Iterator[tuple[SplatTable, Frame, Tile | None]]:
+        """Within, the splats in the frame of the input, that frame, and their tiles if the format wants some."""
         if not self.source.is_dir():
             table = format_of(self.source).read(self.source)
-            yield table, Frame.of_positions(table.means.numpy())
+            yield table, Frame.of_positions(table.means.numpy()), one_tile(table) if self.format.wants_tree else None
             return
         refuse_no_run(self.source)
         with locked(self.source) if self.out is None else nullcontext(), loaded(self.source, "cpu") as (ctx, made):
-            splats = splats_of(ctx.run, made)
-            yield splats.primitive.table(splats.params).in_input_frame(ctx.scene.frame), ctx.scene.frame
+            splats, frame = splats_of(ctx.run, made), ctx.scene.frame
+            table = splats.primitive.table(splats.params).in_input_frame(frame)
+            yield table, frame, self._tiles(ctx.run, splats, table, frame) if self.format.wants_tree else None
+
+    def _tiles(self, run: Run, model: SplatModel, table: SplatTable, frame: Frame) -> Tile:
+        """The levels of detail of a run; all splats in one tile if it has none."""
+        if run.lod_record.exists():
+            return load_levels(run, model).tiles(frame)
+        emit(Warned(f"{self.source} has no levels of detail, so all is one tile; surfkit lod {self.source} makes them"))
+        return one_tile(table)
 
 
 def _stem(path: Path) -> str:
@@ -112,7 +123,7 @@ def _stem(path: Path) -> str:
     return path.name[: -len(form.suffix)] if form.suffix and has_suffix(path, form) else path.stem
 
 
-def _tree(table: SplatTable) -> Tile:
+def one_tile(table: SplatTable) -> Tile:
     """All splats in one tile."""
     means = table.means.double().numpy() if len(table) else np.zeros((1, 3))
     return Tile(table, means.min(0), means.max(0))

@@ -37,7 +37,8 @@ def format_of(path: Path) -> Format:
     found = [form for form in known if form.knows(path, head)]
     if not found:
         raise BadInput(f"{path}: no file of splats of a known format; known: {_listed(known)}")
-    return max(found, key=lambda form: has_suffix(path, form))
+    by_content = [form for form in found if form.knows(path.with_name("content"), head)]  # whatever it is called
+    return max(by_content or found, key=lambda form: has_suffix(path, form))
 
 
 def format_for(path: Path) -> Format:

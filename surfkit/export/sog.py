@@ -124,7 +124,7 @@ class SOG(Format):
         scale = table.median_scale()
         if apart > scale / COARSE:
             rounded = f"{apart:.3g} apart, {apart / scale:.2g} x the median scale of the splats"
-            emit(Warned(f"{path}: positions are {rounded}; --format ply or spz keeps more of such a large scene"))
+            emit(Warned(f"{path}: positions are {rounded}; --format ply keeps more of such a large scene"))
 
     def read(self, path: Path) -> SplatTable:
         """See `Format.read`. A meta.json beside its images is read too."""

@@ -54,6 +54,8 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         entry = archive.getinfo(name)
     except KeyError as error:
         raise BadInput(f"{path}: no .sog file, or damaged: it has no {name}") from error
+    if entry.compress_size > path.stat().st_size:
+        raise BadInput(f"{path}: damaged or cut off: {name} would be larger than the file; copy it again")
     refuse_implausible(path, entry.compress_size, entry.file_size, GROWTH)
     return archive.read(entry)
 

@@ -122,7 +122,7 @@ class SPZ(Format):
             )
         if len(table) and 2.0**-bits > scale / COARSE:
             rounded = f"{2.0**-bits:.3g} apart, {2.0**-bits / scale:.2g} x the median scale of the splats"
-            emit(Warned(f"{path}: positions are {rounded}; --format ply or sog keeps more of such a large scene"))
+            emit(Warned(f"{path}: positions are {rounded}; --format ply keeps more of such a large scene"))
         return bits
 
     def _attributes(self, table: SplatTable, bits: int) -> list[tuple[Tensor, Encode]]:

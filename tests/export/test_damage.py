@@ -163,6 +163,16 @@ def test_images_of_absurd_sizes_take_no_memory(tmp_path, fuzzing):
     assert most < 16 << 20 and "bytes cannot hold 1,073,741,824" in said
 
 
+def test_archives_of_absurd_sizes_take_no_memory(tmp_path):
+    """Both sizes of a file in the central directory are those of a gigabyte."""
+    SOG().write(tmp_path / "a.sog", table(count=9, degree=0))
+    content = bytearray((tmp_path / "a.sog").read_bytes())
+    struct.pack_into("<II", content, content.rindex(b"PK\x01\x02") + 20, 1 << 30, 1 << 30)
+    (tmp_path / "a.sog").write_bytes(content)
+    most, said = peak(lambda: SOG().read(tmp_path / "a.sog"))
+    assert most < 4 << 20 and "meta.json would be larger than the file" in said
+
+
 def test_names_in_meta_json_stay_in_the_archive(tmp_path):
     SOG().write(tmp_path / "a.sog", table(count=9, degree=0))
     zipfile.ZipFile(tmp_path / "a.sog").extractall(tmp_path / "there")

@@ -204,8 +204,9 @@ def test_formats_are_known_by_what_they_hold(tmp_path):
         assert type(format_of(path)) is type(format_for(path)) is cls
         assert len(read_splat_file(path)) == 20
         if cls is not Splat:  # which has nothing but its name
-            other = path.rename(tmp_path / f"{name}.dat")
-            assert type(format_of(other)) is cls
+            for ending in (".dat", ".splat"):
+                path = path.rename(tmp_path / f"{name}{ending}")
+                assert type(format_of(path)) is cls
     with pytest.raises(BadInput, match=r"no format of splats has this suffix; known: .*sog \(.sog\)"):
         format_for(tmp_path / "a.xyz")
     with pytest.raises(BadInput, match="no file of splats of a known format"):
