@@ -14,9 +14,8 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
+from surfkit.scene.earth import AXIS, FLATTENING, utm
 
-AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
-"""WGS 84: semi-major axis, metres, and flattening."""
 POLAR, BESIDE = 84.0, 30.0
 """Degrees of latitude up to which UTM is used, and of longitude from its meridian."""
 MOST_M = 1e8
@@ -95,25 +94,6 @@ def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: f
         )
     shift = _offset(root / FOLDER / "coords.txt", lines)
     return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift)
-
-
-def utm(latitude: float, longitude: float, zone: int, south: bool) -> tuple[float, float]:
-    """Easting and northing in metres, of degrees on WGS 84, by Krueger's series to the fourth order: within 0.1 mm."""
-    n = FLATTENING / (2 - FLATTENING)
-    e = 2 * math.sqrt(n) / (1 + n)
-    radius = AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
-    series = (
-        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16 + 41 * n**4 / 180,
-        13 * n**2 / 48 - 3 * n**3 / 5 + 557 * n**4 / 1440,
-        61 * n**3 / 240 - 103 * n**4 / 140,
-        49561 * n**4 / 161280,
-    )
-    sine, away = math.sin(math.radians(latitude)), math.radians(longitude - (6 * zone - 183))
-    t = math.sinh(math.atanh(sine) - e * math.atanh(e * sine))
-    xi, eta = math.atan2(t, math.cos(away)), math.asinh(math.sin(away) / math.hypot(t, math.cos(away)))
-    along = xi + sum(a * math.sin(2 * j * xi) * math.cosh(2 * j * eta) for j, a in enumerate(series, 1))
-    across = eta + sum(a * math.cos(2 * j * xi) * math.sinh(2 * j * eta) for j, a in enumerate(series, 1))
-    return 500_000 + 0.9996 * radius * across, (10_000_000 if south else 0) + 0.9996 * radius * along
 
 
 def _onto_map(reference: tuple[float, float, float], zone: tuple[int, bool], height: float) -> Similarity:

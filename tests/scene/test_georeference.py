@@ -10,9 +10,10 @@ from surfkit.core.check import BadInput
 from surfkit.export.ply import read_splats, read_vertices, write_splats
 from surfkit.export.table import SplatTable
 from surfkit.readers.data import Data
-from surfkit.readers.georeference import place_on_earth, utm
+from surfkit.readers.georeference import place_on_earth
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
+from surfkit.scene.earth import utm
 from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph
 
