@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 UNFINISHED = (".*.part", ".tmp??????")
-"""Names of files that are being written, by us and by safetensors."""
+"""Names of files and folders that are being written, by us and by safetensors."""
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """Errors of a disk that has no room."""
 
@@ -31,6 +32,29 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """An empty folder that takes the place of `path` and its content when all went well, and vanishes when not."""
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    former = path.with_name(f".{path.name}.{os.getpid()}.old.part")
+    try:
+        unfinished.mkdir()
+        yield unfinished
+        if path.exists():
+            os.replace(path, former)
+        os.replace(unfinished, path)
+        sync_folder(path.parent)
+    finally:
+        if former.exists() and not path.exists():  # the second renaming failed
+            os.replace(former, path)
+        for folder in (unfinished, former):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def refuse_special(path: Path) -> None:
@@ -57,6 +81,10 @@ def sweep(folder: Path, but: Path | None = None, deep: bool = True) -> None:
     `deep`: also in the folders inside.
     """
     for pattern in UNFINISHED:
-        for path in folder.rglob(pattern) if deep else folder.glob(pattern):
-            if but is None or not path.is_relative_to(but):
+        for path in list(folder.rglob(pattern) if deep else folder.glob(pattern)):
+            if but is not None and path.is_relative_to(but):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
                 path.unlink(missing_ok=True)

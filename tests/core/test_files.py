@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.core.files import refuse_special, replacing, sweep
+from surfkit.core.files import refuse_special, replacing, replacing_folder, sweep
 
 
 def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
@@ -27,11 +27,51 @@ def test_what_fails_leaves_the_old_and_nothing_else(tmp_path):
 
 
 def test_what_the_dead_left_is_swept_away(tmp_path):
-    for name in ("x/.a.json.12.part", "x/a.json", ".c.part", "x/.tmpAb1cD2", ".hidden"):
+    for name in (
+        "x/.a.json.12.part",
+        "x/a.json",
+        ".c.part",
+        "x/.tmpAb1cD2",
+        ".hidden",
+        ".t.9.part/.u.9.part",
+        ".t.9.part/v",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     sweep(tmp_path)
-    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [".hidden", "a.json"]
+    assert sorted(p.name for p in tmp_path.rglob("*")) == [".hidden", "a.json", "x"]
+
+
+def test_a_folder_is_replaced_as_a_whole(tmp_path):
+    path = tmp_path / "a" / "tiles"
+    for content in ("old", "new"):
+        with replacing_folder(path) as folder:
+            assert not list(folder.iterdir()) and (content == "old") == (not path.exists())
+            (folder / content).touch()
+        assert [p.name for p in path.iterdir()] == [content]
+    with pytest.raises(ValueError), replacing_folder(path) as folder:  # noqa: PT011
+        (folder / "half").touch()
+        raise ValueError
+    assert [str(p.relative_to(tmp_path)) for p in sorted(tmp_path.rglob("*"))] == ["a", "a/tiles", "a/tiles/new"]
+    with pytest.raises(NotADirectoryError), replacing_folder(path / "new"):
+        pass
+
+
+def test_the_old_folder_stays_if_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    (tmp_path / "tiles").mkdir()
+    (tmp_path / "tiles" / "old").touch()
+    real, calls = os.replace, []
+
+    def fails_once(here, there):
+        calls.append(there)
+        if len(calls) == 2:
+            raise OSError("no room")
+        real(here, there)
+
+    monkeypatch.setattr(os, "replace", fails_once)
+    with pytest.raises(OSError, match="no room"), replacing_folder(tmp_path / "tiles"):
+        pass
+    assert [str(p.relative_to(tmp_path)) for p in sorted(tmp_path.rglob("*"))] == ["tiles", "tiles/old"]
 
 
 def test_what_is_no_file_is_not_replaced(tmp_path):
