@@ -89,19 +89,24 @@ class SPZ(Format):
         if self.axes == "rub":
             table = half_turn(table)
         bits = self._bits(path, table)
+        with replacing(path) as file:
+            for part in self._packed(table, bits):
+                file.write(part)
+
+    def _packed(self, table: SplatTable, bits: int) -> Iterator[bytes]:
+        """A file, part by part."""
         order = torch.from_numpy(morton_order(table.means.double().numpy()))
         head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, int(table.antialias))
         streams = [_parts(column, order, encode) for column, encode in self._attributes(table, bits)]
-        with replacing(path) as file:
-            if self.version < 4:
-                squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
-                file.write(squeeze.compress(head + b"\0"))
-                for stream in streams:
-                    for part in stream:
-                        file.write(squeeze.compress(part))
-                file.write(squeeze.flush())
-            else:
-                file.write(_container(head, streams, len(table)))
+        if self.version == 4:
+            yield _container(head, streams, len(table))
+            return
+        squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
+        yield squeeze.compress(head + b"\0")
+        for stream in streams:
+            for part in stream:
+                yield squeeze.compress(part)
+        yield squeeze.flush()
 
     def _bits(self, path: Path, table: SplatTable) -> int:
         """Digits after the point; BadInput if the positions have no place, a warning if they are rounded much."""
@@ -160,6 +165,30 @@ class SPZ(Format):
         clipped = f"; {outside:.2%} of the splats are smaller or larger than it has a place for" if outside else ""
         harmonics = f", spherical harmonics to {self.sh1_bits} and {self.sh_rest_bits} bits" if table.sh_degree else ""
         return f"scales are rounded to 6 %, colours and opacities to 8 bits{harmonics}{clipped}"
+
+
+def spz_bytes(table: SplatTable, version: Literal[2, 3, 4], where: Path) -> bytes:
+    """What a file of splats holds, in the axes of the table, for formats that have SPZ data inside.
+
+    Args:
+        table: Finite, on the CPU.
+        version: Of the layout.
+        where: Begins messages.
+
+    Raises:
+        BadInput: Its positions have no place in 24 bits.
+    """
+    spz = SPZ(version=version)
+    return b"".join(spz._packed(table, spz._bits(where, table)))
+
+
+def spz_table(data: bytes, where: Path) -> SplatTable:
+    """The ellipsoids of SPZ data, in the axes that they have there; `where` begins messages.
+
+    Raises:
+        BadInput: No such data, or damaged.
+    """
+    return _decoded(where, *_streams(where, data))
 
 
 def half_turn(table: SplatTable) -> SplatTable:
