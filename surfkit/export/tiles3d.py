@@ -57,8 +57,8 @@ class Tiles3D(Format):
     """Most splats in a tile; full-detail tiles with more are divided."""
 
     error_px: float = 1.0
-    """Largest error of coarse tiles in pixels: viewers show finer ones where it is more, at their default of 16 pixels
-    for meshes (maximumScreenSpaceError of CesiumJS)."""
+    """Error of a coarse tile in pixels above which viewers take the finer ones, at their own default threshold
+    (maximumScreenSpaceError 16 of CesiumJS). Smaller values make them load finer tiles earlier."""
 
     def __post_init__(self) -> None:
         require_within({"most_splats": (1_000, 5_000_000), "error_px": (0.01, 1000.0)}, self)
