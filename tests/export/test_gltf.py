@@ -236,7 +236,7 @@ def test_trimesh_finds_the_same_points(tmp_path):
     (name,) = scene.graph.nodes_geometry
     matrix, geometry = scene.graph[name]
     points = trimesh.transform_points(scene.geometry[geometry].vertices, matrix)
-    np.testing.assert_allclose(points, (table.means.double().numpy() + 1e6) @ UPS["-y"].T, atol=1e-5)
+    np.testing.assert_allclose(points, (table.means.double().numpy() + 1e6) @ UPS["-y"].T, rtol=0, atol=1e-6)
 
 
 def test_nan_is_refused_and_nothing_is_left(tmp_path):
