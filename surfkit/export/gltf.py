@@ -21,7 +21,7 @@ import torch
 
 from surfkit.core.version import own_version
 from surfkit.export.base import Format
-from surfkit.export.bits import SH_C0, unit
+from surfkit.export.bits import SH_C0, to_bytes, unit
 from surfkit.export.glb import MAGIC, VERTICES, Blocks, write_glb
 from surfkit.export.gltf_reader import COMPRESSED, LEAST, SPLATS, UPS, harmonics, read_splats
 from surfkit.export.spz import SPZ, spz_bytes, spz_table
@@ -30,6 +30,8 @@ from surfkit.scene.scene import FAR, Frame
 
 Compress = Literal["none", "spz"]
 Up = Literal["auto", "y", "-y", "z"]
+LEAST_W = 0.45
+"""Components w that are kept; the largest of the four is at least a half, and little less when it was rounded."""
 MOST_SCALE = 1e38
 """Largest scale that is written: float32 ends there."""
 
@@ -159,7 +161,8 @@ def _plain(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
 
 def _compressed(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]:
     """The primitive of splats as SPZ, with the accessors that CesiumJS expects: no values, and no degree 0."""
-    data = spz_bytes(table, 2, path)
+    quats = torch.from_numpy(sure_rotations(table.quats.numpy()))
+    data = spz_bytes(replace(table, quats=quats), 2, path)
     stored = spz_table(data, path)
     low, high = (value.tolist() for value in torch.aminmax(stored.means.float(), dim=0))
     count = len(table)
@@ -173,6 +176,21 @@ def _compressed(path: Path, blocks: Blocks, table: SplatTable) -> dict[str, Any]
         attributes[f"{SPLATS}:{name}"] = blocks.accessor(None, count, "VEC3")
     view = blocks.add(len(data), lambda: data)
     return {"attributes": attributes, "extensions": {SPLATS: {"extensions": {COMPRESSED: {"bufferView": view}}}}}
+
+
+def sure_rotations(quats: np.ndarray) -> np.ndarray:
+    """(N, 4) quaternions wxyz that turn ellipsoids as the given ones do, of which SPZ of version 2 loses little.
+
+    It has x, y and z in a byte each; w follows from them, with an error of up to 10 degrees where it is small. Half a turn
+    about an axis of the ellipsoid changes nothing, and makes another component w. What was read back is left as it is.
+    """
+    quats = unit(quats)
+    quats = np.where(quats[:, :1] < 0, -quats, quats)
+    stored = to_bytes(127.5 * quats[:, 1:] + 127.5) / 127.5 - 1
+    w, x, y, z = quats.T
+    halves = np.stack([(-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)])  # times i, j and k
+    best = halves[np.abs(quats[:, 1:]).argmax(1), :, np.arange(len(quats))]
+    return np.where((stored**2).sum(1, keepdims=True) > 1 - LEAST_W**2, best, quats)
 
 
 def _bytes(values: np.ndarray) -> bytes:

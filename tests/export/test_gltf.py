@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from needs import needs
+from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.export.gltf import GLTF, UPS
@@ -202,6 +203,19 @@ def test_compressed_files_are_what_cesiumjs_expects(tmp_path, degree):
     assert len(document["nodes"][0]["matrix"]) == 16
     view = document["bufferViews"][0]
     assert data[view["byteOffset"] :][:2] == b"\x1f\x8b"  # gzip
+
+
+def test_compressed_rotations_are_near_for_every_splat(tmp_path):
+    count = 4_000
+    table = replace(splat_table(count=count, degree=0), means=torch.stack([torch.arange(count) / 100.0] * 3, 1))
+    GLTF(compress="spz").write(tmp_path / "a.glb", table)
+    back = GLTF().read(tmp_path / "a.glb")
+    back = back.take(back.means[:, 0].argsort())
+    before, after = (Rotation.from_quat(np.roll(found.quats.numpy(), -1, 1)).as_matrix() for found in (table, back))
+    cosines = np.abs(np.einsum("nij,nij->nj", before, after)).min(1)  # of the same axes, whichever way they point
+    assert np.degrees(np.arccos(cosines.clip(-1, 1))).max() < 1.8
+    GLTF(compress="spz").write(tmp_path / "b.glb", GLTF().read(tmp_path / "a.glb"))
+    assert (tmp_path / "b.glb").read_bytes() == (tmp_path / "a.glb").read_bytes()
 
 
 def test_compressed_data_by_the_draft_is_turned_and_by_cesium_is_not(tmp_path):

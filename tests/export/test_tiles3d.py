@@ -96,7 +96,9 @@ def test_splats_lie_on_earth_where_proj_has_them(tmp_path):
     local = (stored @ matrix[:3, :3].T + matrix[:3, 3]) @ TO_Z_UP.T  # as CesiumJS does
     np.testing.assert_allclose(local[0], 0, rtol=0, atol=1e-5)
     moved = (table.means.numpy() - ORIGIN) / [0.9996, 0.9996, 1]
-    np.testing.assert_allclose(local, moved, rtol=0, atol=0.005, err_msg="metres on the ground along the axes of the grid")
+    np.testing.assert_allclose(
+        local, moved, rtol=0, atol=0.005, err_msg="metres on the ground along the axes of the grid"
+    )
     up = np.array(ECEF) / np.linalg.norm(ECEF)
     assert transform[:3, 2] @ up > 0.999
 
