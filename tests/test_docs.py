@@ -21,7 +21,6 @@ from surfkit.core.registry import HOOKS, kebab, kind_of, offered, records
 
 SLOTS = {
     "mesh": "mesher",
-    "lod": "levels-of-detail",
     "depth": "depth-estimator",
     "estimator": "depth-estimator",
     "losses": "loss",

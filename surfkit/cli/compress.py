@@ -46,8 +46,8 @@ class Compress:
     """Compress the model of a finished run into RUN/compressed/model.surfkit, and measure it; or a file of splats.
 
     Settings that are not given are those of the run's recipe. Example: `surfkit compress RUN compress:packed
-    --target-loss 0.05dB`. `surfkit mesh RUN --compressed`, `evaluate RUN --compressed` and `export RUN --compressed`
-    use the compressed model; `export`, `import` and `start:splats` read its file.
+    --target-loss 0.05dB`. `surfkit mesh RUN --compressed` and `evaluate RUN --compressed` use the compressed model;
+    `export`, `import` and `start:splats` read its file.
     """
 
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]

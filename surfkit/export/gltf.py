@@ -182,7 +182,7 @@ def sure_rotations(quats: np.ndarray) -> np.ndarray:
     """(N, 4) quaternions wxyz that turn ellipsoids as the given ones do, of which SPZ of version 2 loses little.
 
     It has x, y and z in a byte each; w follows from them, with an error of up to 10 degrees where it is small. Half a
-    turn about an axis of an ellipsoid changes nothing, and makes another component w. What was read back stays so.
+    turn about an axis of an ellipsoid changes nothing, and makes another component w. What was read back stays.
     """
     quats = unit(quats)
     quats = np.where(quats[:, :1] < 0, -quats, quats)
