@@ -302,6 +302,7 @@ def somewhere(content: bytes, damage: Damage) -> bytes:
 
 
 BY_ENDING = {
+    ".glb": (*[splats.inside_glb(splats.in_json(node))] * 14,),
     ".spz": (*[splats.inside_gzip(somewhere)] * 14,),
     ".sog": (
         *[splats.inside_zip(splats.in_json(node), json_only=True)] * 8,

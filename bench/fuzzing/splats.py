@@ -12,7 +12,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-FORMATS = {"compressed-ply": {}, "ply": {}, "sog": {}, "splat": {}, "spz": {"version": 3}, "spz-4": {"version": 4}}
+FORMATS = {
+    "compressed-ply": {},
+    "gltf": {},
+    "gltf-spz": {"compress": "spz"},
+    "ply": {},
+    "sog": {},
+    "splat": {},
+    "spz": {"version": 3},
+    "spz-4": {"version": 4},
+}
 """Names of formats that are damaged, and their settings."""
 SIZES = (0, 1, 2, 3, 15, 255, 256, 2**14 - 1)
 """Widths and heights that an image may claim."""
@@ -24,7 +33,7 @@ def write_model(folder: Path, name: str) -> Path:
     from surfkit.export.base import Format
     from surfkit.testing.files import splat_table
 
-    form = find(Format, name.removesuffix("-4"))(**FORMATS[name])
+    form = find(Format, name.removesuffix("-4").removesuffix("-spz"))(**FORMATS[name])
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"model{form.suffix}"
     form.write(path, splat_table("surfel", 600, 1))
@@ -63,6 +72,21 @@ def inside_zip(change: Callable[[bytes, Any], bytes], json_only: bool = False) -
             for each, content in members.items():
                 archive.writestr(each, content)
         path.write_bytes(file.getvalue())
+
+    return way
+
+
+def inside_glb(change: Callable[[bytes, Any], bytes]) -> Callable[[Path, Any], None]:
+    """A way that changes the JSON of a GLB file, and keeps the lengths sound."""
+
+    def way(path: Path, damage: Any) -> None:
+        content = path.read_bytes()
+        if len(content) < 20 or (end := 20 + struct.unpack_from("<I", content, 12)[0]) > len(content):
+            return  # it is damaged already
+        text = change(content[20:end], damage)
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(content) - end, len(text), b"JSON")
+        path.write_bytes(head + text + content[end:])
 
     return way
 

@@ -97,7 +97,7 @@ SWEEP = tuple(
     )
 )  # fmt: skip
 DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
-EXPORTS = (".ply", ".compressed.ply", ".sog", ".splat", ".spz")
+EXPORTS = (".ply", ".compressed.ply", ".glb", ".sog", ".splat", ".spz")
 
 
 def exports(name: str) -> Target:
@@ -111,7 +111,14 @@ def exports(name: str) -> Target:
     return Target(make, words, ("data/model*",))
 
 
-SUFFIXES = {"compressed-ply": ".compressed.ply", "ply": ".ply", "sog": ".sog", "splat": ".splat", "spz": ".spz"}
+SUFFIXES = {
+    "compressed-ply": ".compressed.ply",
+    "gltf": ".glb",
+    "ply": ".ply",
+    "sog": ".sog",
+    "splat": ".splat",
+    "spz": ".spz",
+}
 TARGETS = {
     **{f"splats-{name}": exports(name) for name in splats.FORMATS},
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),

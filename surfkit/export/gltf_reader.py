@@ -52,7 +52,7 @@ def read_splats(path: Path) -> SplatTable:
     """
     document = read_glb(path)
     required = _list(document, document.root, "extensionsRequired")
-    if unknown := [name for name in required if name not in UNDERSTOOD]:
+    if unknown := [name for name in required if name not in tuple(UNDERSTOOD)]:
         raise document.fault(f"requires the extension {unknown[0]!r}, which is not read"[:300])
     notes = _notes(document)
     back = np.eye(4)
@@ -88,8 +88,9 @@ def _notes(document: Document) -> dict[str, Any]:
     if not isinstance(found, dict):
         return {}
     offset = document.numbers(found.get("offset", [0, 0, 0]), 3, "asset.extras.surfkit.offset")
-    sound = found.get("up") in UPS and found.get("kind") in ("surfel", "gaussian")
-    if not (sound and found.get("sh_degree") in (0, 1, 2, 3) and isinstance(found.get("antialias"), bool)):
+    degree, antialias = found.get("sh_degree"), found.get("antialias")
+    sound = found.get("up") in tuple(UPS) and found.get("kind") in ("surfel", "gaussian")
+    if not (sound and type(degree) is int and 0 <= degree <= 3 and isinstance(antialias, bool)):
         raise document.fault("damaged: asset.extras.surfkit is not what surfkit writes; write or copy it again")
     return {**found, "offset": offset}
 

@@ -171,7 +171,7 @@ def test_nothing_is_half_written(tmp_path, monkeypatch):
     before = (tmp_path / "t/tileset.json").read_bytes()
     spoilt = replace(table, sh0=table.sh0.clone())
     spoilt.sh0[4, 0] = torch.inf
-    with pytest.raises(BadInput, match="tile 0-0: sh0 of splat 4 of 30 has NaN or Inf"):
+    with pytest.raises(BadInput, match="tile 0-0: sh0 of splat 4 of 30 has NaN"):
         Tiles3D().write(tmp_path / "t", table, tree=tile(table, tile(spoilt), error=1.0))
     assert (tmp_path / "t/tileset.json").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
     Tiles3D(compress="none").write(tmp_path / "t", splat_table(count=5))
