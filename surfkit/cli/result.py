@@ -147,7 +147,7 @@ def compressed_rows(record: dict[str, Any], metrics: dict[str, Any] | None) -> l
     size = "-" if before is None else f"{before / 1e6:.2f} MB"
     share = "" if before is None else f", {before / after:.1f} times smaller"
     rows = [("size", size, f"{after / 1e6:.2f} MB{share}"), ("a point", "", f"{after / record['points']:.1f} bytes")]
-    if metrics is None or "compressed" not in metrics:
+    if not metrics:
         return rows
     small, own = metrics["compressed"], metrics["images"]
     for name, label, digits in (("psnr", "PSNR", 3), ("ssim", "SSIM", 4)):

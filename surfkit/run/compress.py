@@ -16,7 +16,7 @@ from torch import Tensor
 from surfkit.compress.base import Compressor
 from surfkit.compress.container import ModelFile, write_model
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, read_keys, write_json
+from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.densify.trim import Trim
@@ -78,7 +78,7 @@ def compress_run(
     """
     began, run, model = time.perf_counter(), ctx.run, on_cpu(splats_of(ctx.run, made))
     importance = importance_of(model, ctx.scene.train, ctx.rasterizer) if compressor.needs_importance else None
-    run.compressed_record.unlink(missing_ok=True)
+    forget_compressed(run)
     run.compressed.mkdir(exist_ok=True)
     if target is not None and target.is_set:
         judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
@@ -95,6 +95,15 @@ def compress_run(
     write_json(run.compressed_record, record)
     emit(FileWritten(run.compressed_record, "facts of the compressed model"))
     return dump(record)
+
+
+def forget_compressed(run: Run) -> None:
+    """Delete what says of an earlier file how it was made, and what was measured and made of it."""
+    for path in (run.compressed_record, *(run.compressed / name for name in ("metrics.json", "mesh.json"))):
+        path.unlink(missing_ok=True)
+    if run.metrics.exists() and "compressed" in (metrics := read_json(run.metrics, dict[str, Any])):
+        del metrics["compressed"]
+        write_json(run.metrics, metrics)
 
 
 def write_compressed(

@@ -99,7 +99,9 @@ def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str
 
 
 def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
-    """Say in the metrics of a run in short what those of its compressed model say, and return them."""
+    """Say in the metrics of a run in short what those of its compressed model say, and return them; {} without any."""
+    if not run.metrics.exists():
+        return {}  # the run has yet to be measured itself
     record = read_json(run.compressed_record, dict[str, Any])
     facts = {name: record[name] for name in ("compressor", "bytes", "ply_bytes")}
     facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
