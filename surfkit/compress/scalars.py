@@ -161,7 +161,7 @@ class Levels(OneColumn, Encoding):
 class SmallestThree(OneColumn, Encoding):
     """Unit quaternions by their three smallest components and the place of the largest, which comes back positive.
 
-    Each of the three comes back off by `step` at most: half of it by rounding, the rest where the largest component
+    Each of the three comes back off by `step` at most: by half of it, and by more only where the largest component
     would not be the largest any more.
     """
 
@@ -182,13 +182,16 @@ class SmallestThree(OneColumn, Encoding):
         quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [[1.0, 0, 0, 0]])
         largest = np.abs(quats).argmax(1)
         quats *= np.where(quats[rows, largest] < 0, -1, 1)[:, None]
-        numbers = np.rint(quats[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4] / self.step)
-        for _ in range(3):  # nothing may come back as large as the largest
+        exact = quats[rows[:, None], (largest[:, None] + [1, 2, 3]) % 4] / self.step
+        numbers = np.rint(exact)
+        for turn in range(4):  # nothing may come back as large as the largest
             rest = np.abs(numbers) * self.step
-            spare = 1 - (rest**2).sum(1)
             worst = rest.argmax(1)
-            wrong = rows[rest[rows, worst] ** 2 >= spare * (1 - 1e-6)]
-            numbers[wrong, worst[wrong]] -= np.sign(numbers[wrong, worst[wrong]])
+            wrong = rows[rest[rows, worst] ** 2 >= (1 - (rest**2).sum(1)) * (1 - 1e-6)]
+            if turn:
+                numbers[wrong, worst[wrong]] -= np.sign(numbers[wrong, worst[wrong]])
+            else:
+                numbers[wrong] = np.trunc(exact[wrong])
         return {f"{self.column}.largest": largest[:, None].astype(np.uint8)} | from_whole(self.column, numbers)
 
     def decode(
@@ -208,7 +211,7 @@ def float_bits(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
     with np.errstate(over="ignore"):
         rounded = numbers.astype(FLOATS[kind])
     if not np.isfinite(rounded).all():
-        raise BadInput(f"{name}: values beyond what {kind} holds; choose compress:none")
+        raise BadInput(f"{name}: values beyond what {kind} holds; choose compress:lossless")
     return np.frombuffer(rounded.tobytes(), f"<u{rounded.dtype.itemsize}").reshape(rounded.shape)
 
 

@@ -98,6 +98,8 @@ def least(importance: Tensor, ratio: float) -> Tensor:
 def codebook(numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str) -> np.ndarray:
     """(C, D) float16 vectors for (n, D) ones, C at most `codes`; in an order that depends on nothing but themselves."""
     given = torch.from_numpy(np.ascontiguousarray(numbers, np.float32))
+    if not given.isfinite().all():
+        raise BadInput("spherical harmonics: NaN or Inf; such a model is of no use")
     if not len(given):
         return np.zeros((0, numbers.shape[1]), np.float16)
     weights = weights / weights.mean() if weights.sum() > 0 else torch.ones_like(weights)

@@ -201,6 +201,8 @@ def _check_near(
     count = len(values["means"])
     found = encoding.decode(encoding.encode(values, kinds, leaf, tables), kinds, leaf, count, tables)
     for column in encoding.columns:
+        if not values[column].numel():
+            continue
         before, after = (kinds[column].activation.value(each[column].double()) for each in (values, found))
         if column == "quats":
             before, after = (torch.nn.functional.normalize(each, dim=1) for each in (before, after))

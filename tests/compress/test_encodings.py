@@ -1,0 +1,41 @@
+"""Encodings that need tables keep their contract too."""
+
+import numpy as np
+import pytest
+import torch
+
+from surfkit.compress.colors import CHOSEN, Codes, PrincipalComponents, principal_components, vectors
+from surfkit.core.check import BadInput
+from surfkit.primitives.columns import standard_columns
+from surfkit.testing import check_encoding
+from surfkit.testing.compress import column_values
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("step", [1e-4, 0.04])
+def test_principal_components(degree, step):
+    columns = standard_columns(3, degree)
+    tables = principal_components(vectors(column_values(columns, 200)))
+    basis = tables["sh.basis"].astype(np.float64)
+    assert np.abs(basis.T @ basis - np.eye(len(basis))).max() < 1e-6
+    check_encoding(PrincipalComponents(step), columns, tables, near=step)
+
+
+def test_the_strongest_component_comes_first():
+    along = np.array([3.0, 4.0, 0]) / 5
+    draw = np.random.default_rng(0)
+    numbers = 10 * draw.standard_normal((500, 1)) * along + 0.1 * draw.standard_normal((500, 3)) + [1, 2, 3]
+    found = principal_components(numbers)
+    assert abs(found["sh.basis"][:, 0] @ along) > 0.999
+    assert np.allclose(found["sh.mean"], numbers.mean(0), atol=1e-5)
+
+
+@pytest.mark.parametrize("parts", [(12,), (3, 9)])
+def test_codes(parts):
+    columns = standard_columns(3, 1)
+    numbers = vectors(column_values(columns, 200)).astype(np.float16)
+    ends = np.cumsum([0, *parts]).tolist()
+    tables = {f"sh.codes.{at}": np.unique(numbers[:, a:b], axis=0) for at, (a, b) in enumerate(zip(ends, ends[1:]))}
+    check_encoding(Codes(parts), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0}, near=1e-3)
+    with pytest.raises(BadInput, match="codebooks are missing, or not of 12 coefficients together"):
+        check_encoding(Codes((11,)), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0})
