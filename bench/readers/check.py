@@ -217,6 +217,30 @@ def read_by_others(folder: Path, reference: Splats) -> list[Row]:
     return rows
 
 
+def meshes_read(run: Path) -> list[Row]:
+    """Whether trimesh and Open3D find the same triangles in each file of the mesh of a run, wherever its origin is."""
+    rows, first = [], None
+    for path in sorted(run.glob("mesh.*"), key=lambda path: path.suffix != ".ply"):
+        if path.suffix not in (".ply", ".obj", ".glb"):
+            continue
+        for program, read in (("trimesh", programs.trimesh_triangles), ("Open3D", programs.open3d_triangles)):
+            try:
+                corners = read(path)
+                size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+                found = (len(corners), float(size.sum()), np.sort(np.ptp(corners.reshape(-1, 3), axis=0)))
+                first = first or found
+                is_same = found[0] == first[0] and np.allclose(found[1], first[1], rtol=1e-4)
+                is_same = is_same and np.allclose(found[2], first[2], rtol=1e-4)
+                rows.append(
+                    Row(path.name, program, bool(is_same), None, f"{found[0]:,} triangles; number, area, extents")
+                )
+            except (Missing, ValueError, OSError, ImportError) as error:
+                rows.append(failed(path, program, error))
+        if path.suffix == ".glb":
+            rows.append(validated(path, "glTF-Validator", lambda p: programs.gltf_messages(p)[str(p)]))
+    return rows
+
+
 def written_by_others(model: Path, folder: Path, reference: Splats) -> list[Row]:
     """What surfkit makes of files that programs of others wrote from the same PLY file."""
     few = folder / "few.ply"
@@ -294,6 +318,7 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="PLY file of a trained model")
     parser.add_argument("--folder", type=Path, default=None, help="of the exports; beside the model by default")
     parser.add_argument("--exported", action="store_true", help="the files are there; do not export again")
+    parser.add_argument("--meshes", type=Path, default=None, metavar="RUN", help="read the mesh files of RUN too")
     parser.add_argument(
         "--pictures",
         type=Path,
@@ -316,6 +341,8 @@ def main() -> None:
         write_all(options.model, folder)
     reference = read_ply(options.model)
     rows = read_by_others(folder, reference) + written_by_others(options.model, folder, reference)
+    if options.meshes:
+        rows += meshes_read(options.meshes)
     if options.pictures:
         from pictures import drawn
 

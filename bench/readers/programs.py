@@ -189,3 +189,22 @@ def open3d_points(path: Path) -> np.ndarray:
     except ImportError as error:
         raise Missing("open3d is missing: pip install 'surfkit[mesh]'") from error
     return open3d.t.io.read_point_cloud(str(path)).point.positions.numpy().astype(np.float64)
+
+
+def trimesh_triangles(path: Path) -> np.ndarray:
+    """(F, 3, 3) corners of the triangles of a mesh, as trimesh reads them."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise Missing("trimesh is missing: pip install trimesh") from error
+    return np.asarray(trimesh.load(path, process=False, force="mesh").triangles, np.float64)
+
+
+def open3d_triangles(path: Path) -> np.ndarray:
+    """(F, 3, 3) corners of the triangles of a mesh, as Open3D reads them."""
+    try:
+        import open3d
+    except ImportError as error:
+        raise Missing("open3d is missing: pip install 'surfkit[mesh]'") from error
+    mesh = open3d.io.read_triangle_mesh(str(path))
+    return np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
