@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 from check import Row, failed
 from PIL import Image
-from programs import HERE, Missing, node, three
+from programs import HERE, Missing, find_chromium, node, three
 
 TIMES = 3
 """Pixels of a picture for one of the photograph, on each side."""
@@ -27,14 +26,6 @@ VIEWERS = {
 }
 """What each viewer draws. CesiumJS 1.145 draws splats in 3D Tiles only, compressed as SPZ; PlayCanvas reads SPZ of
 version 4 only, with a module that npm does not have; Spark 2.2 reads SPZ up to version 3."""
-
-
-def chromium() -> str:
-    """The browser's program."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if found is None:
-        raise Missing("Chromium is missing: apt-get install chromium")
-    return found
 
 
 def suits(viewer: str, path: Path) -> bool:
@@ -79,7 +70,7 @@ def drawn(folder: Path, run: Path) -> list[Row]:
                 )
     plan = folder / "shots.json"
     try:
-        plan.write_text(json.dumps({"chromium": chromium(), "folder": str(folder.resolve()), "shots": shots}))
+        plan.write_text(json.dumps({"chromium": find_chromium(), "folder": str(folder.resolve()), "shots": shots}))
         answers = json.loads(node(HERE / "view.mjs", plan, timeout=3600))
     except (Missing, ValueError, OSError) as error:
         return [failed(folder, "Chromium", error)]

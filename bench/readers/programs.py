@@ -23,12 +23,24 @@ class Missing(Exception):
     """A program is not installed; the message says how to install it."""
 
 
-def node(*words: object, timeout: float = 600) -> str:
-    """What a script prints. ValueError with its last line if it fails."""
+def find_node() -> None:
+    """Missing if Node.js or its packages are not there."""
     if shutil.which("node") is None:
         raise Missing("Node.js 20 or newer is missing: apt-get install nodejs npm")
     if not MODULES.is_dir():
         raise Missing(f"{MODULES} is missing: cd {HERE} && npm ci --ignore-scripts")
+
+
+def find_chromium() -> str:
+    """The program of a browser without a window."""
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if found is None:
+        raise Missing("Chromium is missing: apt-get install chromium")
+    return found
+
+
+def node(*words: object, timeout: float = 600) -> str:
+    """What a script prints. ValueError with its last line if it fails."""
     done = subprocess.run(["node", *map(str, words)], capture_output=True, text=True, timeout=timeout)
     if done.returncode:
         said = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.strip()]
@@ -177,3 +189,22 @@ def open3d_points(path: Path) -> np.ndarray:
     except ImportError as error:
         raise Missing("open3d is missing: pip install 'surfkit[mesh]'") from error
     return open3d.t.io.read_point_cloud(str(path)).point.positions.numpy().astype(np.float64)
+
+
+def trimesh_triangles(path: Path) -> np.ndarray:
+    """(F, 3, 3) corners of the triangles of a mesh, as trimesh reads them."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise Missing("trimesh is missing: pip install trimesh") from error
+    return np.asarray(trimesh.load(path, process=False, force="mesh").triangles, np.float64)
+
+
+def open3d_triangles(path: Path) -> np.ndarray:
+    """(F, 3, 3) corners of the triangles of a mesh, as Open3D reads them."""
+    try:
+        import open3d
+    except ImportError as error:
+        raise Missing("open3d is missing: pip install 'surfkit[mesh]'") from error
+    mesh = open3d.io.read_triangle_mesh(str(path))
+    return np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]

@@ -156,8 +156,8 @@ def compressed_rows(record: dict[str, Any], metrics: dict[str, Any] | None) -> l
             rows.append(
                 (label, f"{own[name]:.{digits}f}", f"{small['images'][name]:.{digits}f} ({change:+.{digits}f})")
             )
-    if metrics["fps"] and small["fps"]:
-        rows.append(("frames a second", f"{metrics['fps']:.1f}", f"{small['fps']:.1f}"))
+    if both := small.get("fps_before_and_after"):
+        rows.append(("frames a second", f"{both[0]:.1f}", f"{both[1]:.1f}"))
     if "geometry" in metrics and "geometry" in small:
         own_f1, f1 = metrics["geometry"]["f1"], small["geometry"]["f1"]
         rows.append(("F1", f"{own_f1:.4f}", f"{f1:.4f} ({f1 - own_f1:+.4f})"))

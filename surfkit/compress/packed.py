@@ -27,19 +27,19 @@ class Packed(Compressor):
     """Points along a Morton curve by the steps from one to the next; all values as multiples of steps, spherical
     harmonics along their principal components. The smallest at the same quality."""
 
-    position: float = 0.03
+    position: float = 0.02
     """Cubes for positions, as a share of the median radius of the splats; the next smaller power of 2 is taken."""
 
-    scale: float = 0.07
+    scale: float = 0.05
     """Steps of the logarithm of radii."""
 
-    rotation: float = 0.007
+    rotation: float = 0.005
     """Steps of the components of unit quaternions."""
 
-    opacity: float = 0.01
+    opacity: float = 0.008
     """Steps of opacities."""
 
-    color: float = 0.028
+    color: float = 0.02
     """Steps of the coefficients of the spherical harmonics, along their principal components."""
 
     def __post_init__(self) -> None:

@@ -95,7 +95,10 @@ def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str
     """
     run, (inner, small) = ctx.run, decompressed(ctx, made)
     found = evaluate(inner.run, small, ctx.scene, lpips_weights=lpips_weights)
-    return note_compressed(run, found)
+    views = ctx.scene.held_out or ctx.scene.train
+    both = [frames_per_second(views, each.draw_color or each.draw) for each in (made, small)]
+    note_metrics(inner.run.metrics, {"fps_before_and_after": both})  # within a minute, on the same machine
+    return note_compressed(run, found | {"fps_before_and_after": both})
 
 
 def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
@@ -105,7 +108,7 @@ def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
     record = read_json(run.compressed_record, dict[str, Any])
     facts = {name: record[name] for name in ("compressor", "bytes", "ply_bytes")}
     facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
-    facts["fps"] = found.get("fps")
+    facts["fps_before_and_after"] = found.get("fps_before_and_after")
     if "geometry" in found:
         facts["geometry"] = {name: found["geometry"][name] for name in ("precision", "recall", "f1")}
     return note_metrics(run.metrics, {"compressed": facts})

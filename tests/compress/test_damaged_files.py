@@ -244,7 +244,7 @@ def test_streams_that_claim_much(tmp_path, whole):
     twice = stream_head(b"means", 8, 1, 40, [0] * 8)
     assert "is there twice" in complaint(tmp_path, leaf_of(whole, b"\2" + twice + twice))
     for size in (0, 3, 16):  # of a number
-        assert "of %d bytes" % size in complaint(
+        assert f"of {size} bytes" in complaint(
             tmp_path, leaf_of(whole, b"\1" + stream_head(b"m", size, 1, 40, [0] * 9))
         )
 
