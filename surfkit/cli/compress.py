@@ -22,7 +22,7 @@ from surfkit.core.registry import choice
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
 from surfkit.recipe import Recipe
-from surfkit.run.compress import Target, compress_run, fitted, write_compressed
+from surfkit.run.compress import Target, compress_run, fitted, writing
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
 from surfkit.run.measure import measure_compressed
@@ -103,9 +103,9 @@ class Compress:
             raise BadInput(f"--out {path}: the name must end in .surfkit")
         if path.resolve() == self.target.resolve():
             raise BadInput(f"{self.target}: the file itself would be replaced; name another with --out")
-        chosen = fitted(self.compress, wanted, model, None, 0, None) if wanted.is_set else self.compress
+        write = writing(model, None, frame, 0)
         with full_disk_in_one_line(path.parent):
-            size = write_compressed(path, model, chosen, None, frame, 0)
+            size = write(path, fitted(self.compress, wanted, write) if wanted.is_set else self.compress)
         before = self.target.stat().st_size
         print(
             f"wrote {len(model):,} points to {path}: {size:,} bytes, {before / size:.1f} times fewer than {self.target}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -80,10 +80,11 @@ def compress_run(
     importance = importance_of(model, ctx.scene.train, ctx.rasterizer) if compressor.needs_importance else None
     forget_compressed(run)
     run.compressed.mkdir(exist_ok=True)
+    write = writing(model, importance, ctx.scene.frame, run.recipe.seed)
     if target is not None and target.is_set:
         judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
-        compressor = fitted(compressor, target, model, importance, run.recipe.seed, judge)
-    size = write_compressed(run.compressed_model, model, compressor, importance, ctx.scene.frame, run.recipe.seed)
+        compressor = fitted(compressor, target, write, judge)
+    size = write(run.compressed_model, compressor)
     record = {
         "compressor": compressor,
         "steps": made.last_steps,
@@ -93,6 +94,7 @@ def compress_run(
         "seconds": round(time.perf_counter() - began, 2),
     }
     write_json(run.compressed_record, record)
+    emit(FileWritten(run.compressed_model, "compressed model"))
     emit(FileWritten(run.compressed_record, "facts of the compressed model"))
     return dump(record)
 
@@ -106,16 +108,18 @@ def forget_compressed(run: Run) -> None:
         write_json(run.metrics, metrics)
 
 
-def write_compressed(
-    path: Path, model: SplatModel, compressor: Compressor, importance: Tensor | None, frame: Frame | None, seed: int
-) -> int:
-    """Write a model as `.surfkit` file with progress, and return its bytes."""
-    plan = compressor.plan(model, importance, seed)
-    size = write_model(
-        path, model, plan, compressor, frame, lambda done, of: emit(Progress("compressing points", done, of))
-    )
-    emit(FileWritten(path, "compressed model"))
-    return size
+def writing(
+    model: SplatModel, importance: Tensor | None, frame: Frame | None, seed: int
+) -> Callable[[Path, Compressor], int]:
+    """What writes a model as `.surfkit` file with a compressor, tells its progress, and returns the bytes."""
+
+    def write(path: Path, compressor: Compressor) -> int:
+        plan = compressor.plan(model, importance, seed)
+        return write_model(
+            path, model, plan, compressor, frame, lambda done, of: emit(Progress("compressing points", done, of))
+        )
+
+    return write
 
 
 def has_compressed(run: Run, steps: int) -> bool:
@@ -192,9 +196,15 @@ class Judge:
 
 
 def fitted(
-    compressor: Compressor, target: Target, model: SplatModel, importance: Tensor | None, seed: int, judge: Judge | None
+    compressor: Compressor, target: Target, write: Callable[[Path, Compressor], int], judge: Judge | None = None
 ) -> Compressor:
     """The compressor with errors as large as the target allows, or as small; bisected on the scale of all errors.
+
+    Args:
+        compressor: To be changed.
+        target: One of its two is set.
+        write: Writes a file with a compressor and returns its bytes.
+        judge: For a loss.
 
     Raises:
         BadInput: The target cannot be reached, or the compressor has no such setting.
@@ -204,7 +214,7 @@ def fitted(
         """Whether a file is good enough at this factor; files of fewer bytes lose more."""
         tried = compressor.coarser(factor)
         path = Path(folder) / "tried.surfkit"
-        size = write_model(path, model, tried.plan(model, importance, seed), tried)
+        size = write(path, tried)
         done[0] += 1
         emit(Progress("choosing settings", done[0], TRIES + 2))
         if target.bytes is not None:
