@@ -276,14 +276,14 @@ def test_a_code_may_be_left_out(engine):
 def test_few_different_vectors_are_found_exactly():
     different = clustered(20, 5)
     vectors = different[torch.arange(500) % 20]
-    for codes in (20, 21, 64):
-        codebook = kmeans(vectors, codes)
+    for codes, iterations in ((20, 0), (20, 10), (21, 0), (64, 10)):
+        codebook = kmeans(vectors, codes, iterations=iterations)
         index, distance = nearest(vectors, codebook)
         assert codebook.shape == (codes, 5) and not distance.any() and len(index.unique()) == 20
     assert kmeans(vectors, 19).shape == (19, 5) and nearest(vectors, kmeans(vectors, 19))[1].max() > 0
     weights = (torch.arange(500) % 20 < 8).float()
     assert not nearest(different[:8], kmeans(vectors, 8, weights))[1].any(), "as many as have a weight"
-    signs = kmeans(torch.tensor([[0.0], [-0.0], [1.0]]), 2)
+    signs = kmeans(torch.tensor([[0.0], [-0.0]] * 50 + [[1.0]]), 2, iterations=0)
     assert sorted(signs.flatten().tolist()) == [0, 1]
 
 
