@@ -196,14 +196,14 @@ class TorchSearch(Search):
         if without is not None:
             score[torch.arange(len(score)), without.long()] = torch.inf
         error = (vectors.shape[1] + 16) * 2.0**-53 * (centred.norm(dim=1) + self.reach).square() + 1e-300
-        row, code = (score <= (score.amin(1) + 2 * error)[:, None]).nonzero().T
-        exact = torch.zeros(len(row), dtype=torch.float64)
-        for x, c in zip(vectors.T, self.codebook.T, strict=True):
-            off = x[row].double() - c[code].double()
+        row, code = (score <= (score.amin(1) + 2 * error)[:, None]).numpy().nonzero()
+        exact = np.zeros(len(row))
+        for x, c in zip(vectors.numpy().T, self.codebook.numpy().T, strict=True):
+            off = x[row].astype(np.float64) - c[code]
             exact += off * off
         order = np.lexsort((code, exact, row))
         first = order[np.searchsorted(row[order], np.arange(len(vectors)))]
-        return code[first].int(), exact[first].float()
+        return torch.from_numpy(code[first].astype(np.int32)), torch.from_numpy(exact[first].astype(np.float32))
 
 
 def searching(codebook: Tensor, features: Features) -> Search:

@@ -99,18 +99,46 @@ def test_equal_distances_go_to_the_lowest_index(engine):
         lambda x: x * 1e-30,
         lambda x: x + 1000,
         lambda x: x * 1e-4 + 300 * torch.sign(x[:, :1]),
+        lambda x: x + 3e4 * torch.sign(x[:, :1]),
         lambda x: torch.where(torch.arange(len(x))[:, None] % 97 == 5, 1e12 * x, x),
         lambda x: x * torch.tensor([1e6, 1e3, 1, 1e-3, 1e-6, 1e-9, 1, 1, 1]).repeat(5)[: x.shape[1]],
     ],
-    ids=["large", "small", "tiny", "far away", "two tight clusters far apart", "outliers", "different scales"],
+    ids=[
+        "large",
+        "small",
+        "tiny",
+        "far away",
+        "two tight clusters far apart",
+        "two clusters far apart",
+        "outliers",
+        "different scales",
+    ],
 )
 def test_rounding_errors_rule_no_nearest_code_out(engine, change):
     vectors, codebook = change(clustered(150, 45)), change(clustered(300, 45, seed=1))
+    features, true = search.Features.of(codebook), brute(vectors, codebook)
     with using(engine):
-        index, _ = nearest(vectors, codebook)
-    true = brute(vectors, codebook)
-    found = np.take_along_axis(true, index.numpy()[:, None].astype(int), 1)[:, 0]
-    assert (found <= true.min(1) * (1 + 1e-13)).all()
+        every = search.searching(codebook, features).nearest(vectors, features(vectors))  # fewer leave room for errors
+        for index, _ in (every, nearest(vectors, codebook)):
+            found = np.take_along_axis(true, index.numpy()[:, None].astype(int), 1)[:, 0]
+            assert (found <= true.min(1) * (1 + 1e-13)).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_codes_at_nearly_the_same_distance_are_told_apart(engine):
+    """By less than float32 can tell: the same numbers in other orders, one of them by a few bits larger."""
+    random, numbers = np.random.default_rng(0), np.linspace(0.1, 1, 45, dtype=np.float32)
+    for away in [0.0, 300.0, 1e6] * 10:  # also where float32 products cannot tell any two codes apart
+        vectors, codes = torch.zeros(1, 46), torch.zeros(100, 46)
+        for code, more in enumerate(random.permutation(60)):
+            larger = np.where(np.arange(45) == 20, numbers + more * np.spacing(numbers), numbers)
+            codes[code, :45] = torch.from_numpy(random.permutation(larger))
+        vectors[:, 45] = codes[:60, 45] = away
+        codes[60:, 45] = -away - 50
+        features = search.Features.of(codes)  # all of them: fewer leave room for errors
+        with using(engine):
+            index, _ = search.searching(codes, features).nearest(vectors, features(vectors))
+        assert index[0] == brute(vectors, codes)[0].argmin()
 
 
 def test_nearest_has_the_same_bits_everywhere():
@@ -276,14 +304,14 @@ def test_a_code_may_be_left_out(engine):
 def test_few_different_vectors_are_found_exactly():
     different = clustered(20, 5)
     vectors = different[torch.arange(500) % 20]
-    for codes in (20, 21, 64):
-        codebook = kmeans(vectors, codes)
+    for codes, iterations in ((20, 0), (20, 10), (21, 0), (64, 10)):
+        codebook = kmeans(vectors, codes, iterations=iterations)
         index, distance = nearest(vectors, codebook)
         assert codebook.shape == (codes, 5) and not distance.any() and len(index.unique()) == 20
     assert kmeans(vectors, 19).shape == (19, 5) and nearest(vectors, kmeans(vectors, 19))[1].max() > 0
     weights = (torch.arange(500) % 20 < 8).float()
     assert not nearest(different[:8], kmeans(vectors, 8, weights))[1].any(), "as many as have a weight"
-    signs = kmeans(torch.tensor([[0.0], [-0.0], [1.0]]), 2)
+    signs = kmeans(torch.tensor([[0.0], [-0.0]] * 50 + [[1.0]]), 2, iterations=0)
     assert sorted(signs.flatten().tolist()) == [0, 1]
 
 
