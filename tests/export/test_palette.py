@@ -10,9 +10,7 @@ from surfkit.export.palette import codebook, nearest, palette
 
 def test_a_palette_is_nearly_as_good_as_one_level_of_k_means():
     draw = np.random.default_rng(0)
-    common = draw.laplace(size=(4000, 8)) @ draw.normal(
-        size=(8, 9)
-    )  # as spherical harmonics are: many small, some large
+    common = draw.laplace(size=(4000, 8)) @ draw.normal(size=(8, 9))  # many small, some large
     rows = (0.05 * common + 0.03 * draw.laplace(size=(4000, 9))).astype(np.float32)
     codes, label = palette(rows, 128)
     assert codes.shape == (128, 9) and label.min() >= 0 and label.max() < 128
