@@ -83,8 +83,9 @@ def _shares(rows: np.ndarray, members: list[np.ndarray], size: int) -> list[int]
     error = np.array([float(rows[member].var(0).sum()) if len(member) else 0.0 for member in members])
     count = np.array([len(member) for member in members])
     weight = count * np.sqrt(error) + 1e-12 * count
-    free = size - len(members)
-    shares = 1 + np.floor(free * weight / weight.sum()).astype(int)
+    wanted = (size - len(members)) * weight / weight.sum()
+    shares = 1 + np.floor(wanted).astype(int)
+    shares[np.argsort(wanted % -1, kind="stable")[: size - shares.sum()]] += 1  # what rounding down left over
     return np.minimum(shares, np.maximum(count, 1)).tolist()
 
 
