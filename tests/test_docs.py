@@ -27,7 +27,6 @@ SLOTS = {
     "filters": "filter",
     "regularizers": "regularizer",
     "compress": "compressor",
-    "lod": "levels-of-detail",
 }
 """Kinds of parts whose slot in a recipe or a command has another name."""
 TUTORIAL = ROOT / "docs" / "plugins.md"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -13,7 +13,7 @@ from surfkit.core.events import Progress, emit
 from surfkit.core.schedule import StepCount
 from surfkit.lod.base import LevelsOfDetail, LodInput
 from surfkit.lod.cut import cut, depth_for
-from surfkit.lod.moments import alike, merged_model, refuse_unmergeable, rows_of
+from surfkit.lod.moments import alike, merged_model, refuse_unmergeable
 from surfkit.lod.pairs import groups, summed
 from surfkit.lod.refine import contributions, refined
 from surfkit.lod.tree import LodBlock, LodTree
@@ -60,38 +60,40 @@ class MergedLevels(LevelsOfDetail):
         self.refuse_unfit(given.model.primitive)
         depth = depth_for(len(given.model), self.tile_points)
         order, bounds = cut(given.model.splats.means.detach().double().cpu().numpy(), depth)
-        levels = [rows_of(given.model, torch.from_numpy(order))]
+        levels = [given.model.take(torch.from_numpy(order))]
         known = contributions(given).numpy()[order], np.zeros(len(order))
         ends = bounds[depth]
         errors, limits = [np.zeros(len(ends) - 1)], [ends]
         for number in range(1, depth + 1):
-            labels, ends = halves(levels[-1], known[0], ends[::2], number)
-            level = merged_model(levels[-1], labels, known[0])
-            known = carried(levels[-1], level, labels, known)
+            level, known, ends = halved(levels[-1], known, ends[::2], number)
             levels.append(refined(given, level, number, self.steps, AFAR ** (number - 1)))
             errors.append(block_errors(known, ends))
             limits.append(ends)
         return LodTree.of(order, levels, blocks(limits, errors))
 
 
-def halves(level: SplatModel, weights: np.ndarray, ends: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) groups of the points of a level, half as many in each block, and the bounds of the blocks in the next level.
+def halved(level: SplatModel, known: Moments, ends: np.ndarray, number: int) -> tuple[SplatModel, Moments, np.ndarray]:
+    """The next level with half the points in each block, what is known of them, and the bounds of the blocks in it.
+
+    One block after the other, so that what this takes beside the levels does not grow with the scene.
 
     Args:
-        level: Its points.
-        weights: (N,) how much each counts.
+        level: To merge points of.
+        known: Of its points.
         ends: (B + 1,) bounds of the blocks of the next level in this one.
         number: Of the next level.
     """
-    known = alike(level.splats, weights)
-    labels, bounds = np.empty(len(level), np.int64), [0]
-    for at, (first, last) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
-        part = type(known)(*(value[first:last] for value in vars(known).values()))
-        target = (last - first + 1) // 2
-        labels[first:last] = bounds[-1] + groups(part, target)
-        bounds.append(bounds[-1] + target)
+    parts, moments = [], []
+    for at, (first, last) in enumerate(zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)):
+        part, (weights, spread) = level.take(slice(first, last)), (each[first:last] for each in known)
+        labels = groups(alike(part.splats, weights), (last - first + 1) // 2)
+        parts.append(merged_model(part, labels, weights))
+        moments.append(carried(part, parts[-1], labels, (weights, spread)))
         emit(Progress(f"merging to level {number} of detail", at + 1, len(ends) - 1))
-    return labels, np.array(bounds)
+    shared, one = level.primitive.shared(), parts[0].params
+    params = {n: v if n in shared else torch.cat([part.params[n] for part in parts]) for n, v in one.items()}
+    weights, spread = (np.concatenate(each) for each in zip(*moments, strict=True))
+    return replace(level, params=params), (weights, spread), np.cumsum([0, *map(len, parts)])
 
 
 def carried(before: SplatModel, after: SplatModel, labels: np.ndarray, known: Moments) -> Moments:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import name_of
@@ -198,9 +197,3 @@ def quaternions(turns: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(turns).as_quat()[:, [3, 0, 1, 2]]
-
-
-def rows_of(model: SplatModel, rows: Tensor) -> SplatModel:
-    """The points of a mask or of indices, with what is shared."""
-    shared = model.primitive.shared()
-    return replace(model, params={n: v if n in shared else v[rows] for n, v in model.params.items()})

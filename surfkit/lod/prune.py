@@ -18,7 +18,6 @@ from surfkit.densify.prune import importance
 from surfkit.densify.trim import lowest
 from surfkit.lod.base import LevelsOfDetail, LodInput
 from surfkit.lod.cut import cut, depth_for
-from surfkit.lod.moments import rows_of
 from surfkit.lod.refine import refined
 from surfkit.lod.tree import LodBlock, LodTree
 from surfkit.primitives.drawing import drawn_by
@@ -74,13 +73,13 @@ class PrunedLevels(LevelsOfDetail):
         limits = [0.0, *(self._local(given, distance) / focal for distance in self.distances)]
         depth = depth_for(len(given.model), self.tile_points)
         order, bounds = cut(given.model.splats.means.detach().double().cpu().numpy(), depth)
-        full = rows_of(given.model, torch.from_numpy(order))
+        full = given.model.take(torch.from_numpy(order))
         tally = ViewContributions(given.views, drawn_by(full.primitive, given.rasterizer), full.splats, full.near)
         scores = importance(tally, full.splats.detached(), self.power).cpu()
         levels, ends = [full], [bounds[depth]]
         for number, share in enumerate(self.keep, 1):
             kept = kept_rows(scores, share, bounds[depth])
-            levels.append(refined(given, rows_of(full, kept), number, self.steps, smaller=1.0))
+            levels.append(refined(given, full.take(kept), number, self.steps, smaller=1.0))
             ends.append(np.searchsorted(kept.numpy(), bounds[depth]))
         errors = (
             [np.full(len(bounds[depth]) - 1, limit) for limit in limits] if self.distances else sights(levels, ends)

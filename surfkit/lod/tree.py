@@ -136,11 +136,11 @@ class LodTree:
         low, high, reach = np.full((count, 3), np.inf), np.full((count, 3), -np.inf), np.zeros(count)
         error = np.array([block.error for block in blocks], dtype=np.float64)
         for at, block in enumerate(blocks):
-            splats, rows = levels[block.level].splats, slice(block.first, block.last)
             if block.first < block.last:
-                means = splats.means[rows].detach().double().cpu().numpy()
+                splats = levels[block.level].take(slice(block.first, block.last)).splats.detached()
+                means = splats.means.double().cpu().numpy()
                 low[at], high[at] = means.min(0), means.max(0)
-                reach[at] = CUTOFF * float(splats.scales[rows].detach().max())
+                reach[at] = CUTOFF * float(splats.scales.max())
         for at in range(count - 1, 0, -1):
             up = blocks[at].parent
             low[up], high[up] = np.minimum(low[up], low[at]), np.maximum(high[up], high[at])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+
+from torch import Tensor
 
 from surfkit.export.table import SplatTable
 from surfkit.primitives.base import Primitive
@@ -39,6 +41,11 @@ class SplatModel:
     def splats(self) -> Splats:
         """Activated values."""
         return self.primitive.activate(self.params, self.sh_degree)
+
+    def take(self, rows: Tensor | slice) -> SplatModel:
+        """The points of a mask, of indices or of a slice, with the shared parameters."""
+        shared = self.primitive.shared()
+        return replace(self, params={n: v if n in shared else v[rows] for n, v in self.params.items()})
 
 
 def primitive_of(table: SplatTable) -> Primitive:

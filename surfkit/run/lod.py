@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 import safetensors.torch
+import torch
 from safetensors import SafetensorError
 
 from surfkit.core.check import BadInput
@@ -23,7 +24,6 @@ from surfkit.core.files import replacing
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.measure import Draw, evaluate_views, frames_per_second
 from surfkit.lod.base import LevelsOfDetail, LodInput
-from surfkit.lod.moments import rows_of
 from surfkit.lod.sound import fault
 from surfkit.lod.tree import LodBlocks, LodTree
 from surfkit.method.base import Reconstruction
@@ -171,7 +171,7 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
         coarse = [safetensors.torch.load_file(path) for path in names]
         if len(order) != len(model):
             raise BadInput(f"{run.lod}: made from {len(order):,} points, and the run has {len(model):,}; {again}")
-        first = rows_of(model, order)
+        first = model.take(torch.from_numpy(order))
         levels = (first, *(SplatModel(model.primitive, params, model.sh_degree, model.near) for params in coarse))
         tree = LodTree(order, levels, blocks)
         wrong = fault(tree, model)
