@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from surfkit.cli.recipes import ARGV
+from surfkit.cli.recipes import part_of_run
 from surfkit.cli.result import compressed_rows
 from surfkit.cli.table import print_table
 from surfkit.compress.base import Compressor
 from surfkit.compress.format import model_of_file
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
-from surfkit.recipe import Recipe
 from surfkit.run.compress import Target, compress_run, fitted, writing
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
@@ -30,15 +29,6 @@ from surfkit.run.notes import collect_notes
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
-
-
-def named_compressor() -> Compressor:
-    """The compressor of the recipe of the run on the command line; vectree if the recipe has none."""
-    for word in ARGV.get():
-        path = Path(word) / "recipe.json"
-        if not word.startswith("-") and path.is_file():
-            return read_json(path, Recipe).compress or Vectree()
-    return Vectree()
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,9 @@ class Compress:
     target: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
     """Folder that `surfkit train` made; or a file of splats, for compressors that need no photographs."""
 
-    compress: Annotated[Compressor, choice(Compressor)] = field(default_factory=named_compressor)
+    compress: Annotated[Compressor, choice(Compressor)] = field(
+        default_factory=partial(part_of_run, "compress", Vectree)
+    )
     """How the model is compressed."""
 
     target_size: str | None = None

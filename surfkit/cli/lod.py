@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from surfkit.cli.recipes import ARGV
+from surfkit.cli.recipes import part_of_run
 from surfkit.cli.result import lod_rows
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.lod.base import LevelsOfDetail
 from surfkit.lod.merge import MergedLevels
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
-from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
 from surfkit.run.lod import make_levels
@@ -27,15 +26,6 @@ from surfkit.run.notes import collect_notes
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
-
-
-def named_levels() -> LevelsOfDetail:
-    """The levels of the recipe of the run on the command line; merged ones if the recipe has none."""
-    for word in ARGV.get():
-        path = Path(word) / "recipe.json"
-        if not word.startswith("-") and path.is_file():
-            return read_json(path, Recipe).lod or MergedLevels()
-    return MergedLevels()
 
 
 @dataclass(frozen=True)
@@ -49,7 +39,9 @@ class LodOf:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `surfkit train` made."""
 
-    lod: Annotated[LevelsOfDetail, choice(LevelsOfDetail)] = field(default_factory=named_levels)
+    lod: Annotated[LevelsOfDetail, choice(LevelsOfDetail)] = field(
+        default_factory=partial(part_of_run, "lod", MergedLevels)
+    )
     """How levels are made."""
 
     memory: str = "auto"

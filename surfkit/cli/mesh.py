@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from surfkit.cli.recipes import ARGV
+from surfkit.cli.recipes import ARGV, part_of_run
 from surfkit.cli.result import mesh_rows
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
-from surfkit.recipe import Recipe
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
 from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
@@ -31,15 +30,6 @@ from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
 from surfkit.train.material import CacheSettings
-
-
-def named_mesher() -> Mesher:
-    """The mesher of the recipe of the run on the command line; TSDF if the recipe has none."""
-    for word in ARGV.get():
-        path = Path(word) / "recipe.json"
-        if not word.startswith("-") and path.is_file():
-            return read_json(path, Recipe).mesh or TSDF()
-    return TSDF()
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,7 @@ class MeshOf:
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """Folder that `surfkit train` made."""
 
-    mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=named_mesher)
+    mesh: Annotated[Mesher, choice(Mesher)] = field(default_factory=partial(part_of_run, "mesh", TSDF))
     """Method that makes triangles from splats; a mesh that the method of the run made itself is written again."""
 
     delivery: Annotated[MeshOutput, tyro.conf.arg(name="")] = MeshOutput()

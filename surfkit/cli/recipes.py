@@ -11,7 +11,7 @@ leading "recipe.", and parts as `pretrain.densify:none`.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +82,17 @@ class Recipes:
 
 
 COMMAND = Recipes
+
+
+def part_of_run(field: str, otherwise: Callable[[], Any]) -> Any:
+    """The part at a field of the recipe of the run that the command line names; `otherwise()` if there is none."""
+    for word in ARGV.get():
+        path = Path(word) / "recipe.json"
+        if not word.startswith("-") and path.is_file():
+            from surfkit.recipe import Recipe
+
+            return getattr(read_json(path, Recipe), field) or otherwise()
+    return otherwise()
 
 
 def settled(recipe: Any) -> Any:

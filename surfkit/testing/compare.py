@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch
+
+from surfkit.core.check import BadInput
 
 PLAIN = (bool, int, float, str, bytes, type(None), Path)
 
@@ -91,3 +93,15 @@ def _equal(one: Any, two: Any) -> bool:
         same = one.dtype == two.dtype and one.shape == two.shape
         return same and np.array_equal(one, two, equal_nan=one.dtype.kind == "f")
     return one == two or (one != one and two != two)
+
+
+def refuses(what: str, act: Callable[[], object]) -> bool:
+    """Whether a call ends in BadInput of one line; AssertionError for another error."""
+    try:
+        act()
+    except BadInput as error:
+        assert "\n" not in str(error), f"{what} has a message of several lines"
+        return True
+    except Exception as error:
+        raise AssertionError(f"{what} raises {type(error).__name__} in place of BadInput: {error}") from error
+    return False

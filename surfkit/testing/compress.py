@@ -16,14 +16,13 @@ from surfkit.compress.encoding import ColumnType, Encoding, Tables
 from surfkit.compress.index import TABLE_TYPES
 from surfkit.compress.octree import Leaf, leaves
 from surfkit.compress.streams import packed, unpacked
-from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import Column, standard_columns
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
-from surfkit.testing.compare import assert_same, unchanged
+from surfkit.testing.compare import assert_same, refuses, unchanged
 
 LEAF = 70
 """Points of a leaf in the files of the check, so that there are several."""
@@ -163,7 +162,7 @@ def _check_file(what: str, compressor: Compressor, model: SplatModel, plan: Plan
 
 def _check_coarser(name: str, compressor: Compressor, model: SplatModel, folder: Path) -> None:
     coarser: list[Any] = []
-    if not _refuses(f"{name}.coarser", lambda: coarser.append(compressor.coarser(4.0))):
+    if not refuses(f"{name}.coarser", lambda: coarser.append(compressor.coarser(4.0))):
         other = coarser[0]
         assert type(other) is type(compressor), f"{name}.coarser returned {type(other).__name__}"
         sizes = []
@@ -222,23 +221,11 @@ def _check_damage(
 
     for key, numbers in whole.items():
         rest = {other: value for other, value in whole.items() if other != key}
-        assert _refuses(f"{name}.decode without the stream {key}", decode(rest)), f"{name} does without stream {key}"
+        assert refuses(f"{name}.decode without the stream {key}", decode(rest)), f"{name} does without stream {key}"
         longer = rest | {key: np.concatenate([numbers, numbers[:1]])}
-        refused = _refuses(f"{name}.decode with another shape of the stream {key}", decode(longer))
+        refused = refuses(f"{name}.decode with another shape of the stream {key}", decode(longer))
         assert refused, f"{name}.decode takes a stream {key} with a row too many"
         for kind in ("u1", "u2", "u4", "u8"):
             drawn = draw.integers(0, np.iinfo(kind).max, numbers.shape, kind, endpoint=True)
             with np.errstate(all="ignore"):
-                _refuses(f"{name}.decode with other numbers in the stream {key}", decode(rest | {key: drawn}))
-
-
-def _refuses(what: str, act: Callable[[], object]) -> bool:
-    """Whether a call ends in BadInput of one line; AssertionError for another error."""
-    try:
-        act()
-    except BadInput as error:
-        assert "\n" not in str(error), f"{what} has a message of several lines"
-        return True
-    except Exception as error:
-        raise AssertionError(f"{what} raises {type(error).__name__} in place of BadInput: {error}") from error
-    return False
+                refuses(f"{name}.decode with other numbers in the stream {key}", decode(rest | {key: drawn}))

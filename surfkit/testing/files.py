@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
 from surfkit.export.base import HEAD, Format
 from surfkit.export.table import SplatTable, Tile
 from surfkit.scene.scene import Frame
-from surfkit.testing.compare import unchanged
+from surfkit.testing.compare import refuses, unchanged
 
 NEAR = 0.01
 """A position may be rounded to this share of the size of the scene."""
@@ -107,7 +105,7 @@ def _check_refusals(name: str, form: Format, folder: Path, table: SplatTable) ->
     spoilt = table.sh0.clone()
     spoilt[len(table) // 2, 1] = float("nan")
     bad = replace(table, sh0=spoilt)
-    refused = _refuses(f"{name}.write, for NaN,", lambda: form.write(path, bad, tree=_tree(form, table)))
+    refused = refuses(f"{name}.write, for NaN,", lambda: form.write(path, bad, tree=_tree(form, table)))
     assert refused, f"{name}.write takes NaN; call table.refuse_unsound(path)"
     assert not path.exists(), f"{name}.write leaves a file where it refused the splats"
     if not _reads(form) or not form.suffix:
@@ -119,7 +117,7 @@ def _check_refusals(name: str, form: Format, folder: Path, table: SplatTable) ->
     whole = path.read_bytes()
     for size in (10, len(whole) // 2 | 1):
         path.write_bytes(whole[:size])
-        refused = _refuses(f"{name}.read, for a file that is cut off,", lambda: form.read(path))
+        refused = refuses(f"{name}.read, for a file that is cut off,", lambda: form.read(path))
         assert refused, f"{name}.read takes a file cut off after {size} of {len(whole)} bytes"
 
 
@@ -157,15 +155,3 @@ def _bytes(path: Path) -> dict[str, bytes]:
     if path.is_file():
         return {"": path.read_bytes()}
     return {str(p.relative_to(path)): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
-
-
-def _refuses(what: str, act: Callable[[], object]) -> bool:
-    """Whether a call ends in BadInput of one line; AssertionError for another error."""
-    try:
-        act()
-    except BadInput as error:
-        assert "\n" not in str(error), f"{what} has a message of several lines"
-        return True
-    except Exception as error:
-        raise AssertionError(f"{what} raises {type(error).__name__} in place of BadInput: {error}") from error
-    return False
