@@ -309,6 +309,10 @@ BY_ENDING = {
         *[splats.inside_zip(somewhere)] * 4,
         *[splats.inside_zip(splats.sized)] * 4,
     ),
+    ".surfkit": (
+        *[splats.inside_surfkit(splats.in_json(node), index_only=True)] * 8,
+        *[splats.inside_surfkit(somewhere)] * 12,
+    ),
     ".txt": TEXT,
     ".ply": TEXT,
     ".jsonl": (*TEXT, *[event] * 6),

@@ -21,6 +21,7 @@ FORMATS = {
     "splat": {},
     "spz": {"version": 3},
     "spz-4": {"version": 4},
+    "surfkit": {},
 }
 """Names of formats that are damaged, and their settings."""
 SIZES = (0, 1, 2, 3, 15, 255, 256, 2**14 - 1)
@@ -74,6 +75,46 @@ def inside_zip(change: Callable[[bytes, Any], bytes], json_only: bool = False) -
         path.write_bytes(file.getvalue())
 
     return way
+
+
+SURFKIT_HEAD = struct.Struct("<8sIIQQQII")
+
+
+def inside_surfkit(change: Callable[[bytes, Any], bytes], index_only: bool = False) -> Callable[[Path, Any], None]:
+    """A way that changes the JSON or a block of a .surfkit file, with checksums that fit."""
+
+    def way(path: Path, damage: Any) -> None:
+        import zstandard
+
+        content = path.read_bytes()
+        try:
+            start = SURFKIT_HEAD.unpack(content[: SURFKIT_HEAD.size])[3]
+            text = zstandard.ZstdDecompressor().decompress(content[start:])
+            index = json.loads(text)
+            entries = [entry["block"] for entry in (*index["tables"].values(), *index["leaves"])]
+            block = entries[damage.what // 7 % len(entries)]
+            begin, end = block["offset"], block["offset"] + block["length"]
+        except Exception:  # it is damaged already
+            return
+        blocks = bytearray(content[SURFKIT_HEAD.size : start])
+        if index_only:
+            text = change(text, damage)
+        else:
+            part = change(content[begin:end], damage)[: end - begin].ljust(end - begin, b"\0")
+            blocks[begin - SURFKIT_HEAD.size : end - SURFKIT_HEAD.size] = part
+            block["crc"] = zlib.crc32(part)
+            text = json.dumps(index).encode()
+        path.write_bytes(sealed_surfkit(bytes(blocks), zstandard.ZstdCompressor().compress(text)))
+
+    return way
+
+
+def sealed_surfkit(blocks: bytes, index: bytes) -> bytes:
+    """A .surfkit file with checksums that fit."""
+    start = SURFKIT_HEAD.size + len(blocks)
+    numbers = struct.pack("<QQQI", start, len(index), start + len(index), zlib.crc32(index))
+    head = b"\x89SRFK\r\n\x1a" + struct.pack("<II", 1, zlib.crc32(numbers)) + numbers + bytes(4)
+    return head + blocks + index
 
 
 def inside_glb(change: Callable[[bytes, Any], bytes]) -> Callable[[Path, Any], None]:

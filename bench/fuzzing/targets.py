@@ -97,7 +97,7 @@ SWEEP = tuple(
     )
 )  # fmt: skip
 DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
-EXPORTS = (".ply", ".compressed.ply", ".glb", ".sog", ".splat", ".spz")
+EXPORTS = (".ply", ".compressed.ply", ".glb", ".sog", ".splat", ".spz", ".surfkit")
 
 
 def exports(name: str) -> Target:
@@ -118,6 +118,7 @@ SUFFIXES = {
     "sog": ".sog",
     "splat": ".splat",
     "spz": ".spz",
+    "surfkit": ".surfkit",
 }
 TARGETS = {
     **{f"splats-{name}": exports(name) for name in splats.FORMATS},

@@ -45,15 +45,15 @@ class Stored:
         name: Of the stream.
         dtype: Of its numbers.
         shape: (rows, components).
-        planes: Stored bytes of each plane, component by component, lowest byte first.
-        coded: Whether each of them is a Zstandard frame.
+        planes: Stored bytes of all planes, component by component, lowest byte first.
+        lengths: Bytes of each plane, as they stand in the file.
     """
 
     name: str
     dtype: np.dtype
     shape: tuple[int, int]
-    planes: tuple[memoryview, ...] = field(repr=False)
-    coded: tuple[bool, ...] = field(repr=False)
+    planes: memoryview = field(repr=False)
+    lengths: np.ndarray = field(repr=False)
 
     def numbers(self) -> np.ndarray:
         """(rows, components) numbers, the rows of each component one after the other in memory.
@@ -64,9 +64,12 @@ class Stored:
         (rows, components), size = self.shape, self.dtype.itemsize
         found = np.zeros((components, rows), self.dtype)
         split = found.view(np.uint8).reshape(components, rows, size)
-        for at, (part, coded) in enumerate(zip(self.planes, self.coded, strict=True)):
-            if len(part):
-                split[at // size, :, at % size] = self._plane(part, coded)
+        start = 0
+        for at, length in enumerate(self.lengths.tolist()):
+            stop = start + (length & ~AS_IT_IS)
+            if stop > start:
+                split[at // size, :, at % size] = self._plane(self.planes[start:stop], length < AS_IT_IS)
+            start = stop
         return found.T
 
     def _plane(self, part: memoryview, coded: bool) -> np.ndarray:
@@ -134,21 +137,20 @@ def unpacked(data: bytes | memoryview, most_rows: int) -> dict[str, Stored]:
             at += 1 + length + 9
             if size not in (1, 2, 4, 8) or components > MOST_COMPONENTS or rows > most_rows or name in found:
                 raise BadInput(f"stream {name!r} has {rows} x {components} numbers of {size} bytes, or is there twice")
-            found[name] = (size, components, rows, struct.unpack_from(f"<{components * size}I", data, at))
+            found[name] = (size, components, rows, np.frombuffer(data, "<u4", components * size, at))
             at += 4 * components * size
-    except (struct.error, UnicodeDecodeError) as error:
+    except (struct.error, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
         raise BadInput("the heads of its streams are damaged") from error
     streams = {}
     for name, (size, components, rows, lengths) in found.items():
-        ends = [at := at + (length & ~AS_IT_IS) for length in lengths]
-        starts = [end - (length & ~AS_IT_IS) for end, length in zip(ends, lengths, strict=True)]
+        start, at = at, at + int((lengths & np.uint32(~AS_IT_IS & 0xFFFFFFFF)).sum(dtype=np.int64))
         if at > len(data):
             raise BadInput(f"stream {name} is cut off")
-        if rows > MOST_EMPTY and 0 in lengths:
+        if rows > MOST_EMPTY and not lengths.all():
             raise BadInput(f"stream {name} of {rows} rows lacks a plane")
-        planes = tuple(data[start:end] for start, end in zip(starts, ends, strict=True))
-        coded = tuple(length < AS_IT_IS for length in lengths)
-        streams[name] = Stored(name, np.dtype(f"<u{size}"), (rows, components), planes, coded)
+        streams[name] = Stored(name, np.dtype(f"<u{size}"), (rows, components), data[start:at], lengths)
     if at != len(data):
         raise BadInput(f"{len(data) - at} bytes after the last stream")
     return streams

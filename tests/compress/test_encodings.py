@@ -35,10 +35,8 @@ def test_codes(parts):
     columns = standard_columns(3, 1)
     numbers = vectors(column_values(columns, 200)).astype(np.float16)
     ends = np.cumsum([0, *parts]).tolist()
-    tables = {
-        f"sh.codes.{at}": np.unique(numbers[:, a:b], axis=0)
-        for at, (a, b) in enumerate(zip(ends, ends[1:], strict=False))
-    }
+    cuts = enumerate(zip(ends[:-1], ends[1:], strict=True))
+    tables = {f"sh.codes.{at}": np.unique(numbers[:, a:b], axis=0) for at, (a, b) in cuts}
     check_encoding(Codes(parts), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0}, near=1e-3)
     with pytest.raises(BadInput, match="codebooks are missing, or not of 12 coefficients together"):
         check_encoding(Codes((11,)), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0})

@@ -141,7 +141,7 @@ def models(draw):
     return SplatModel(primitive, params | {"means": params["means"].to(dtype)}, primitive.sh_degree)
 
 
-@hypothesis.settings(max_examples=120, deadline=None, derandomize=True, database=None)
+@hypothesis.settings(max_examples=60, deadline=None, derandomize=True, database=None)
 @hypothesis.given(model=models(), compressor=st.sampled_from(COMPRESSORS))
 def test_models_of_any_values(tmp_path_factory, model, compressor):
     path = tmp_path_factory.getbasetemp() / "any.surfkit"
