@@ -204,7 +204,7 @@ def read_by_others(folder: Path, reference: Splats) -> list[Row]:
                 rows.append(placed(path, "trimesh", reference, programs.trimesh_points))
         elif path.suffix in (".ply", ".splat", ".spz", ".sog"):
             rows.append(compared(path, "splat-transform", reference, programs.splat_transform))
-            if form != "splat":
+            if form != "splat" and reference.rest.shape[1]:
                 rows.append(compared(path, "gaussforge", reference, programs.gaussforge))
             if form == "spz":
                 rows.append(compared(path, "spz library", reference, programs.spz_library))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 from check import Row, failed
 from PIL import Image
-from programs import HERE, Missing, find_chromium, node, three
+from programs import HERE, Missing, find_chromium, is_as_in_ply, node, three
 
 TIMES = 3
 """Pixels of a picture for one of the photograph, on each side."""
@@ -20,27 +21,24 @@ HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of PLY files to those of SPZ files, right-up-back."""
 
 VIEWERS = {
-    "playcanvas": (".ply", ".compressed.ply", ".sog", ".glb"),
-    "spark": (".ply", ".compressed.ply", ".sog", ".splat", ".spz"),
-    "cesium": (".tiles",),
+    "playcanvas": r"\.(ply|sog|glb)$|\.v4\.(same\.)?spz$",
+    "spark": r"\.(ply|sog|splat)$|\.v[23]\.spz$",
+    "cesium": r"\.tiles$",
 }
-"""What each viewer draws. CesiumJS 1.145 draws splats in 3D Tiles only, compressed as SPZ; PlayCanvas reads SPZ of
-version 4 only, with a module that npm does not have; Spark 2.2 reads SPZ up to version 3."""
+"""Names of the files that each viewer draws. PlayCanvas reads version 4 of SPZ only, Spark 2.2 versions up to 3, and
+CesiumJS 1.145 only 3D Tiles with SPZ inside."""
 
 
 def suits(viewer: str, path: Path) -> bool:
     """Whether a viewer is to draw a file."""
-    if ".spz." in path.name or ".v4." in path.name or ".z." in path.name and viewer != "playcanvas":
-        return False
-    ends = VIEWERS[viewer]
-    return path.name.endswith(ends) and not (path.name.endswith(".compressed.ply") and ".compressed.ply" not in ends)
+    return bool(re.search(VIEWERS[viewer], path.name)) and not path.name.endswith(".spz.glb")
 
 
 def world_of(path: Path) -> np.ndarray:
     """(4, 4) from the coordinates of the PLY file to those in which a viewer sees a file."""
     if path.suffix == ".glb":
         return np.array(three(path)[1]["matrix"]).reshape(4, 4).T
-    return HALF_TURN if path.suffix == ".spz" else np.eye(4)
+    return HALF_TURN if path.suffix == ".spz" and not is_as_in_ply(path) else np.eye(4)
 
 
 def camera_of(row: dict, world: np.ndarray) -> dict:

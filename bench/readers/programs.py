@@ -91,7 +91,7 @@ KINDS = {".compressed.ply": "compressed.ply", ".ply": "ply", ".splat": "splat", 
 def gaussforge(path: Path) -> Splats:
     """GaussForge (Apache-2.0), C++ with a Python package. It leaves the axes of .spz files as they are.
 
-    Version 0.6.0 reads no .splat, not even its own.
+    Version 0.6.0 reads no file without further spherical harmonics, not even its own: no .splat.
     """
     kind = next(kind for suffix, kind in KINDS.items() if path.name.endswith(suffix))
     said = _forge().read(path.read_bytes(), kind)
