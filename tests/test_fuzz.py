@@ -14,8 +14,8 @@ pytestmark = needs_native
 BENCH = Path(__file__).parents[1] / "bench"
 CASES = 16
 TARGETS = (
-    "splats-compressed-ply", "splats-gltf", "splats-gltf-spz", "splats-ply", "splats-sog", "splats-splat", "splats-spz", "splats-spz-4",
-    "splats-surfkit",
+    "splats-compressed-ply", "splats-gltf", "splats-gltf-spz", "splats-ply", "splats-sog", "splats-splat",
+    "splats-spz", "splats-spz-4", "splats-surfkit",
     "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
     "points-as-text", "blender", "matrixcity", "odm", "recipe", "run", "stopped-run", "blocks", "comparison", "outputs",
     "memory", "numbers-evaluate", "numbers-prepare", "numbers-mesh", "numbers-tetra", "numbers-train", "numbers-doctor",
