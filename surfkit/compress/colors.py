@@ -85,7 +85,7 @@ def principal_components(numbers: np.ndarray) -> dict[str, np.ndarray]:
     mean = (mean / max(1, len(numbers))).astype(np.float32)
     if not np.isfinite(square).all():
         raise BadInput("spherical harmonics: NaN or Inf, or numbers whose squares are; such a model is of no use")
-    covariance = square / max(1, len(numbers)) - np.outer(mean, mean)
+    covariance = square / max(1, len(numbers)) - np.outer(mean.astype(np.float64), mean)
     basis = np.linalg.eigh(covariance)[1][:, ::-1]
     return {"sh.basis": np.ascontiguousarray(basis.astype(np.float32)), "sh.mean": mean[None]}
 

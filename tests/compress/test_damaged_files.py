@@ -229,8 +229,10 @@ def test_streams_that_claim_much(tmp_path, whole):
     """Nothing is decoded before its shape is known to fit."""
     zeros = stream_head(b"means", 8, MOST_COMPONENTS, 131_072, [0] * 8 * MOST_COMPONENTS)
     assert "leaf 0 of" in complaint(tmp_path, leaf_of(whole, b"\1" + zeros))
-    many = b"".join(stream_head(b"%d" % i, 8, 500, 40, [0] * 4_000) for i in range(255))
-    assert "stream means is missing" in complaint(tmp_path, leaf_of(whole, b"\xff" + many))
+    many = b"".join(stream_head(b"%d" % i, 8, 500, 40, [0] * 4_000) for i in range(254))
+    many = stream_head(b"means", 8, 1, 40, [0] * 8) + many
+    assert "stream scales.middle is missing" in complaint(tmp_path, leaf_of(whole, b"\xff" + many))
+    assert "leaf 0: 131072 points" in complaint(tmp_path, leaf_of(whole, b"\0", points=131_072))
     bomb = zstandard.ZstdCompressor().compress(b"\0" * (100 << 20))
     part = b"\1" + stream_head(b"means", 8, 1, 40, [len(bomb)] + [0] * 7) + bomb
     assert "stream means has a plane of another size" in complaint(tmp_path, leaf_of(whole, part))

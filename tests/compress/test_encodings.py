@@ -28,6 +28,9 @@ def test_the_strongest_component_comes_first():
     found = principal_components(numbers)
     assert abs(found["sh.basis"][:, 0] @ along) > 0.999
     assert np.allclose(found["sh.mean"], numbers.mean(0), atol=1e-5)
+    with np.errstate(all="raise"):
+        huge = principal_components(np.full((5, 3), 1e30, np.float32))
+    assert np.isfinite(huge["sh.basis"]).all()
 
 
 @pytest.mark.parametrize("parts", [(12,), (3, 9)])
