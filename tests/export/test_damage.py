@@ -29,7 +29,7 @@ from .models import table
 
 hypothesis = needs("hypothesis")
 BENCH = Path(__file__).parents[2] / "bench"
-NAMES = ("compressed-ply", "gltf", "gltf-spz", "ply", "sog", "splat", "spz", "spz-4")
+NAMES = ("compressed-ply", "gltf", "gltf-spz", "ply", "sog", "splat", "spz", "spz-4", "surfkit")
 CASES = int(os.environ.get("SURFKIT_FUZZ_CASES", "300"))
 MOST = 64 << 20
 """Bytes that reading a damaged file of some tens of kilobytes may take."""
