@@ -19,6 +19,8 @@ from surfkit.primitives.model import SplatModel
 
 PASSES = 10
 """Of k-means."""
+LEARNT_FROM = 1 << 20
+"""Points that a codebook is learnt from, so that memory does not grow with the model."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,12 @@ class Vectree(Compressor):
         if importance is None:
             raise BadInput("compress:vectree needs the contributions to training views; choose compress:packed")
         chosen = least(importance, self.ratio)
-        numbers = vectors({name: model.params[name][chosen] for name in COLUMNS})
-        weights = importance[chosen].float()
+        rows = chosen.nonzero()[:, 0]
+        if len(rows) > LEARNT_FROM:
+            draw = torch.Generator().manual_seed(seed)
+            rows = rows[torch.randperm(len(rows), generator=draw)[:LEARNT_FROM].sort().values]
+        numbers = vectors({name: model.params[name][rows] for name in COLUMNS})
+        weights = importance[rows].float()
         parts = self.parts(width(kinds))
         ends = np.cumsum([0, *parts]).tolist()
         tables = {

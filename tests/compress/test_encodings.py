@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from surfkit.compress import vectree
 from surfkit.compress.colors import CHOSEN, Codes, PrincipalComponents, principal_components, vectors
 from surfkit.core.check import BadInput
+from surfkit.primitives import Surfel2D
 from surfkit.primitives.columns import standard_columns
+from surfkit.primitives.model import SplatModel
 from surfkit.testing import check_encoding
 from surfkit.testing.compress import column_values
 
@@ -43,3 +46,15 @@ def test_codes(parts):
     check_encoding(Codes(parts), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0}, near=1e-3)
     with pytest.raises(BadInput, match="codebooks are missing, or not of 12 coefficients together"):
         check_encoding(Codes((11,)), columns, tables, {CHOSEN: torch.arange(200) % 3 == 0})
+
+
+def test_a_codebook_is_learnt_from_a_sample_of_many_points(monkeypatch):
+    """Of two colours only, so that any sample has both."""
+    monkeypatch.setattr(vectree, "LEARNT_FROM", 64)
+    points = Surfel2D(sh_degree=0)
+    params = {name: torch.zeros(1000, *column.shape) for name, column in points.columns().items()}
+    params["sh0"][:] = torch.tensor([0.25, 0.5])[torch.arange(1000) % 2][:, None, None]
+    seen, plain = [], vectree.kmeans
+    monkeypatch.setattr(vectree, "kmeans", lambda given, *a, **k: seen.append(len(given)) or plain(given, *a, **k))
+    plan = vectree.Vectree(ratio=0.5, codes=8).plan(SplatModel(points, params), torch.arange(1000.0), 0)
+    assert seen == [64] and plan.tables["sh.codes.0"].tolist() == [[0.25] * 3, [0.5] * 3]
