@@ -27,6 +27,7 @@ SLOTS = {
     "filters": "filter",
     "regularizers": "regularizer",
     "compress": "compressor",
+    "lod": "levels-of-detail",
 }
 """Kinds of parts whose slot in a recipe or a command has another name."""
 TUTORIAL = ROOT / "docs" / "plugins.md"
