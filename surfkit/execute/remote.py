@@ -12,8 +12,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -33,8 +33,15 @@ import os, signal, subprocess, sys
 agent = int(os.environ["{DRIVER}"])
 for number in (signal.SIGUSR1, signal.SIGUSR2):
     signal.signal(number, signal.SIG_IGN)
-child = subprocess.Popen([sys.executable, *sys.argv[1:]], env=os.environ | {{"{DRIVER}": str(os.getpid())}})
+mask = signal.pthread_sigmask
+mask(signal.SIG_BLOCK, [signal.SIGTERM])
+child = subprocess.Popen(
+    [sys.executable, *sys.argv[1:]],
+    env=os.environ | {{"{DRIVER}": str(os.getpid())}},
+    preexec_fn=lambda: mask(signal.SIG_UNBLOCK, [signal.SIGTERM]),
+)
 signal.signal(signal.SIGTERM, lambda *_: child.terminate())
+mask(signal.SIG_UNBLOCK, [signal.SIGTERM])
 while True:
     try:
         status = child.wait({POLL_S})
@@ -126,7 +133,7 @@ class RemoteJob:
     def begin(self) -> None:
         """Start the process."""
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-        with open(self.log, "ab") as log:
+        with open(self.log, "ab") as log, interrupts_wait():
             self.process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", WATCHDOG, *self.words],
                 env={**os.environ, **self.variables, **limits, DRIVER: str(os.getpid())},
@@ -150,6 +157,22 @@ class RemoteJob:
 
         self.stop()
         return DelayedSubmission(replace(self, process=None))
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[None]:
+    """Within, Ctrl-C waits until the end: a process that has just begun must be known to whoever stops it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda *_: came.append(1))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 def run_remote_job(remote_job: RemoteJob) -> Outcome:
