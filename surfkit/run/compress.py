@@ -78,13 +78,13 @@ def compress_run(
     """
     began, run, model = time.perf_counter(), ctx.run, on_cpu(splats_of(ctx.run, made))
     importance = importance_of(model, ctx.scene.train, ctx.rasterizer) if compressor.needs_importance else None
-    forget_compressed(run)
     run.compressed.mkdir(exist_ok=True)
     write = writing(model, importance, ctx.scene.frame, run.recipe.seed)
     if target is not None and target.is_set:
         judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
         compressor = fitted(compressor, target, write, judge)
     size = write(run.compressed_model, compressor)
+    forget_compressed(run)  # only now: what cannot be compressed so costs nothing of before
     record = {
         "compressor": compressor,
         "steps": made.last_steps,

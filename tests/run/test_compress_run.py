@@ -148,6 +148,7 @@ def test_a_size_and_a_loss_can_be_wished_for(copy):
 
 
 def test_what_cannot_be_reached_is_one_line(copy, capsys):
+    before, metrics = record_of(copy), metrics_of(copy)
     for words, text in (
         (["--target-size", "100"], "does not come to 100 bytes with any setting"),
         (["--target-size", "1MB", "--target-loss", "1"], "give one of the two"),
@@ -160,6 +161,7 @@ def test_what_cannot_be_reached_is_one_line(copy, capsys):
         more = [] if any("compress:" in word for word in words) else ["compress:packed"]
         assert main(["compress", str(copy), *more, *words]) == 2
         assert text in capsys.readouterr().err
+    assert (record_of(copy), metrics_of(copy)) == (before, metrics), "what was there stays"
 
 
 def test_without_the_file_it_cannot_be_read(copy, capsys):
