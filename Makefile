@@ -5,14 +5,16 @@ PY = $(VENV)/bin/python
 STEPS ?= 1000
 SCALE ?= 1.5
 OUT ?= runs/demo
+WORKERS ?= logical
 
 .PHONY: demo test lint docs bench fuzz clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/surfkit train recipe:surface --scale $(SCALE) --steps $(STEPS) --out $(OUT)
 
+# In a process for each core, four at most, as each takes 1 GB of memory; `WORKERS=0` is in this one.
 test: $(VENV)/.installed
-	$(PY) -m pytest
+	$(PY) -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile
 
 lint: $(VENV)/.installed
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
@@ -38,7 +40,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt CMakeLists.txt $(wildcard sur
 	test -x $(PY) || $(PYTHON) -m venv $(VENV)
 	$(PY) -m pip install --quiet --upgrade pip
 	$(PY) -m pip install --quiet -c constraints.txt -e ".[test,dev,docs]"
-	$(PY) -m pip install --quiet --no-deps -e plugins/surfkit-ceiling -e plugins/surfkit-mcmc
+	$(PY) -m pip install --quiet --no-deps $(addprefix -e ,$(wildcard plugins/surfkit-*))
 	touch $@
 
 clean:

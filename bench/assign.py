@@ -21,7 +21,7 @@ from torch import Tensor
 from trained import halfway
 
 from surfkit.core.tree import evolve
-from surfkit.partition import Assign, CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid, SSIMDifference
+from surfkit.partition import CoarseModel, ContractedGrid, Partition, PictureShare, QuantileGrid, SSIMDifference
 from surfkit.readers.data import Data
 from surfkit.recipes.city import COARSE
 
@@ -63,7 +63,7 @@ def compared(sight: CoarseModel, way: Partition) -> Case:
     """Both ways, one after the other."""
     cells = way.cells(sight)
     owner, seconds, found = cells.owner(sight.splats.means), [], []
-    ways: tuple[Assign, ...] = (SSIMDifference(), PictureShare())
+    ways: tuple[SSIMDifference | PictureShare, ...] = (SSIMDifference(), PictureShare())
     for assign in ways:
         began = time.process_time()
         found.append(assign.measure(sight, owner, cells.count))

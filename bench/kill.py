@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import hashlib
 import json
 import os
@@ -26,7 +27,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-STEPS = 40
+STEPS = 24
 WORDS = f"train recipe:2dgs --steps {STEPS} --checkpoint-every 7 --pictures-every 20 --device cpu"
 SETTINGS = "--primitive.sh-degree 1 --pretrain.densify.every 5 --pretrain.densify.start 10"
 BLOCKS = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share --tune.sh-every 1"
@@ -88,6 +89,22 @@ class Deadly:
 def die() -> None:
     """End this process as the kernel does when memory runs out."""
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def load_all() -> None:
+    """Load what a run loads, once: attempts are forked from here."""
+    import torch.fx.experimental.symbolic_shapes  # noqa: F401
+    from PIL import Image
+
+    from surfkit import pipeline  # noqa: F401
+    from surfkit.cli.recipes import recipes
+    from surfkit.readers.capture import load_pycolmap
+
+    recipes()
+    load_pycolmap()
+    Image.init()
+    gc.collect()
+    gc.freeze()
 
 
 def attempt(words: list[str], prepare: Callable[[], object], after_s: float | None = None) -> int:
@@ -216,13 +233,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
     os.environ.update(OMP_NUM_THREADS="1", OMP_WAIT_POLICY="PASSIVE")
-    import torch.fx.experimental.symbolic_shapes  # noqa: F401  (slow ones, loaded once: attempts are forked from here)
-
-    from surfkit import pipeline  # noqa: F401
-    from surfkit.cli.recipes import recipes
+    load_all()
     from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
-    recipes()
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "data"
         flight = Flight(width=48, height=36, points=200)

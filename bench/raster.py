@@ -13,8 +13,8 @@ from machine import cpu_seconds, save
 from scenes import city
 
 from surfkit.native import module
-from surfkit.raster.api import Maps
-from surfkit.raster.native import MAPS, NativeRasterizer, _Pass
+from surfkit.raster.api import MAPS, Maps
+from surfkit.raster.native import NativeRasterizer, _Pass
 from surfkit.raster.ssim import ssim
 from surfkit.train.adam import update
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from surfkit.blocks.block import plan_file
 from surfkit.blocks.schedule import Compute, tune_blocks
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
@@ -23,7 +24,7 @@ from surfkit.method.base import Reconstruction
 from surfkit.primitives.model import SplatModel
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.readers.read import observations, read
 from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
@@ -41,19 +42,22 @@ from surfkit.run.method import (
     result_path,
     with_drawing,
 )
-from surfkit.run.notes import collect_notes
+from surfkit.run.notes import collect_notes, prefix_notes
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
 from surfkit.run.refine import refine_model, stage_scene
 from surfkit.run.resume import refuse_changed, refuse_other_run, write_run_files
+from surfkit.run.shared import Shares
 from surfkit.run.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.run.start import InitialPoints, align_priors
+from surfkit.run.store import StageStore
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import in_one_line
 from surfkit.train.material import CacheSettings, read_ahead
 from surfkit.train.meter import Meter
-from surfkit.train.stage import MOST_STEPS, StageState
+from surfkit.train.stage import MOST_STEPS
+from surfkit.train.state import StageState
 
 
 def with_steps(recipe: Recipe, steps: int) -> Recipe:
@@ -78,6 +82,7 @@ def run(
     compute: Compute | None = None,
     intervals: Intervals | None = None,
     caches: CacheSettings | None = None,
+    store: StageStore | None = None,
 ) -> dict[str, Any]:
     """Train, write the results into `out` and return the metrics; an interrupted run goes on where it stopped.
 
@@ -88,6 +93,8 @@ def run(
         compute: Who computes.
         intervals: When checkpoints and pictures are written.
         caches: Where photographs, masks and depth priors are kept at hand; the result does not depend on it.
+        store: Finished stages are taken from here if another run has made the same, and put here if not. In `out`,
+            there must be no run of fewer steps that this one makes longer.
 
     Raises:
         BadInput: `out` holds a run of another recipe or of other data, another process works in it, or the data cannot
@@ -115,19 +122,29 @@ def run(
         rasterizer, backend = select_rasterizer(compute.device)
         state = load_state(run, run.pretrain, scene, repair=True) if recipe.has_stages else None
         prints = refuse_changed(run, scene, {scene.train[at].name for at in state.skipped} if state else set())
+        for mesher in recipe.meshers:
+            mesher.refuse_unfit(scene.frame)
+        refuse_unplannable(run, scene)
         warn_of_gaps(scene, state)
         warn_of_no_edits(run)
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
-        ctx = RunContext(run, scene, rasterizer, intervals, caches)
+        shares = Shares.of(run, store, backend, prints)
+        ctx = RunContext(run, scene, rasterizer, intervals, caches, shares)
         stages = Stages(ctx, compute, meter, state)
         given = use.enter_context(method_input(ctx, compute.device, stages))
         recipe.method.refuse_unfit(given)
+        known = len(notes.texts)
         stages.begin()
+        warned = notes.texts[known:]  # runs that take the stage repeat what its journal warns of
         write_run_files(run, backend, prints, notes, scene.frame)
-        with record_events(out):
-            return results(ctx, reconstruct(run, given), compute.device, meter)
+        shares.take()
+        with record_events(out, warned):
+            made = reconstruct(run, given)
+            if not recipe.has_stages:
+                ctx.keep("result")
+            return results(ctx, made, compute.device, meter)
 
 
 class Stages:
@@ -146,8 +163,13 @@ class Stages:
 
     def begin(self) -> None:
         """Find where the first stage begins, or BadInput; nothing is written."""
-        if self.ctx.run.recipe.has_stages:
+        if self.ctx.run.recipe.has_stages and not self.is_shared:
             self.start = initial_points(self.ctx.run, self.ctx.scene, self.ctx.caches, self.state)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether another run has made the first stage, so that its state is taken from there."""
+        return self.ctx.shares is not None and "pretrain" in self.ctx.shares.found
 
     def __call__(self) -> Reconstruction:
         """Optimise what is not finished yet."""
@@ -158,10 +180,25 @@ class Stages:
             job = StageJob(run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start)
             state = optimise(job, state)
             del start, job  # to free the memory of the photographs
+        elif self.is_shared and run.recipe.partition is None:
+            state = load_state(run, run.pretrain, ctx.scene)
+        ctx.keep("pretrain")
         if run.recipe.partition is not None:
             state = None  # it is in the folder
-            state = tune_blocks(ctx, self.compute)
+            state = tune_blocks(ctx, self.compute, self.optimise_partition)
         return optimised(run, refine_model(ctx, state))
+
+    def optimise_partition(self, run: Run) -> None:
+        """Optimise the model that decides the partition, where another than that of pretraining does."""
+        ctx = replace(self.ctx, run=run, intervals=replace(self.ctx.intervals, pictures=0))
+        run.out.mkdir(exist_ok=True)
+        with prefix_notes("partition: "), record_events(run.out):
+            state = load_state(run, run.pretrain, ctx.scene, repair=True)
+            if (start := initial_points(run, ctx.scene, ctx.caches, state)) is not None:
+                job = StageJob(
+                    run, run.pretrain, ctx.scene, ctx.rasterizer, ctx.intervals, start.given, self.meter, start
+                )
+                optimise(job, state)
 
 
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
@@ -171,8 +208,21 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     caches.bytes(), caches.maps_bytes()
     if run.recipe.partition is not None:
         compute.workers.ready()
-    if run.recipe.mesh is not None:
-        run.recipe.mesh.ready()
+    for mesher in run.recipe.meshers:
+        mesher.ready()
+
+
+def refuse_unplannable(run: Run, scene: Scene) -> None:
+    """BadInput, before hours are spent on pretraining, if the data set lacks what the blocks will be planned by."""
+    recipe = run.recipe
+    if recipe.partition is None or plan_file(run).exists():
+        return
+    recipe.partition.refuse_unfit(scene.frame)
+    if recipe.assign.needs_observations and observations(run.data, scene).is_empty:
+        raise BadInput(
+            f"{run.data.path}: assign {name_of(recipe.assign)} needs the sparse points that each photograph shows, "
+            "and the data set has none; choose another assign, such as assign:picture-share"
+        )
 
 
 def initial_points(run: Run, scene: Scene, caches: CacheSettings, state: StageState | None) -> InitialPoints | None:
@@ -197,10 +247,14 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter)
         export(run, made.splats, scene)
     if not meshed:
         mesh(ctx, made, device)
+        if run.recipe.mesh is not None:
+            ctx.keep("mesh")
     if not has_lod:
         make_wanted_levels(ctx, made)
+        ctx.keep("lod")
     if not has_file:
         make_wanted_compressed(ctx, made)
+        ctx.keep("compress")
     metrics = evaluate(run, made, scene, meter, lpips_weights="gpu")
     return measure_compressed(ctx, made) if run.recipe.compress and has_compressed(run, made.last_steps) else metrics
 

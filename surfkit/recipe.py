@@ -14,6 +14,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, components, name_of
 from surfkit.depth.base import DepthEstimator
 from surfkit.lod.base import LevelsOfDetail
+from surfkit.losses.consensus import Consensus
 from surfkit.mesh.base import Mesher
 from surfkit.method.base import Method
 from surfkit.method.splats import SplatOptimisation
@@ -56,6 +57,10 @@ class Recipe:
 
     partition: Annotated[Partition | None, choice(Partition, optional=True)] = None
     """How the scene is cut into blocks that are tuned separately, after pretraining; none keeps it whole."""
+
+    partition_pretrain: Stage | None = None
+    """Where the scene is cut: a pretraining of its own, from the same start, whose model decides where the blocks lie
+    and which views they are tuned on; none takes the model of pretrain. The blocks begin with that of pretrain."""
 
     assign: Annotated[Assign, choice(Assign)] = SSIMDifference()
     """Which views a block is tuned on, where the scene is cut."""
@@ -101,6 +106,8 @@ class Recipe:
         """Every stage in its order: its path in the recipe, the stage, and the primitive of its points."""
         yield "pretrain", self.pretrain, self.primitive
         if self.partition is not None:
+            if self.partition_pretrain is not None:
+                yield "partition_pretrain", self.partition_pretrain, self.primitive
             yield "tune", self.tune, self.primitive
         primitive = self.primitive
         for at, refine in enumerate(self.refine):
@@ -109,6 +116,10 @@ class Recipe:
 
     def refuse_unfit(self) -> None:
         """BadInput if parts do not fit together; a note of learning rates that are not used."""
+        if self.partition_pretrain is not None and self.partition is None:
+            raise BadInput(
+                "partition_pretrain: the recipe cuts the scene into no blocks; leave it out, or choose partition"
+            )
         before = self.primitive
         for at, refine in enumerate(self.refine):
             try:
@@ -123,6 +134,28 @@ class Recipe:
                 raise BadInput(f"lod: {error}") from error
         for path, stage, primitive in self.stages():
             _refuse_unfit_stage(path, stage, primitive)
+            for key in (key for key, term in stage.regularizers.items() if isinstance(term, Consensus)):
+                self._refuse_consensus(f"{path}.regularizers.{key}", path, stage)
+
+    def _refuse_consensus(self, where: str, path: str, stage: Stage) -> None:
+        """BadInput where blocks could not agree: points must stay the same ones, and be tuned by several blocks."""
+        if path != "tune":
+            raise BadInput(f"{where}: only blocks agree; give it to tune.regularizers, in a recipe with a partition")
+        if sum(isinstance(term, Consensus) for term in stage.regularizers.values()) > 1:
+            raise BadInput(f"{where}: there are several of them; leave all but one out")
+        if stage.policies:
+            raise BadInput(
+                f"{where}: blocks agree on points, so none may be added or removed; choose tune.densify:none, and no "
+                "tune.prune"
+            )
+        if self.context == "frozen":
+            raise BadInput(f"{where}: with --context frozen no point is tuned by two blocks; choose tuned")
+
+    @property
+    def meshers(self) -> tuple[Mesher, ...]:
+        """Everything that makes a mesh: what the recipe refines with, then the one of the result."""
+        used = [mesher for refine in self.refine for mesher in refine.meshers]
+        return (*used, *([] if self.mesh is None else [self.mesh]))
 
     @property
     def has_stages(self) -> bool:
@@ -155,6 +188,16 @@ def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
             f"{path}.signal: {name_of(stage.signal)} wants absolute pixel gradients, and primitive "
             f"{name_of(primitive)} draws itself without them; choose {path}.signal:loss-gradient, or another primitive"
         )
+    if stage.densify is not None and not primitive.has_free_points:
+        raise BadInput(
+            f"{path}.densify: the points of primitive {name_of(primitive)} can be neither copied nor split; leave it "
+            f"out ({path}.densify:none), or choose another primitive"
+        )
+    if stage.densify is not None and stage.densify.needs_absolute and not stage.signal.absolute:
+        raise BadInput(
+            f"{path}.densify: {name_of(stage.densify)} needs absolute pixel gradients, and signal "
+            f"{name_of(stage.signal)} has none; choose {path}.signal:abs-gradient, or another densify"
+        )
     if stage.appearance is not None:
         stage.appearance.refuse_unfit(primitive)
 
@@ -178,11 +221,12 @@ def complete(recipe: Recipe, primitive: str | None = None) -> Recipe:
     if kind is not None and kind is not type(found):
         found = kind()
     pretrain, tune = with_rates(recipe.pretrain, found), with_rates(recipe.tune, found)
+    planned = None if recipe.partition_pretrain is None else with_rates(recipe.partition_pretrain, found)
     refined = []
     for refine in recipe.refine:
         found = refine.primitive(found)
         refined.append(replace(refine, stage=with_rates(refine.stage, found)))
-    return replace(recipe, pretrain=pretrain, tune=tune, refine=tuple(refined))
+    return replace(recipe, pretrain=pretrain, partition_pretrain=planned, tune=tune, refine=tuple(refined))
 
 
 def without_unused(recipe: Recipe) -> Recipe:

@@ -1,5 +1,6 @@
 """A small world of components and recipes for the tests of core and cli: no built-in folder, no plugin, no torch."""
 
+import gc
 import os
 import sys
 import types
@@ -16,6 +17,16 @@ from surfkit.core.schedule import Interval, StepCount, Steps
 
 # As in the command, and before torch is loaded: threads that wait for others do not spin.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0)):  # they share the cores
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // workers)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def little_garbage():
+    """What is loaded stays: it is not searched for garbage again and again, which took a third of the time."""
+    gc.freeze()
+    yield
+    gc.collect()
 
 
 class Loss(Component):
@@ -142,6 +153,14 @@ def compiled():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def unsynced():
+    """No file is flushed to the disk: that is for a loss of power, and no test has one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture
 def bare(monkeypatch):
     """The registry with nothing in it; as it was again afterwards."""
@@ -180,6 +199,16 @@ def own_cache(tmp_path_factory, monkeypatch):
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("SURFKIT_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture
+def forked_probe(monkeypatch):
+    """The process of a probe is forked from one that has loaded torch."""
+    import multiprocessing
+
+    from forks import CONTEXT
+
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method: CONTEXT)
 
 
 @pytest.fixture

@@ -19,7 +19,8 @@ from surfkit.cli import main
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 TESTS = Path(__file__).parent
-TOOLS = {"pre-commit", "pytest", "ruff"}
+TOOLS = {"mkdocs-material", "nvidia-cuda-nvrtc", "pre-commit", "pytest", "pytest-xdist", "ruff"}
+"""Packages that no test imports."""
 EXTRAS = [line for line in importlib.metadata.requires("surfkit") if "extra ==" in line]
 OPTIONAL = sorted({re.match(r"[\w-]+", line)[0] for line in EXTRAS} - TOOLS)
 """Packages of the extras; each is imported by the name that it is installed by."""
@@ -29,14 +30,11 @@ CASES += [f"ImportError:{EVERYTHING},{NATIVE}", f"OSError:{EVERYTHING}"]
 
 
 @pytest.fixture(scope="module")
-def collected(tmp_path_factory):
+def collected():
     """By case, what pytest said, and its exit status."""
     words = [sys.executable, str(TESTS / "hidden.py"), str(TESTS), *CASES]
-    env = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "PYTHONDONTWRITE"))}
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     env |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "OMP_NUM_THREADS": "1"}
-    env["PYTHONPYCACHEPREFIX"] = str(
-        tmp_path_factory.mktemp("compiled")
-    )  # the tests are compiled in the first case only
     said = subprocess.run(words, cwd=TESTS.parent, env=env, capture_output=True, text=True, check=True).stdout
     found = re.findall(r"^== (\w+:\S+)\n(.*?)^== (\d+)$", said, re.MULTILINE | re.DOTALL)
     return {case: (text, int(status)) for case, text, status in found}

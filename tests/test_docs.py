@@ -15,9 +15,9 @@ from pages import PAGES, ROOT, anchors, code, named, prose, spans, title
 from surfkit.cli import COMMANDS
 from surfkit.cli.parse import parse
 from surfkit.cli.recipes import recipes
-from surfkit.cli.tables import tables
 from surfkit.core.codec import dump, write_json
 from surfkit.core.registry import HOOKS, kebab, kind_of, offered, records
+from surfkit.report.ablation import offered_tables
 
 SLOTS = {
     "mesh": "mesher",
@@ -31,7 +31,7 @@ SLOTS = {
 }
 """Kinds of parts whose slot in a recipe or a command has another name."""
 TUTORIAL = ROOT / "docs" / "plugins.md"
-PLUGINS = {"surfkit-mcmc", "surfkit-ceiling"}
+PLUGINS = {folder.name for folder in (ROOT / "plugins").glob("surfkit-*")}
 PLACEHOLDER = re.compile(r"\[|(?:^|:)(?:NAME|COMMAND|FIELD|BLOCK)\b|FIELD:|\.\.\.")
 """In a word of a command that cannot be given as it stands."""
 MOST_LINES = 60
@@ -62,6 +62,7 @@ def somewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("my-recipe.json", "RUN/recipe.json"):
         write_json(tmp_path / name, recipes()["2dgs"])
+    write_json(tmp_path / "my-table.json", {"name": "mine", "base": "2dgs", "rows": [{"label": "base"}]})
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page != TUTORIAL], ids=title)
@@ -104,7 +105,7 @@ def parses(words, where):
 @cache
 def parts():
     """Names of components by kind."""
-    found: dict[str, set[str]] = {"recipe": set(recipes()), "table": set(tables())}
+    found: dict[str, set[str]] = {"recipe": set(recipes()), "table": set(offered_tables())}
     for _, name, cls in offered("surfkit_components"):
         found.setdefault(kebab(kind_of(cls).__name__), set()).add(name)
     return found
@@ -124,12 +125,19 @@ def test_parts_are_there(page):
 @pytest.mark.parametrize("page", PAGES, ids=title)
 def test_options_are_there(page):
     known = set(re.findall(r"`--([\w-]+)", (ROOT / "docs" / "commands.md").read_text()))
-    known |= {name.removeprefix("no-") for name in known} | set(recipe_settings())
+    known |= {name.removeprefix("no-") for name in known} | set(recipe_settings()) | settings_of_package(page.parent)
     for span in spans(page):
         if not span.startswith("--"):
             continue
         for flag in re.findall(r"(?<!\S)--([A-Za-z][\w.-]*)", span):
             assert flag.split(".")[-1].removeprefix("no-") in known, f"{title(page)}: --{flag} is no option"
+
+
+def settings_of_package(folder):
+    """Names of what may be settings of the parts of a package in plugins/."""
+    sources = folder.glob("surfkit_*/**/*.py") if folder.name in PLUGINS else ()
+    named = (re.findall(r"^    (\w+):", source.read_text(), re.M) for source in sources)
+    return {name.replace("_", "-") for names in named for name in names}
 
 
 @cache
@@ -164,7 +172,7 @@ def test_settings_of_the_paper():
 def test_rows_of_the_paper():
     cells = {span for span in spans(ROOT / "docs" / "paper.md")}
     for table in ("model", "gradient"):
-        for row in tables()[table].rows:
+        for row in offered_tables()[table].rows:
             assert row.label in cells, f"paper.md lacks the row {row.label!r} of table:{table}"
 
 

@@ -19,6 +19,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.tree import evolve
 from surfkit.execute import Pool
 from surfkit.export.ply import read_splats
+from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import QuantileGrid
 from surfkit.pipeline import Intervals, load_run, run, with_steps
 from surfkit.primitives import Flat3D, Surfel2D
@@ -51,6 +52,12 @@ def recipe():
 def finished(data, recipe, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
     return out, run(recipe, data, out)
+
+
+def test_lengths_in_metres_are_refused_before_training_where_the_unit_is_not_known(data, recipe, tmp_path):
+    with pytest.raises(BadInput, match="mesh.voxel: a length of 1 m cannot be used.*--metres-per-unit"):
+        run(replace(recipe, mesh=TSDF(voxel=1.0)), data, tmp_path / "run")
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 def test_a_run_leaves_everything_behind(finished, data, recipe):

@@ -7,7 +7,10 @@ import pytest
 from surfkit.cli.recipes import recipes
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
-from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
+from surfkit.densify import ADC, Importance, Trim
+from surfkit.losses import L1, SSIM, DepthRegression, Distortion, NormalConsistency
+from surfkit.mesh.tsdf import TSDF
+from surfkit.partition import ContractedGrid, QuantileGrid
 from surfkit.pipeline import with_steps
 from surfkit.primitives import Gaussian3D, Surfel2D
 from surfkit.train.stage import rates_of
@@ -59,7 +62,7 @@ def test_citygs2_coarse_is_the_last_row_of_the_upper_half_of_the_ablation_table(
     from surfkit.recipes.ablations import MODEL
     from surfkit.report.ablation import build
 
-    *_, last = build(MODEL).values()
+    last = build(MODEL)["+ depth regression"]
     assert replace(recipes()["citygs2-coarse"], about=last.about, mesh=last.mesh) == last
     assert last.pretrain.signal.boost == 0.9 and last.pretrain.signal.terms == ("ssim",)
 
@@ -68,12 +71,12 @@ def test_published_settings_of_the_other_recipes():
     known = recipes()
     flat, absolute, trimmed, light = (known[n].pretrain for n in ("flat3dgs", "absgs", "trim2dgs", "lightgaussian"))
     assert flat.losses["normal"].weight == 0.0125
-    assert absolute.signal.absolute and (absolute.densify.threshold, absolute.densify.small) == (4e-4, 0.001)
+    assert absolute.signal.absolute and absolute.densify == ADC(threshold=2e-4, split_threshold=4e-4, small=0.001)
     trim = trimmed.prune[0]
     assert (trim.ratio, trim.start, trim.until, trim.every, trimmed.steps) == (0.1, 31_000, 37_000, 500, 37_000)
     pruned, distilled = known["lightgaussian"].refine
     drop = pruned.stage.prune[0]
-    assert (drop.at, drop.ratio, drop.power) == ((0,), 0.66, 0.1) and distilled.sh_degree == 2
+    assert drop == Importance(at=(0,), ratio=0.66, power=0.1, score="significance") and distilled.sh_degree == 2
     assert (light.steps, pruned.stage.steps, distilled.stage.steps) == (30_000, 5_000, 5_000)
     assert known["lightgaussian"].compress == Vectree(ratio=0.6, codes=8192)
 
@@ -104,6 +107,39 @@ def test_citygs2_short_goes_on_at_the_pace_of_pretraining():
     assert replace(short.tune, rates=whole.tune.rates, prune=whole.tune.prune) == whole.tune and not short.tune.prune
 
 
+def test_citygs2_on_the_scenes_of_its_paper():
+    general = recipes()["citygs2"]
+    for name, blocks, ratio in (("residence", (4, 2), 0.1), ("russian", (3, 3), 0.025), ("modern", (3, 3), 0.025)):
+        scene = recipes()[f"citygs2-{name}"]
+        assert scene.tune == replace(general.tune, prune=(Trim(ratio=ratio),)) and scene.pretrain == general.pretrain
+        assert (scene.partition, scene.mesh) == (ContractedGrid(blocks=blocks), TSDF(1.0, 4.0, depth_limit=250.0))
+    aerial = recipes()["citygs2-aerial"]
+    rates = rates_of(aerial.pretrain, Surfel2D())
+    assert [rates["means"].at(step, 30_000) for step in (0, 30_000)] == pytest.approx([8e-5, 8e-7])
+    assert rates["scales"].start == 2.5e-3 and aerial.tune.densify.every == 200 and aerial.partition.blocks == (6, 6)
+    assert aerial.mesh == recipes()["citygs2-street"].mesh == TSDF(1.0, 4.0, depth_limit=500.0)
+
+
+def test_2dgs_in_blocks_has_nothing_of_what_citygs2_changes():
+    plain, blocks, city = (recipes()[name] for name in ("2dgs", "2dgs-blocks", "citygs"))
+    assert (blocks.primitive, blocks.pretrain, blocks.mesh) == (plain.primitive, plain.pretrain, plain.mesh)
+    assert blocks.tune == replace(plain.pretrain, rates=city.tune.rates) and blocks.partition == city.partition
+
+
+def test_the_released_code():
+    released = recipes()["citygs2-released"]
+    for stage, end in ((released.pretrain, 0.0025), (released.tune, 0.025)):
+        assert stage.signal.boost == 0 and set(stage.losses) - set(stage.signal.terms) == {"l1"}
+        assert stage.losses["depth"] == DepthRegression(start=0.5, end=end, error="ssim")
+    assert released.primitive.sh_degree == 2 and released.tune.densify.threshold == 3e-4
+    assert list(released.tune.prune[0].trims(958)) == list(range(1_000, 15_001, 500))
+    aerial, street = (recipes()[f"citygs2-released-{name}"] for name in ("aerial", "street"))
+    assert list(aerial.tune.prune[0].trims(5_621)) == list(range(1_000, 30_001, 500)) and not street.tune.prune
+    assert aerial.pretrain == released.pretrain and (aerial.tune.steps, street.tune.steps) == (60_000, 60_000)
+    assert {type(one.partition) for one in (released, aerial, street)} == {QuantileGrid}
+    assert (street.pretrain.losses["depth"].error, street.tune.losses["depth"].error) == ("l1", "ssim")
+
+
 def test_citygs2_for_streets():
     street, at = recipes()["citygs2-street"], {}
     for part in ("pretrain", "tune"):
@@ -111,4 +147,6 @@ def test_citygs2_for_streets():
         at[part] = [rates_of(stage, Surfel2D())["means"].at(step, stage.steps) for step in (0, stage.steps)]
         assert stage.densify.reset_every >= stage.densify.until  # never
     assert at == {"pretrain": pytest.approx([1.6e-5, 1.6e-6]), "tune": pytest.approx([8e-6, 8e-7])}
-    assert street.assign.least == 0.01 and street.partition.blocks == (5, 4) and street.tune.prune == ()
+    for stage in (street.pretrain, street.tune):
+        assert stage.losses["depth"].scale_band == (0.01, 50.0)
+    assert street.assign.threshold == 0.01 and street.partition.blocks == (5, 4) and street.tune.prune == ()

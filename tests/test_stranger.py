@@ -20,6 +20,7 @@ from surfkit.densify.base import Densify, Prune
 from surfkit.export.ply import read_splats
 from surfkit.losses.base import Loss
 from surfkit.mesh.base import Mesher
+from surfkit.primitives.base import Primitive
 from surfkit.run import stage
 from surfkit.testing import check
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -31,8 +32,9 @@ WORDS = {
     "charbonnier": "pretrain.losses.l1:charbonnier",
     "top-share": "pretrain.densify:top-share",
     "cards": "mesh:cards",
+    "balls": "primitive:balls",
 }
-KINDS = {"far": Prune, "charbonnier": Loss, "top-share": Densify, "cards": Mesher}
+KINDS = {"far": Prune, "charbonnier": Loss, "top-share": Densify, "cards": Mesher, "balls": Primitive}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -108,7 +110,8 @@ def test_the_parts_are_listed_with_where_they_come_from(capsys):
         assert line.split()[-1] == "acme-surfkit"
     assert main(["plugins"]) == 0
     assert re.search(
-        r"acme +acme-surfkit +1.2 +far, charbonnier, top-share, cards, table:acme", capsys.readouterr().out
+        r"acme +acme-surfkit +1.2 +far, charbonnier, top-share, cards, balls, recipe:acme, table:acme",
+        capsys.readouterr().out,
     )
 
 
@@ -163,12 +166,34 @@ def test_one_word_puts_a_part_in_the_place_of_another(train, tmp_path, name):
     assert (out / "mesh.json").exists() == (name == "cards")
 
 
-def test_an_ablation_table_of_them(data, tmp_path, capsys):
-    words = ["--data", str(data), "--steps", "4", "--out", str(tmp_path), "--rows", "1", "+ top share", "+ cards"]
-    assert main(["ablate", "table:acme", *words, "--max-points", "130"]) == 0
+def test_an_ablation_table_of_them_and_its_report(data, tmp_path, capsys):
+    words = ["--data", str(data), "--steps", "4", "--out", str(tmp_path), "--probe", "0"]
+    rows = ["+ top share", "+ cards", "recipe of Acme"]
+    assert main(["ablate", "table:acme", *words, "--rows", "1", *rows, "--max-points", "130"]) == 0
     printed = capsys.readouterr().out
-    assert "+ top share" in printed and "+ cards" in printed
-    assert json.loads((tmp_path / "ablation.json").read_text())
+    assert all(row in printed for row in rows)
+    assert main(["report", str(tmp_path)]) == 0
+    results, page = (tmp_path / "ablation.json").read_text(), (tmp_path / "report.html").read_text()
+    assert all(row in results and row in page for row in rows)
+
+
+def test_help_and_lists_show_them(capsys):
+    shown = {}
+    for words in (["train", "--help"], ["train", "recipe:2dgs", "--help"], ["recipes"], ["tables"], ["tables", "acme"]):
+        assert main(words) == 0
+        shown[" ".join(words)] = capsys.readouterr().out
+    assert "recipe:acme" in shown["train --help"] and "acme" in shown["recipes"] and "acme" in shown["tables"]
+    for word in ("primitive:balls", "pretrain.densify:top-share", "mesh:cards"):
+        assert word in shown["train recipe:2dgs --help"]
+    assert "recipe of Acme" in shown["tables acme"]
+
+
+def test_the_recipe_is_trained_by_its_name(data, tmp_path):
+    words = ["--data", str(data), "--out", str(tmp_path), "--steps", "4", "--pictures-every", "0"]
+    assert main(["train", "recipe:acme", *words]) == 0
+    assert recipe_of(tmp_path)["primitive"]["use"] == "balls"
+    assert recipe_of(tmp_path)["pretrain"]["prune"][0]["use"] == "far"
+    assert state_of(tmp_path).points.params["scales"].shape[1:] == (1,)
 
 
 def test_what_is_refused_is_one_line(train, tmp_path, capsys):

@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from matplotlib import font_manager  # noqa: F401 (makes its folders of settings and fonts now, while no case runs)
+
 from . import limits
 from .damage import NUMBERS, Damage, apply
 from .limits import Watch, damaged_output, giving_out, limited

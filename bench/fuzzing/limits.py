@@ -46,7 +46,8 @@ class Watch:
                 below = args[-1] if event in ("os.remove", "os.rmdir") and args[-1] >= 0 else None  # an open folder
                 base = "" if below is None else os.readlink(f"/proc/self/fd/{below}")
                 path = os.path.realpath(os.path.join(base, os.fsdecode(name)))
-                if not path.startswith(self.allowed) and "__pycache__" not in path and not path.startswith("/dev/"):
+                is_process = path.startswith(("/dev/", f"/proc/{os.getpid()}/"))  # such as the count of its memory
+                if not (path.startswith(self.allowed) or "__pycache__" in path or is_process):
                     self.found.append(f"{event} {path}")
 
 

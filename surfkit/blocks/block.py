@@ -10,8 +10,10 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.execute.state import BlockState, read_state, write_state
+from surfkit.losses.consensus import Consensus
 from surfkit.partition.plan import Block as PlannedBlock
 from surfkit.partition.plan import Plan
+from surfkit.recipe import Recipe
 from surfkit.run.folder import Run, RunStage
 
 
@@ -72,9 +74,17 @@ class Block:
 
     @property
     def is_done(self) -> bool:
-        """Whether it has all its steps, or has no views to be trained on."""
-        steps = self.run.recipe.tune.steps
-        return not self.planned.views or (self.state.status == "done" and self.state.step >= steps)
+        """Whether it has all the steps that it can take now, or has no views to be trained on."""
+        goal, state = self.goal, self.state
+        if goal < self.run.recipe.tune.steps:  # it waits for the others
+            return not self.planned.views or (state.status == "planned" and state.step == goal)
+        return not self.planned.views or (state.status == "done" and state.step >= goal)
+
+    @property
+    def goal(self) -> int:
+        """The step up to which it can be trained now: the last, or the end of the round that all blocks are in."""
+        rule, steps = consensus_of(self.run.recipe), self.run.recipe.tune.steps
+        return steps if rule is None else min(steps, (rounds_agreed(self.run) + 1) * rule.every)
 
     @property
     def is_out_of_memory(self) -> bool:
@@ -111,6 +121,21 @@ def read_plan(run: Run) -> Record:
 def plan_file(run: Run) -> Path:
     """Where the plan of a run is saved."""
     return run.blocks / "plan.json"
+
+
+def consensus_of(recipe: Recipe) -> Consensus | None:
+    """How the blocks of a recipe agree on common points; None if each is trained by itself."""
+    return next((term for term in recipe.tune.regularizers.values() if isinstance(term, Consensus)), None)
+
+
+def agreement_file(run: Run, number: int) -> Path:
+    """Where it is saved what blocks have agreed on at the end of a round, counted from 1."""
+    return run.blocks / "consensus" / f"{number:06}.safetensors"
+
+
+def rounds_agreed(run: Run) -> int:
+    """Rounds at whose end the blocks have agreed."""
+    return max((int(path.stem) for path in agreement_file(run, 0).parent.glob("[0-9]*.safetensors")), default=0)
 
 
 def load_blocks(run: Run, plan: Plan) -> list[Block]:

@@ -32,7 +32,7 @@ class BlockProgress:
 
     Attributes:
         states: Of each block with views, by number.
-        steps: Of each.
+        steps: Of each, up to the end of the round if blocks are tuned in rounds.
         at_once: How many run at a time.
     """
 
@@ -42,8 +42,9 @@ class BlockProgress:
 
     @property
     def done(self) -> int:
-        """Blocks that are done."""
-        return sum(state.status == "done" and state.step >= self.steps for state in self.states.values())
+        """Blocks that are done, or wait for the others at the end of a round."""
+        ended = ("done", "planned")
+        return sum(state.status in ended and state.step >= self.steps for state in self.states.values())
 
     def summary(self) -> str:
         """All blocks in one phrase: 3 of 20 blocks done, about 2:10:00 left."""

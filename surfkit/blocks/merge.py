@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from surfkit.blocks.block import Block
+from surfkit.blocks.block import Block, consensus_of
 from surfkit.blocks.oom_retry import reduction
+from surfkit.blocks.rounds import AgreedMerge, finished_piece
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
@@ -16,7 +17,8 @@ from surfkit.primitives.points import Columns, Points
 from surfkit.run.context import RunContext
 from surfkit.train import checkpoint, streaming
 from surfkit.train.look import fresh_looks
-from surfkit.train.stage import Stage, StageState
+from surfkit.train.stage import Stage
+from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored
 from surfkit.train.views import Order
 
@@ -28,26 +30,29 @@ def merge_blocks(ctx: RunContext, blocks: Sequence[Block], coarse: Stored) -> bo
     """
     recipe, path = ctx.run.recipe, ctx.run.merged.checkpoint
     skipped = frozenset(block.index for block in blocks if not block.planned.views)
-    results = {block.index: open_result(block) for block in blocks if block.index not in skipped}
+    results = {block.index: open_result(block, recipe.tune.steps) for block in blocks if block.index not in skipped}
     found = {index: result for index, result in results.items() if result is not None}
     if len(found) < len(results):
         return False
     trained = {index: finished(recipe.tune, result) for index, result in found.items()}
-    merge = Merge(blocks[0].plan.cells, finished(recipe.pretrain, coarse), trained, skipped)
+    merge: Merge | AgreedMerge = Merge(blocks[0].plan.cells, finished(recipe.pretrain, coarse), trained, skipped)
+    if consensus_of(recipe) is not None:
+        merge = AgreedMerge(blocks, coarse, found)
     shares = merge.shares()
     write_shares(blocks, shares)
     parts = [result.state for result in (coarse, *found.values())]
-    streaming.save(path, merged_state(ctx, parts, shares), merge.pieces())
+    state = merged_state(ctx, parts, shares)
+    if (other := ctx.run.partition) is not None and (decided := streaming.open_last(other.pretrain.checkpoint)):
+        state.seconds += decided[0].state.seconds
+        state.cpu_seconds += decided[0].state.cpu_seconds
+    streaming.save(path, state, merge.pieces())
     emit(FileWritten(path, "merged blocks"))
     return True
 
 
 def finished(stage: Stage, stored: Stored) -> Pieces:
     """The points of a state as they leave its stage."""
-    return lambda: (
-        {name: value for name, value in stage.finished(piece).items() if name in piece.points.params}
-        for piece in stored.pieces()
-    )
+    return lambda: (finished_piece(stage, piece) for piece in stored.pieces())
 
 
 def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[Share]) -> StageState:
@@ -88,9 +93,9 @@ def shared_mean(parts: Sequence[StageState], shares: Sequence[Share]) -> Columns
     }
 
 
-def open_result(block: Block) -> Stored | None:
-    """The result of a block; None, and the block planned again, if it is damaged or has not all its steps."""
-    path, steps = block.stage.checkpoint, block.stage.stage.steps
+def open_result(block: Block, steps: int) -> Stored | None:
+    """The state of a block after some steps; None, and the block planned again, if it is damaged or has not as many."""
+    path = block.stage.checkpoint
     try:
         found = streaming.open_last(path)
     except BadInput as error:

@@ -12,14 +12,15 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surfkit.blocks.block import Block, Record, load_blocks, plan_file, read_plan, started_folders, unfinished
 from surfkit.blocks.display import BlockDisplay, BlockProgress, read_state_since
 from surfkit.blocks.forecast import forecast, point_memory, report_forecast
-from surfkit.blocks.merge import merge_blocks
+from surfkit.blocks.merge import merge_blocks, open_result
 from surfkit.blocks.oom_retry import next_fallback
+from surfkit.blocks.rounds import end_round
 from surfkit.blocks.worker import BUSY, FULL, activate_coarse_model, open_coarse_model, train_block
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import write_json
@@ -33,13 +34,14 @@ from surfkit.partition.plan import Fewest, plan
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.readers.depth_prior import alignment
+from surfkit.readers.read import observations
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results
 from surfkit.run.notes import prefix_notes, repeat_warnings
 from surfkit.train import checkpoint
 from surfkit.train.faults import DiskFull
-from surfkit.train.material import needs_normals, needs_priors
-from surfkit.train.stage import StageState
+from surfkit.train.material import needs_normals, needs_priors, scale_band
+from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored
 
 ATTEMPTS = 3
@@ -75,12 +77,13 @@ class Unfinished(Fault):
     status = 3
 
 
-def tune_blocks(ctx: RunContext, compute: Compute) -> StageState:
+def tune_blocks(ctx: RunContext, compute: Compute, optimise_partition: Callable[[Run], None]) -> StageState:
     """The state of all blocks together; what is done already is not done again.
 
     Args:
         ctx: The run; the coarse model is in its folder.
         compute: What trains the blocks.
+        optimise_partition: Optimises the model that decides the partition, given its run, where the recipe has one.
 
     Raises:
         Unfinished: Blocks failed, also when they were tried again.
@@ -91,7 +94,8 @@ def tune_blocks(ctx: RunContext, compute: Compute) -> StageState:
         return state
     coarse = open_coarse_model(run)
     sweep(run.blocks, deep=False)  # in the folder of a block, only its worker may delete files
-    record = load_or_make_plan(ctx, coarse)
+    record = load_or_make_plan(ctx, coarse, optimise_partition)
+    ctx.keep("plan")
     if not unfinished(load_blocks(run, record.plan)) and (state := load_merged(run)):
         return state
     discard_results(run, run.merged)
@@ -102,10 +106,11 @@ def tune_blocks(ctx: RunContext, compute: Compute) -> StageState:
         for folder in started_folders(run):  # also of blocks that were trained by hand
             repeat_warnings(run.out, folder, f"block {int(folder.name)}: ")
         if merge_blocks(ctx, blocks, coarse):
+            ctx.keep("tune")
             return checkpoint.load(run.merged.checkpoint)
 
 
-def load_or_make_plan(ctx: RunContext, coarse: Stored) -> Record:
+def load_or_make_plan(ctx: RunContext, coarse: Stored, optimise_partition: Callable[[Run], None]) -> Record:
     """The plan in the folder, or a new one; blocks of another coarse model are renamed."""
     run, path = ctx.run, plan_file(ctx.run)
     if path.exists():
@@ -120,14 +125,21 @@ def load_or_make_plan(ctx: RunContext, coarse: Stored) -> Record:
         aside = rename_blocks(run)
         checkpoint.discard(run.merged.checkpoint)
         emit(Warned(f"the coarse model or the plan has changed: blocks are tuned anew; the ones before are in {aside}"))
+    if ctx.run.partition is not None:
+        optimise_partition(ctx.run.partition)
     return make_plan(ctx, coarse)
 
 
 def make_plan(ctx: RunContext, coarse: Stored) -> Record:
     """Plan the blocks, and write the plan and its picture."""
     recipe, path = ctx.run.recipe, plan_file(ctx.run)
-    model = activate_coarse_model(ctx, checkpoint.load(coarse.path))
-    record = Record(coarse.state.index, plan(model, recipe.partition, recipe.assign, Fewest(recipe.min_views)))
+    model = sight = activate_coarse_model(ctx, checkpoint.load(coarse.path))
+    if (other := ctx.run.partition) is not None:
+        sight = activate_coarse_model(replace(ctx, run=other), checkpoint.load(open_coarse_model(other).path))
+    if recipe.assign.needs_observations:
+        sight = replace(sight, observations=observations(ctx.run.data, ctx.scene))
+    made = plan(sight, recipe.partition, recipe.assign, Fewest(recipe.min_views), model)
+    record = Record(coarse.state.index, made)
     picture = ctx.run.blocks / "plan.png"
     plan_picture(picture, model, record.plan)
     emit(FileWritten(picture, "picture of the blocks"))
@@ -185,6 +197,11 @@ def train_all(ctx: RunContext, blocks: Sequence[Block], coarse: Stored, compute:
         report_forecast(ctx.run.out, forecast(waiting, coarse, memory))
     extract_views(ctx, blocks)
     train_waiting(ctx, waiting, compute, len(blocks))
+    while (goal := blocks[0].goal) < ctx.run.recipe.tune.steps:
+        results = {block: open_result(block, goal) for block in blocks if block.planned.views}
+        if None not in results.values():
+            end_round(blocks, list(results.values()))
+        train_waiting(ctx, unfinished(blocks), compute, len(blocks))
 
 
 def extract_views(ctx: RunContext, blocks: Sequence[Block]) -> None:
@@ -197,7 +214,7 @@ def extract_views(ctx: RunContext, blocks: Sequence[Block]) -> None:
     priors = None
     if missing and needs_priors(losses := ctx.run.recipe.tune.losses):
         with prefix_notes("blocks: "):  # warnings of the coarse stage are not repeated
-            priors = alignment(ctx.run.data, ctx.scene, needs_normals(losses))
+            priors = alignment(ctx.run.data, ctx.scene, needs_normals(losses), scale_band(losses))
     for block in missing:
         extract.save(block.views_file, extract.of(ctx.scene, block.planned.views, priors))
 
@@ -220,7 +237,8 @@ def train_waiting(ctx: RunContext, waiting: list[Block], compute: Compute, total
                 attempts[block.index] += 1
                 repeat_warnings(ctx.run.out, block.folder, f"block {block.index}: ")
                 if result.status == 0 and has_arrived(block):
-                    say(f"block {block.index} is done; {look().summary()}")
+                    what = "is done" if block.state.status == "done" else f"is at step {block.state.step:,}"
+                    say(f"block {block.index} {what}; {look().summary()}")
                     continue
                 reason = record_failure(block, result)
                 if result.status == FULL:
@@ -278,7 +296,7 @@ def watch_progress(ctx: RunContext, compute: Compute, blocks: Sequence[Block]) -
 
     def look() -> BlockProgress:
         states = {index: read_state_since(folder, since) for index, folder in folders.items()}
-        return BlockProgress(states, ctx.run.recipe.tune.steps, compute.workers.at_once or len(folders))
+        return BlockProgress(states, blocks[0].goal, compute.workers.at_once or len(folders))
 
     return look
 

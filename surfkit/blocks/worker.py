@@ -15,8 +15,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from surfkit.blocks.block import Block
+from surfkit.blocks.block import Block, consensus_of
 from surfkit.blocks.oom_retry import apply_fallback, take_fallback
+from surfkit.blocks.rounds import ID, stops, take_in
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import StageBegan, StepDone, say
 from surfkit.core.files import sweep
@@ -39,7 +40,7 @@ from surfkit.start.base import InitialModel
 from surfkit.train.faults import DiskFull, OutOfMemory, in_one_line
 from surfkit.train.material import read_ahead
 from surfkit.train.meter import Meter
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 from surfkit.train.streaming import Stored, open_last
 
 HEARTBEAT_S = 5.0
@@ -106,21 +107,27 @@ def take_steps(ctx: RunContext, block: Block) -> None:
         raise BadInput(
             f"{stage.checkpoint} has {there}, and the recipe --context {context}; delete {block.folder} to tune it anew"
         )
-    done = state.index if state else 0
+    done, goal = state.index if state else 0, block.goal
+    if goal < done:
+        raise BadInput(
+            f"{stage.checkpoint} is of step {done}, and what blocks agreed on after step {goal} is gone; delete "
+            f"{block.run.blocks} to tune all blocks anew"
+        )
     begun = {"attempts": block.state.attempts + 1, "first": done, "began": 0.0}
     block.write(status="running", step=done, steps=steps, error=None, kind=None, **begun)
-    if state is None or state.index < steps:
+    if done < goal:
         given = read_ahead(ctx.run.data, scene, stage.stage.losses, caches, part.priors)
         start, frozen = Start(ctx, block, scene.train), None
         if context == "frozen":
             start, frozen = replace(start, part="own"), replace(start, part="around")
         owns = None if context == "densified" else start.owns
-        intervals, meter = replace(ctx.intervals, pictures=0), Meter()
+        intervals, meter = replace(ctx.intervals, pictures=0), Meter.of_stage()
         job = StageJob(ctx.run, stage, scene, ctx.rasterizer, intervals, given, meter, start, frozen=frozen, owns=owns)
-        state = optimise(job, state)
+        for until in stops(block, done):
+            state = optimise(replace(job, until=until), take_in(block, state))
     else:
-        say(f"{stage.title} has all its {steps} steps already")
-    block.write(status="done", step=state.index, steps=steps)
+        say(f"{stage.title} has all its {goal} steps already")
+    block.write(status="done" if state.index >= steps else "planned", step=state.index, steps=steps)
 
 
 @dataclass(frozen=True)
@@ -137,13 +144,18 @@ class Start:
 
     def __call__(self, _: torch.Generator | None = None) -> InitialModel:
         """Their raw parameters, and the degree of spherical harmonics of the coarse model."""
-        coarse = open_coarse_model(self.ctx.run)
-        kept = [self.select(piece) for piece in coarse.pieces()]
+        coarse, kept, ids, begin = open_coarse_model(self.ctx.run), [], [], 0
+        for piece in coarse.pieces():
+            rows, params = self.select(piece)
+            kept.append({name: params[name][rows] for name in piece.points.params})
+            ids.append(rows.nonzero()[:, 0] + begin)
+            begin += len(rows)
         params = {name: torch.cat([part[name] for part in kept]) for name in kept[0]}
-        return InitialModel(params | coarse.state.points.shared, coarse.state.sh_degree)
+        stats = {} if consensus_of(self.ctx.run.recipe) is None else {ID: torch.cat(ids)}
+        return InitialModel(params | coarse.state.points.shared, coarse.state.sh_degree, stats)
 
-    def select(self, piece: StageState) -> Columns:
-        """Those among some points of the coarse model."""
+    def select(self, piece: StageState) -> tuple[Tensor, Columns]:
+        """(N,) bool, which of some points of the coarse model these are, and the parameters of these N points."""
         ctx = self.ctx
         params, model = ctx.run.recipe.pretrain.finished(piece), activate_coarse_model(ctx, piece)
         own = self.owns(params["means"])
@@ -151,7 +163,7 @@ class Start:
         for view in self.views if self.part != "own" else ():
             rows |= model.rasterizer.render(model.splats, view.camera, model.near, geometry=False).seen
         rows &= ~own if self.part == "around" else True
-        return {name: params[name][rows] for name in piece.points.params}
+        return rows, params
 
     def owns(self, means: Tensor) -> Tensor:
         """(N,) bool, which of (N, 3) positions the block owns."""
@@ -171,7 +183,8 @@ def activate_coarse_model(ctx: RunContext, coarse: StageState) -> CoarseModel:
     stage = ctx.run.recipe.pretrain
     splats = ctx.run.recipe.primitive.activate(stage.finished(coarse), coarse.sh_degree)
     draws = drawn_by(ctx.run.recipe.primitive, ctx.rasterizer)
-    return CoarseModel(splats.detached(), ctx.scene.train, draws, stage.near)
+    seed = ctx.run.recipe.seed
+    return CoarseModel(splats.detached(), ctx.scene.train, draws, stage.near, ctx.scene.frame, seed=seed)
 
 
 @contextmanager

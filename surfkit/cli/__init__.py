@@ -30,13 +30,16 @@ COMMANDS = {
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
+    "report": "Write a report of runs or of an ablation table as one HTML file.",
     "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "export": "Write the splats of a run or of a file in another format, for other programs.",
     "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
+    "tables": "List the ablation tables that `surfkit ablate` accepts, or the rows of one.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
     "components": "List the components that recipes are made of, by kind.",
     "plugins": "List the plugins: package, components, and the error if one does not load.",
+    "new": "Write the files of a new plugin, with a working part and its tests: `new plugin`.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
 MEMORY_ADVICE = {

@@ -73,7 +73,7 @@ class Doctor:
     """Folder of the run folders: free disk space is checked there."""
 
     device: Device = "auto"
-    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    """Device for training and rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:

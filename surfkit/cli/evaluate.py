@@ -84,7 +84,7 @@ class Evaluate:
     backbones to torch's cache (760 MB), a folder, or `none`. metrics.json says what was not measured and why."""
 
     device: Device = "auto"
-    """Device for rendering: auto, cpu, cuda, or a rasterizer by its name
+    """Device for rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
     def run(self) -> None:

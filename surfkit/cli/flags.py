@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin
 
 import tyro
 
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.slots import join, members, slots
+from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, kebab
 
 LIKENESS = 0.75
@@ -46,7 +47,7 @@ def owners(command: type, flag: str, argv: Sequence[str]) -> list[str]:
 
 def _flags_of(owner: Any, kind: type, path: str, argv: Sequence[str]) -> Iterator[str]:
     """The flags of all fields of a class; `owner` has their values: an instance, or the class for its defaults."""
-    hints = get_type_hints(kind, include_extras=True)
+    hints = hints_of(kind)
     for field in fields(kind):
         hint = hints[field.name]
         marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()

@@ -27,6 +27,7 @@ from surfkit.cli.flags import explain_flag, flags
 from surfkit.cli.help_text import one_paragraph_each
 from surfkit.cli.recipes import ARGV
 from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
+from surfkit.cli.tables import files_as_choices
 from surfkit.core.check import BadInput
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
         BadInput: One line about the words that do not fit, or about the values they give.
         SystemExit: After `--help` was printed.
     """
+    if hasattr(command, "default_table"):
+        argv = files_as_choices(argv)
     argv = flags_as_choices(command, [*argv, *_default(command, argv)])
     token = ARGV.set(tuple(argv))
 
@@ -90,11 +93,13 @@ def _refuse_nan(settings: T, at: str = "") -> T:
 
 
 def _default(command: type, argv: Sequence[str]) -> list[str]:
-    """The word for the recipe that a command takes when none is named, if it has one in `default_recipe`."""
-    name = getattr(command, "default_recipe", None)
-    if name is None or any(word.startswith("recipe:") for word in argv) or {"-h", "--help"} & set(argv):
-        return []
-    return [f"recipe:{name}"]
+    """The word for the recipe or the table that a command takes when none is named, if it has one in `default_recipe`
+    or in `default_table`."""
+    for whole in WHOLE:
+        name = getattr(command, f"default_{whole.rstrip(':')}", None)
+        if name is not None and not any(word.startswith(whole) for word in argv) and not {"-h", "--help"} & set(argv):
+            return [f"{whole}{name}"]
+    return []
 
 
 def _explained(event: ParseErrorEvent, command: type, argv: Sequence[str], prog: str) -> str | None:

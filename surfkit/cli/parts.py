@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, is_dataclass
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, get_args, get_origin
 
+from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, find
 from surfkit.core.tree import evolve
 
@@ -73,7 +74,7 @@ def _place(recipe: Any, slot: str) -> Place | None:
     *path, last = slot.split(".")
     node, hint, taken = recipe, Any, []
     for step in path:
-        if is_dataclass(node) and (field := step.replace("-", "_")) in (hints := _hints(node)):
+        if is_dataclass(node) and (field := step.replace("-", "_")) in (hints := hints_of(type(node))):
             node, hint, step = getattr(node, field), hints[field], field
         elif isinstance(node, tuple) and step.isdecimal() and int(step) < len(node):
             node, hint = node[int(step)], Any
@@ -90,10 +91,6 @@ def _place(recipe: Any, slot: str) -> Place | None:
     if isinstance(node, tuple) and last.isdecimal() and int(last) <= len(node):
         return Place(".".join(taken), node, int(last), base)
     return None
-
-
-def _hints(node: Any) -> dict[str, Any]:
-    return get_type_hints(type(node), include_extras=True)
 
 
 def _held(hint: Any) -> type[Component] | None:

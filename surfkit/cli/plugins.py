@@ -18,7 +18,12 @@ class Plugins:
     def run(self) -> None:
         """Print one line per plugin."""
         offers: dict[str, list[str]] = {}
-        prefixes = {"surfkit_components": "", "surfkit_recipes": "recipe:", "surfkit_tables": "table:"}
+        prefixes = {
+            "surfkit_components": "",
+            "surfkit_recipes": "recipe:",
+            "surfkit_tables": "table:",
+            "surfkit_rows": "rows of table:",
+        }
         for hook, prefix in prefixes.items():  # before `records`, which then knows what failed here
             for owner, name, _ in offered(hook):
                 offers.setdefault(owner, []).append(prefix + name)

@@ -56,7 +56,7 @@ class Depth:
     """How the data set is read."""
 
     device: Device = "auto"
-    """Device for the estimate: auto, cpu, cuda, or that of a rasterizer, by its name (`surfkit components
+    """Device for the estimate: auto, cpu, cuda, cuda:1, or that of a rasterizer, by its name (`surfkit components
     rasterizer`)."""
 
     def run(self) -> None:

@@ -112,6 +112,7 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("photographs", f"not measured: {lacking}"))
     if lacking := images.get("lpips_not_measured"):
         rows.append(("LPIPS", f"not measured: {lacking}"))
+    rows += before_rows(metrics)
     rows += zone_rows(images)
     rows += [
         *([] if metrics["points"] is None else [("points", f"{metrics['points']:,}")]),
@@ -124,6 +125,16 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
     if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
+    return rows
+
+
+def before_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What metrics.json says of the models before the refinements of a run."""
+    rows = []
+    for name, one in metrics.get("before", {}).items():
+        if one["psnr"] is not None:
+            found = f"PSNR {one['psnr']:.2f} dB, SSIM {one['ssim']:.3f}, {one['points']:,} points"
+            rows.append((f"before {name}", found))
     return rows
 
 

@@ -6,11 +6,12 @@ import difflib
 import types
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from surfkit.cli.parts import open_places, with_parts
 from surfkit.cli.recipes import chosen_name, chosen_recipe, recipes
 from surfkit.cli.tables import chosen_table, tables
+from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, kebab, unknown
 
 Slots = dict[str, tuple[str, ...]]
@@ -21,14 +22,14 @@ WHOLE = ("recipe:", "table:")
 def slots(command: type, argv: Sequence[str]) -> Slots:
     """The names that may follow each slot, by slot; of the recipe that `argv` chooses, if the command takes one."""
     found: Slots = {}
-    for name, hint in get_type_hints(command, include_extras=True).items():
+    for name, hint in hints_of(command).items():
         if get_origin(hint) is Annotated and chosen_recipe in get_args(hint):
             known = recipes(argv)
             found["recipe"] = tuple(known)
             if (chosen := known.get(chosen_name(argv))) is not None:
                 found |= open_places(chosen, argv) | _below(type(chosen), chosen, "")
         elif get_origin(hint) is Annotated and chosen_table in get_args(hint):
-            found["table"] = tuple(tables())
+            found["table"] = tuple(tables(argv))
         elif get_origin(hint) is Annotated and any(getattr(mark, "name", None) == "" for mark in get_args(hint)[1:]):
             found |= slots(get_args(hint)[0], argv)  # its settings are typed as if they were the command's own
         else:
@@ -84,8 +85,8 @@ def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
         hint = f"did you mean {near[0]!r}? " if near else ""
         return f"nothing to choose at {slot!r}; {hint}choices are made at {', '.join(known) or 'no place'}"
     if name not in known[slot]:
-        files = "; or name a file, recipe:FILE.json" if slot == "recipe" else ""
-        return unknown(slot, name, known[slot]) + files
+        files = {"recipe": "; or name a file, recipe:FILE.json", "table": "; or name a file, FILE.json or FILE.py"}
+        return unknown(slot, name, known[slot]) + files.get(slot, "")
     return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
 
 
@@ -101,7 +102,7 @@ def _below(hint: Any, value: Any, path: str) -> Slots:
     elif optional and (plain := [cls for cls in classes if is_dataclass(cls)]):
         found[path] = (kebab(plain[0].__name__), "none")
     if is_dataclass(value) and not isinstance(value, type):
-        hints = get_type_hints(type(value), include_extras=True)
+        hints = hints_of(type(value))
         for field in fields(value):
             found |= _below(hints[field.name], getattr(value, field.name), join(path, _flag(field.name)))
     elif isinstance(value, tuple) and (inner := [get_args(m)[0] for m in kinds if get_origin(m) is tuple]):

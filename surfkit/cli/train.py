@@ -67,7 +67,7 @@ class Train:
     """How the data set is read."""
 
     device: Device = "auto"
-    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    """Device for training and rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
     executor: Annotated[Executor, choice(Executor)] = Inline()

@@ -39,7 +39,7 @@ class Tune:
     """Number of the block, counted from 0."""
 
     device: Device = "auto"
-    """Device for training and rendering: auto, cpu, cuda, or a rasterizer by its name
+    """Device for training and rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
     cache: str = "auto"

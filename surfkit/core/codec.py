@@ -8,10 +8,11 @@ import types
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
+from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, components, find, name_of
 
 _JSON_NAMES = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
@@ -184,7 +185,7 @@ def _load_dataclass(cls: type, data: Any, at: str) -> Any:
     needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     if missing := [name for name in needed if name not in data]:
         raise BadInput(f"{_place(at)}{', '.join(missing)} missing; {cls.__name__} needs {', '.join(needed)}")
-    hints = get_type_hints(cls, include_extras=True)
+    hints = hints_of(cls)
     values = {key: load(hints[key], item, _join(at, key)) for key, item in data.items()}
     try:
         return cls(**values)

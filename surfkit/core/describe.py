@@ -7,8 +7,9 @@ import inspect
 import textwrap
 import types
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
+from surfkit.core.hints import hints_of
 from surfkit.core.registry import Component, name_of
 
 
@@ -39,7 +40,7 @@ def summary(cls: type) -> str:
 
 def settings(cls: type) -> list[Setting]:
     """The settings of a dataclass, in the order of its fields."""
-    hints = get_type_hints(cls, include_extras=True)
+    hints = hints_of(cls)
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         texts |= _field_docs(base)

@@ -42,7 +42,7 @@ class StepDone:
         steps: How many the stage has.
         losses: Weighted value of each loss, by its name in the recipe.
         points: After the step; 0 for a method without points.
-        peak_memory_bytes: Most memory held so far; 0 where the system does not tell.
+        peak_memory_bytes: Most memory held so far in the stage; 0 where that is not known.
     """
 
     index: int
@@ -138,7 +138,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class MemoryTaken:
-    """What the most memory that was held so far was taken by.
+    """What the most memory that was held so far in a run, or in a stage of it, was taken by.
 
     Attributes:
         parts: Bytes by part, and "peak" for all of them together.

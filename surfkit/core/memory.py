@@ -7,6 +7,7 @@ import errno
 import re
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 from surfkit.core.check import Fault
 
@@ -17,6 +18,9 @@ NO_MEMORY = (
 """Words of torch, Qhull, C++, threads and shared libraries, whose errors have no class of their own."""
 ASKED = re.compile(r"allocate ([\d.]+ ?\w+)")
 """How numpy and torch say what they wanted."""
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+"""What Linux tells of this process, and where it is asked to count its peak anew."""
+PEAK = re.compile(r"^VmHWM:\s*(\d+) kB", re.MULTILINE)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -39,8 +43,39 @@ def out_of_memory(error: BaseException | None = None) -> str:
     return f"out of memory{' with ' if parts else ''}{' and '.join(parts)}"
 
 
+_passed = 0
+"""The peak at the last `reset_peak_memory` that the system refused: up to there, none since then can be told."""
+
+
 def peak_memory_bytes() -> int:
-    """The most memory this process has held so far; 0 where the system does not tell (Windows)."""
+    """The most memory this process has held since the last `reset_peak_memory`; 0 where that is not known.
+
+    It is never known on Windows. Where the system cannot reset its count, it is known when more is held than ever
+    before.
+    """
+    peak = highest_memory_bytes()
+    return peak if peak > _passed else 0
+
+
+def reset_peak_memory() -> None:
+    """Let `peak_memory_bytes` count from what is held now; what was freed is handed back to the system before."""
+    global _passed
+    give_back()
+    try:
+        CLEAR.write_text("5", encoding="ascii")
+        _passed = 0
+    except OSError:
+        _passed = highest_memory_bytes()
+
+
+def highest_memory_bytes() -> int:
+    """The peak that the system has counted, of whatever was ever held in this process; 0 where it counts none.
+
+    The one that `getrusage` gives is at least what the parent process held when it started this one.
+    """
+    with suppress(OSError):
+        if found := PEAK.search(STATUS.read_text(encoding="ascii", errors="replace")):
+            return int(found[1]) * 1024
     try:
         import resource
     except ImportError:

@@ -55,6 +55,10 @@ class Hooks:
         """Return the ablation tables this package offers, by the name users type."""
 
     @hookspec
+    def surfkit_rows(self) -> Mapping[str, Any]:
+        """Return rows that this package adds to tables that are there, a sequence by the name of the table."""
+
+    @hookspec
     def surfkit_event(self, event: Any) -> None:
         """See one event of a run: a stage began, a step ended, a file was written."""
 
@@ -107,9 +111,9 @@ def records() -> tuple[Plugin, ...]:
     """What is known of every plugin: those in use, in the order of loading, then those that failed."""
     manager, known = _loaded()
     used = [
-        Plugin(name, origin.distribution, origin.version, tuple(_hooks_of(manager, plugin)))
+        Plugin(name, origin.distribution, origin.version, tuple(sorted(hook.name for hook in hooks)))
         for name, plugin in manager.list_name_plugin()
-        for origin in [known.get(name, Plugin(name, "", ""))]
+        for origin, hooks in [(known.get(name, Plugin(name, "", "")), manager.get_hookcallers(plugin) or ())]
     ]
     return (*used, *failures())
 
@@ -295,10 +299,15 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
         return
     if not (isinstance(value, type) and issubclass(value, Component)):
         raise BadInput(f"{name!r} is {value!r}, which is not a subclass of surfkit.Component")
-    if "__dataclass_params__" not in vars(value) or not value.__dataclass_params__.frozen:
-        raise BadInput(f"{_where(value)} must be a frozen dataclass to be offered as {name!r}")
-    if is_dataclass(value) and any(field.name == "use" for field in fields(value)):
-        raise BadInput(f"{_where(value)} has a setting named 'use', which saved recipes keep for the component's name")
+    _check_class(name, value)
+
+
+@cache  # all offers are checked again at each look-up, thousands of times in a table of runs
+def _check_class(name: str, cls: type[Component]) -> None:
+    if "__dataclass_params__" not in vars(cls) or not cls.__dataclass_params__.frozen:
+        raise BadInput(f"{_where(cls)} must be a frozen dataclass to be offered as {name!r}")
+    if is_dataclass(cls) and any(field.name == "use" for field in fields(cls)):
+        raise BadInput(f"{_where(cls)} has a setting named 'use', which saved recipes keep for the component's name")
 
 
 def _unused(name: str, records: Mapping[str, Plugin]) -> str:

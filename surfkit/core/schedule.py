@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import types
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from surfkit.core.check import BadInput
+from surfkit.core.hints import hints_of
 
 T = TypeVar("T")
 
@@ -78,7 +79,7 @@ def _rescale(hint: Any, value: Any, factor: float, like: Any) -> Any:
         scaled = max(rounded(value * factor), marker.lowest(value, factor))
         return like if isinstance(like, int) and _alike(marker, value, like, factor) else scaled
     if is_dataclass(value) and not isinstance(value, type):
-        hints = get_type_hints(type(value), include_extras=True)
+        hints = hints_of(type(value))
         old = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
         new = {name: _rescale(hints[name], item, factor, getattr(like, name, None)) for name, item in old.items()}
         try:

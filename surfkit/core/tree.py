@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -19,6 +20,24 @@ def evolve(node: T, path: str, value: Any) -> T:
         value: What to put there.
     """
     return _evolve(node, path.split("."), 0, value)
+
+
+def differences(before: Any, after: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted paths and new values of what differs between plain data of two recipes, as deep inside as it can be named.
+
+    A part of another kind, a list of another length and a new key are named as a whole; None stands for a key that is
+    gone.
+    """
+    if isinstance(before, dict) and isinstance(after, dict) and before.get("use") == after.get("use"):
+        pairs = [(key, before.get(key), after.get(key)) for key in {**before, **after}]
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        pairs = [(str(at), *pair) for at, pair in enumerate(zip(before, after, strict=True))]
+    else:
+        pairs = []
+        if before != after:
+            yield path, after
+    for key, old, new in pairs:
+        yield from differences(old, new, f"{path}.{key}" if path else key)
 
 
 def _evolve(node: Any, path: list[str], depth: int, value: Any) -> Any:

@@ -6,6 +6,7 @@ from surfkit.core.registry import Component, hookimpl
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap, Elongation
 from surfkit.densify.limited import Limited
+from surfkit.densify.matched import MatchedADC
 from surfkit.densify.prune import Faint, Importance
 from surfkit.densify.signal import AbsGradient, LossGradient
 from surfkit.densify.trim import Trim
@@ -16,6 +17,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     """Policies, filters and signals, by name."""
     return {
         "adc": ADC,
+        "matched-adc": MatchedADC,
         "limited": Limited,
         "elongation": Elongation,
         "count-cap": CountCap,

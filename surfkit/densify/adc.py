@@ -17,7 +17,7 @@ from surfkit.primitives.base import SHRINK
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
 
-GRAD, SEEN, SIZE = "adc/grad", "adc/seen", "adc/size"
+GRAD, SEEN, SIZE, SIGNED = "adc/grad", "adc/seen", "adc/size", "adc/signed"
 START_STRETCH, EVERY_STRETCH = 15.0, 30.0
 """How much longer than their share of a short run its first steps without an edit and its pauses between edits may be.
 Of the default `until`, 15,000, 500 times 15 are a half, and 100 times 30 a fifth: two edits. On examples/boruszyn at
@@ -32,6 +32,10 @@ class ADC(Densify):
 
     threshold: float = 2e-4
     """Mean length of the gradient above which a point is densified, in units of half the image size."""
+
+    split_threshold: float | None = None
+    """If set, large points are split where the mean of the signal, which must be abs-gradient, is above this, and small
+    ones cloned where that of the signed gradient of all losses is above `threshold` (AbsGS: 4e-4 and 2e-4)."""
 
     small: float = 0.01
     """Largest scale that is cloned rather than split, as a share of the scene extent."""
@@ -73,6 +77,8 @@ class ADC(Densify):
         for name in ("every", "reset_every"):
             if getattr(self, name) < 1:
                 raise BadInput(f"densify.{name} is {getattr(self, name)}; it must be 1 or more steps")
+        if self.split_threshold is not None and not 0 < self.split_threshold < float("inf"):
+            raise BadInput(f"densify.split_threshold is {self.split_threshold}; it must be above 0, or unset")
         if not 0 < self.reset_opacity < 1:
             raise BadInput(f"densify.reset_opacity is {self.reset_opacity}; it must lie between 0 and 1")
 
@@ -80,23 +86,29 @@ class ADC(Densify):
         """Sum the signal and count the views, from one edit to the next."""
         if step.index >= self.until:
             return
-        columns = [points.stat(GRAD), points.stat(SEEN)] + [points.stat(SIZE)] * (self.cull_screen > 0)
-        if self._due(step.index - 1):
-            for column in columns:
+        names = [GRAD, SEEN] + [SIZE] * (self.cull_screen > 0) + [SIGNED] * self.needs_absolute
+        columns = {name: points.stat(name) for name in names}
+        if self.is_due(step.index - 1):
+            for column in columns.values():
                 column.zero_()
-        columns[0].add_(step.grad_norm)
-        columns[1].add_(step.seen)
+        columns[GRAD].add_(step.grad_norm)
+        columns[SEEN].add_(step.seen)
         if self.cull_screen > 0:
-            torch.maximum(columns[2], step.radii / step.image_px, out=columns[2])
+            torch.maximum(columns[SIZE], step.radii / step.image_px, out=columns[SIZE])
+        if self.needs_absolute:
+            columns[SIGNED].add_(step.signed_norm)
 
     def edit(self, points: Points, step: Step) -> Edit | None:
         """Clone, split and drop every so often; reset opacities less often."""
-        reset = step.index % self.reset_every == 0 and step.index < self.until
-        cap = self.reset_opacity if reset else None
-        if not self._due(step.index):
-            return Edit(max_opacity=cap) if reset else None
+        if not self.is_due(step.index):
+            cap = self._cap(step.index)
+            return None if cap is None else Edit(max_opacity=cap)
+        return self.edit_of(points, step, self._hot(points, step))
+
+    def edit_of(self, points: Points, step: Step, hot: Tensor) -> Edit:
+        """The edit of a step that is due, for densifiers with another rule: (N,) bool `hot` are densified."""
         size = step.splats.scales.amax(-1)
-        hot, small = self._hot(points, step), size <= self.small
+        small = size <= self.small
         clone, split = hot & small, hot & ~small
         drop = step.splats.opacities < self.cull_opacity
         if step.index > self.reset_every:
@@ -105,11 +117,16 @@ class ADC(Densify):
                 drop |= torch.where(split, size / SHRINK, size) > self.cull_scale
             if self.cull_screen > 0:
                 drop |= points.stat(SIZE) > self.cull_screen
-        return Edit(drop, clone, split, cap)
+        return Edit(drop, clone, split, self._cap(step.index))
 
     def edits(self, steps: int) -> range:
         """See `Densify.edits`."""
         return range((self.start // self.every + 1) * self.every, min(self.until, steps + 1), self.every)
+
+    @property
+    def needs_absolute(self) -> bool:
+        """See `Densify.needs_absolute`."""
+        return self.split_threshold is not None
 
     @property
     def most_points(self) -> int | None:
@@ -121,10 +138,20 @@ class ADC(Densify):
         """See `Densify.limited`; the points with the largest gradient come first."""
         return replace(self, filters=(*self.filters, CountCap(points)))
 
-    def _due(self, index: int) -> bool:
+    def is_due(self, index: int) -> bool:
+        """Whether points are added and dropped after step `index`."""
         return self.start < index < self.until and index % self.every == 0
+
+    def _cap(self, index: int) -> float | None:
+        """Where step `index` resets opacities, the highest one after that."""
+        return self.reset_opacity if index % self.reset_every == 0 and index < self.until else None
 
     def _hot(self, points: Points, step: Step) -> Tensor:
         """(N,) bool, points to be densified."""
-        mean = points.stat(GRAD) / points.stat(SEEN).clamp_min(1)
-        return admitted(self.filters, step, mean * (mean >= self.threshold))
+        seen = points.stat(SEEN).clamp_min(1)
+        mean, least = points.stat(GRAD) / seen, self.threshold
+        if self.split_threshold is not None:  # in multiples of the threshold, so that both kinds can be compared
+            small = step.splats.scales.amax(-1) <= self.small
+            mean = torch.where(small, points.stat(SIGNED) / seen / self.threshold, mean / self.split_threshold)
+            least = 1.0
+        return admitted(self.filters, step, mean * (mean >= least))

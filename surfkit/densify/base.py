@@ -13,7 +13,7 @@ from torch import Tensor
 from surfkit.core.registry import Component, find
 from surfkit.primitives.edit import Edit
 from surfkit.primitives.points import Points
-from surfkit.raster.api import Splats
+from surfkit.raster.api import Derived, Splats
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,10 @@ class Step:
         rates: Learning rates of this step by parameter, local units.
         seed: Differs from step to step and from run to run; for policies that draw.
         owns: (N, 3) positions to (N,) bool, whether points there are this block's own; None where all are.
+        signed_norm: (N,) length of the signed gradient of all losses, whatever the densification signal is; 0 where not
+            seen. The trainer always gives it.
+        derived: What was drawn in place of the points, with its `grad_norm`, for a primitive that draws splats made of
+            them (`DerivedRender`); None for others.
     """
 
     index: int
@@ -78,11 +82,15 @@ class Step:
     rates: Mapping[str, float] = field(default_factory=dict)
     seed: int = 0
     owns: Callable[[Tensor], Tensor] | None = None
+    signed_norm: Tensor | None = None
+    derived: Derived | None = None
 
     def may_be_densified(self) -> Tensor:
         """(N,) bool, the points that stand where this block owns them now; a trainer copies and splits no others."""
         means = self.splats.means
-        return torch.ones(len(means), dtype=torch.bool) if self.owns is None else self.owns(means)
+        if self.owns is None:
+            return torch.ones_like(means[:, 0], dtype=torch.bool)
+        return self.owns(means.cpu()).to(means.device)
 
 
 class Policy(Component):
@@ -105,6 +113,11 @@ class Densify(Policy):
         Where there are none, a note says so before the run.
         """
         return None
+
+    @property
+    def needs_absolute(self) -> bool:
+        """Whether it only works with a signal of absolute pixel gradients (`Signal.absolute`); others are refused."""
+        return False
 
     @property
     def most_points(self) -> int | None:

@@ -42,11 +42,15 @@ class Limited(Densify):
     def edit(self, points: Points, step: Step) -> Edit | None:
         """The edit of the inner densifier, without the clones and splits that there is no room for."""
         edit = self.inner.edit(points, step)
-        if edit is None or (edit.clone is None and edit.split is None):
+        if edit is None or (edit.clone is None and edit.split is None and edit.new is None):
             return edit
         dropped = torch.zeros_like(step.seen) if edit.drop is None else edit.drop
-        added = sum(mask.to(torch.int64) for mask in (edit.clone, edit.split) if mask is not None)
-        added = added * (step.may_be_densified() & ~dropped)  # a trainer leaves out the others
+        added = torch.zeros_like(dropped, dtype=torch.int64)
+        for mask in (edit.clone, edit.split):
+            added += 0 if mask is None else mask * ~dropped
+        if edit.new is not None:
+            added += torch.bincount(edit.new.parent, minlength=len(points))
+        added *= step.may_be_densified()  # a trainer leaves out the others
         room = max(0, self.points - int((~dropped).sum()))
         if int(added.sum()) <= room:
             return edit
@@ -58,6 +62,11 @@ class Limited(Densify):
     def edits(self, steps: int) -> Sequence[int] | None:
         """See `Densify.edits`."""
         return self.inner.edits(steps)
+
+    @property
+    def needs_absolute(self) -> bool:
+        """See `Densify.needs_absolute`."""
+        return self.inner.needs_absolute
 
     @property
     def most_points(self) -> int:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
+import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
@@ -18,7 +20,10 @@ from surfkit.raster.api import Splats
 
 @dataclass(frozen=True)
 class Importance(Prune):
-    """Drop the points of least importance: opacity times pixels hit, times a power of the volume (LightGaussian)."""
+    """Drop the points of least importance (LightGaussian, Fan et al. 2023).
+
+    Importance is opacity, times how much the pixels show that a point hits, times a power of the volume.
+    """
 
     at: tuple[Steps, ...] = (15_000,)
     """Steps after which to prune; 0 is at once, after the first."""
@@ -27,7 +32,13 @@ class Importance(Prune):
     """Share of the points that is dropped."""
 
     power: float = 0.1
-    """Of the volume, or of a surfel's area, over that at the 90th percentile from the top."""
+    """Of the normalised volume, or of a surfel's area; beta in the paper."""
+
+    score: Literal["hits", "significance"] = "hits"
+    """What opacity and volume are multiplied by: the number of pixels hit, the volume over that at the 90th percentile
+    from the top, as in the released code; or the sum over these pixels of the transmittance in front of the point, the
+    volume over that at the 90th percentile from the bottom and at most 1, so that huge points gain nothing, as in the
+    paper (global significance)."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ratio < 1:
@@ -37,7 +48,8 @@ class Importance(Prune):
         """Drop the least important at the given steps."""
         if step.index not in self.at and not (step.index == 1 and 0 in self.at):
             return None
-        return Edit(drop=lowest(importance(step.views, step.splats, self.power), self.ratio))
+        measure = significance if self.score == "significance" else importance
+        return Edit(drop=lowest(measure(step.views, step.splats, self.power), self.ratio))
 
 
 def importance(views: Views, splats: Splats, power: float) -> Tensor:
@@ -46,6 +58,17 @@ def importance(views: Views, splats: Splats, power: float) -> Tensor:
     volume = splats.scales.prod(-1)
     large = volume.sort(descending=True).values[int(0.9 * len(volume))]
     return hits * splats.opacities * (volume / large) ** power
+
+
+def significance(views: Views, splats: Splats, power: float) -> Tensor:
+    """(N,) sum over views and pixels of opacity x transmittance, times min(V / V90, 1)^power.
+
+    V90 is the volume that 90 % of the points do not exceed.
+    """
+    shown = functools.reduce(torch.add, (amount for amount, _ in views.each(0.0, 1.0)))
+    volume = splats.scales.prod(-1)
+    large = volume.sort().values[int(0.9 * len(volume))]
+    return shown * splats.opacities * (volume / large).clamp_max(1) ** power
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,8 @@ class LossGradient(Signal):
 class AbsGradient(Signal):
     """Sizes of the pixels' shares of the screen-space gradient, which do not cancel out as signs do (AbsGS).
 
-    Larger than the gradient itself: double the threshold of densification or more (AbsGS splits at 4e-4).
+    Larger than the gradient itself: double the threshold of densification or more. AbsGS splits by it at 4e-4, and
+    clones by the signed gradient at 2e-4: `adc.split_threshold`.
     """
 
     absolute: ClassVar[bool] = True

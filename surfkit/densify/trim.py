@@ -42,9 +42,13 @@ class Trim(Prune):
     """Last step that may trim."""
 
     every: Annotated[int, StepCount(floor=500)] = 500
-    """Fewest steps between trims, rounded up to whole epochs, from the first end of an epoch after `start`. Short runs
-    keep at least 500: as in long ones, five times the steps between edits of `adc`, as what these add must learn before
-    it is judged."""
+    """Fewest steps between trims, rounded up to whole epochs unless `whole_epochs` is off, from the first end of an
+    epoch after `start`. Short runs keep at least 500: as in long ones, five times the steps between edits of `adc`, as
+    what these add must learn before it is judged."""
+
+    whole_epochs: bool = True
+    """Trim at ends of epochs only, when all views have taught alike; otherwise at `start` and then at every `every`
+    steps, as in the released code."""
 
     recovery: Annotated[int, StepCount(floor=100)] = 500
     """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100."""
@@ -67,7 +71,8 @@ class Trim(Prune):
 
     def trims(self, views: int) -> range:
         """The steps that trim where so many views are an epoch, unless opacities have just been reset."""
-        first, period = (-(-steps // views) * views for steps in (max(self.start, 1), self.every))
+        unit = views if self.whole_epochs else 1
+        first, period = (-(-steps // unit) * unit for steps in (max(self.start, 1), self.every))
         return range(first, self.until + 1, period)
 
     def _scores(self, views: Views) -> Tensor:

@@ -38,7 +38,8 @@ from surfkit.scene.scene import Scene, View
 from surfkit.scene.vectors import unit
 from surfkit.train import checkpoint
 from surfkit.train.material import needs_normals
-from surfkit.train.stage import Stage, StageState, Trainer
+from surfkit.train.stage import Stage, Trainer
+from surfkit.train.state import StageState
 
 WARM = 2
 """Steps of each part before the clock counts: caches are cold and memory is new."""

@@ -1,4 +1,4 @@
-"""How blocks are trained: one after the other in this process, or in several processes at a time."""
+"""How jobs (blocks of a run, rows of a table) are run: one after the other in this process, or several at a time."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from surfkit.execute.state import Kind
 from surfkit.scene.memory import free_bytes, oom_kills
 
 LOG = "log.txt"
-"""Output of a worker process, in the folder of its block."""
+"""Output of a worker process, in the folder of its job."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """The work on one block.
+    """The work on one block of a run, or on one row of a table.
 
     Attributes:
-        index: Number of the block.
-        folder: Of the block.
+        index: Its number.
+        folder: Of the block, or of the run of the row.
         call: Runs the job in this process and returns the exit status.
         command: Arguments of `python` that run the job in a process of its own.
         cost: Expected work, in any unit.
@@ -96,7 +96,7 @@ class Executor(Component):
 
 @dataclass(frozen=True)
 class Inline(Executor):
-    """One block after the other, in this process."""
+    """One block or row after the other, in this process."""
 
     @property
     def in_process(self) -> bool:
@@ -122,7 +122,7 @@ class Inline(Executor):
 
 @dataclass(frozen=True)
 class Pool(Executor):
-    """Several blocks at a time on this machine, each in a process of its own; the largest first."""
+    """Several blocks or rows at a time on this machine, each in a process of its own; the largest first."""
 
     workers: int = 2
     """Processes at a time."""
@@ -134,9 +134,13 @@ class Pool(Executor):
     """No further block is started if the expected memory of all running blocks would exceed this share of the memory
     that was free."""
 
+    gpus: int = 0
+    """GPUs, from the first on, of which each process gets the one that the fewest use; 0 leaves them to --device."""
+
     def __post_init__(self) -> None:
-        if self.workers < 1 or self.threads < 0:
-            raise BadInput(f"pool.workers {self.workers}, threads {self.threads}: give 1 or more, 0 or more")
+        if self.workers < 1 or self.threads < 0 or self.gpus < 0:
+            given = f"pool.workers {self.workers}, threads {self.threads}, gpus {self.gpus}"
+            raise BadInput(f"{given}: give 1 or more, 0 or more, 0 or more")
         if not 0 < self.memory_share <= 1:
             raise BadInput(f"pool.memory_share is {self.memory_share}; it must lie in 0 to 1")
 
@@ -146,12 +150,18 @@ class Pool(Executor):
         return self.workers
 
     def ready(self) -> None:
-        """See `Executor.ready`; nothing to check."""
+        """See `Executor.ready`."""
+        if not self.gpus:
+            return
+        import torch
+
+        if (count := torch.cuda.device_count()) < self.gpus:
+            raise BadInput(f"pool.gpus is {self.gpus}, and torch finds {count} GPUs here; give 0 to {count}")
 
     def run(self, jobs: Sequence[Job]) -> Iterator[JobResult]:
         """See `Executor.run`."""
         waiting = sort_by_cost(jobs)
-        workers = Workers(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers))
+        workers = Workers(self.threads or max(1, len(os.sched_getaffinity(0)) // self.workers), self.gpus)
         room = self.memory_share * free_bytes()
         with terminable():
             try:
@@ -167,6 +177,12 @@ class Pool(Executor):
                     time.sleep(POLL_S)
             finally:
                 workers.stop()
+
+
+def _seen_gpus(count: int) -> list[str]:
+    """Names of the first GPUs that this process may use, as CUDA_VISIBLE_DEVICES has them."""
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return [str(at) for at in range(count)] if given is None else given.split(",")[:count]
 
 
 def sort_by_cost(jobs: Sequence[Job]) -> list[Job]:
@@ -192,6 +208,8 @@ class Workers:
     """Worker processes and the job of each."""
 
     threads: int
+    gpus: int = 0
+    uses: dict[subprocess.Popen[bytes], int] = field(default_factory=dict)
     busy: dict[subprocess.Popen[bytes], Job] = field(default_factory=dict)
     kills: int = field(default_factory=lambda: oom_kills())
 
@@ -204,6 +222,10 @@ class Workers:
         """Start a process; it does not receive Ctrl-C, but SIGTERM from `stop`."""
         job.folder.mkdir(parents=True, exist_ok=True)
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+        used = [self.uses[process] for process in self.busy if process in self.uses]
+        gpu = min(range(self.gpus), key=used.count, default=None)
+        if gpu is not None:
+            limits["CUDA_VISIBLE_DEVICES"] = _seen_gpus(self.gpus)[gpu]
         with open(job.folder / LOG, "ab") as log:
             process = subprocess.Popen(
                 [sys.executable, *job.command],
@@ -214,6 +236,8 @@ class Workers:
                 start_new_session=True,
             )
         self.busy[process] = job
+        if gpu is not None:
+            self.uses[process] = gpu
 
     def ended(self) -> list[JobResult]:
         """The results of the jobs that have ended since the last call."""

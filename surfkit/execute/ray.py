@@ -18,6 +18,7 @@ from surfkit.execute.shared import mark_folder, remote_job
 from surfkit.execute.state import Kind
 
 REACH_S = 10.0
+AGAIN_S = 2.0
 STORE_BYTES = 100 << 20
 """Size of Ray's object store on this machine, which is hardly used."""
 
@@ -79,10 +80,7 @@ class Ray(Executor):
                     for ref in ray.wait(list(under_way), timeout=POLL_S)[0]:
                         yield _ended(ray, ref, under_way.pop(ref))
             finally:
-                for ref in under_way:
-                    ray.cancel(ref)
-                if under_way:  # they save their states
-                    ray.wait(list(under_way), num_returns=len(under_way))
+                _cancel(ray, list(under_way))
 
     def share(self, nodes: Sequence[dict[str, float]], jobs: Sequence[Job]) -> dict[str, float]:
         """Resources of each block, as Ray names them: the same for all, so that Ray keeps their order.
@@ -119,6 +117,17 @@ class Ray(Executor):
             most += [node.get("memory", 0) // memory] if memory else []
             room += int(min(most))
         return int(sum(node.get("CPU", 0) for node in nodes) // max(1, min(jobs, room)))
+
+
+def _cancel(ray: ModuleType, left: list[Any]) -> None:
+    """Stop tasks and wait until they have saved their states.
+
+    Asked again and again: a task that is asked in the moment it begins may not notice.
+    """
+    while left:
+        for ref in left:
+            ray.cancel(ref)
+        left = ray.wait(left, num_returns=len(left), timeout=AGAIN_S)[1]
 
 
 def _imported() -> ModuleType:

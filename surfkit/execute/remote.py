@@ -108,12 +108,15 @@ class RemoteJob:
         host, kills = socket.gethostname(), oom_kills()
         if missing := self.missing():
             return Outcome(2, host, f"machine {host}: {missing}", "data")
-        try:
+        with interrupts_noted() as came:
             self.begin()
-            while self.process.poll() is None:
-                time.sleep(POLL_S)
-        finally:
-            self.stop()
+            try:
+                while self.process.poll() is None and not came:
+                    time.sleep(POLL_S)
+            finally:
+                self.stop()
+        if came:
+            raise KeyboardInterrupt
         if self.process.returncode == INTERRUPTED:
             time.sleep(self.hold_s)
         killed = self.process.returncode == -signal.SIGKILL and oom_kills() > kills
@@ -133,7 +136,7 @@ class RemoteJob:
     def begin(self) -> None:
         """Start the process."""
         limits = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
-        with open(self.log, "ab") as log, interrupts_wait():
+        with open(self.log, "ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-IS", "-c", WATCHDOG, *self.words],
                 env={**os.environ, **self.variables, **limits, DRIVER: str(os.getpid())},
@@ -160,29 +163,24 @@ class RemoteJob:
 
 
 @contextmanager
-def interrupts_wait() -> Iterator[None]:
-    """Within, Ctrl-C waits until the end: a process that has just begun must be known to whoever stops it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def interrupts_noted() -> Iterator[list[int]]:
+    """Within, Ctrl-C only adds to the list that is given: it may come twice, and before the process is known."""
     came: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
     before = signal.signal(signal.SIGINT, lambda *_: came.append(1))
     try:
-        yield
+        yield came
     finally:
         signal.signal(signal.SIGINT, before)
-    if came:
-        raise KeyboardInterrupt
 
 
 def run_remote_job(remote_job: RemoteJob) -> Outcome:
     """Run a remote job; a function, as Ray needs one.
 
-    Ray cancels by a simulated Ctrl-C. Processes that a shell starts in the background ignore Ctrl-C, and the driver
-    would then wait for ever.
+    Ray cancels by a simulated Ctrl-C, which `RemoteJob` sees even where the shell that started Ray ignores it.
     """
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     return remote_job()
 
 

@@ -1,6 +1,7 @@
 """Loss terms, by the name users type."""
 
 from surfkit.core.registry import hookimpl
+from surfkit.losses.consensus import Consensus
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.normal_prior import NormalPrior
 from surfkit.losses.photometric import L1, SSIM
@@ -23,4 +24,5 @@ def surfkit_components():
         "warped-patches": WarpedPatches,
         "mean-opacity": MeanOpacity,
         "mean-scale": MeanScale,
+        "consensus": Consensus,
     }

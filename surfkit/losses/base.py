@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Splats
 from surfkit.readers.depth_prior import DepthPrior
+from surfkit.scene.align import SCALE_BAND
 from surfkit.scene.scene import View
 
 
@@ -78,7 +80,8 @@ class Loss(Component):
 
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
     priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
-    may still be without one, and a data set without normals. A second view is only chosen and rendered in steps in
+    may still be without one, and a data set without normals. `scale_band` says which of them are aligned well enough:
+    the lowest and highest multiple of the median scale of all. A second view is only chosen and rendered in steps in
     which a term with a weight has `needs_neighbour`, once for all of them.
     """
 
@@ -86,6 +89,7 @@ class Loss(Component):
     needs_prior: ClassVar[bool] = False
     needs_neighbour: ClassVar[bool] = False
     needs_normals: ClassVar[bool] = False
+    scale_band: tuple[float, float] = SCALE_BAND
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:
@@ -96,8 +100,39 @@ class Loss(Component):
         """The unweighted loss, a scalar that is differentiable in the maps."""
 
 
+@dataclass(frozen=True)
+class RegularizerInput:
+    """What a term on the points may know of a step beside the splats.
+
+    Attributes:
+        index: The step, 1 to `steps`.
+        steps: Of the stage.
+        target: The view of the step, its mask, and the seed of random draws.
+        maps: What was rendered of that view; constant.
+        seen: (N,) bool, the splat may touch a pixel of that view.
+        stat: The column (N,) of this name that is kept with the points, zeros at first and for new points. A term may
+            write to columns of its own: they follow the points through edits and are saved with them. Further sizes
+            make a column (N, ...).
+        params: Raw parameters, each (N, ...), and the shared ones; a term may be differentiable in them, too.
+    """
+
+    index: int
+    steps: int
+    target: Target
+    maps: Maps
+    seen: Tensor
+    stat: Callable[..., Tensor]
+    params: Mapping[str, Tensor] = field(default_factory=dict)
+
+
 class Regularizer(Component):
-    """A loss term on the points alone, not on what is rendered."""
+    """A loss term on the points alone, not on what is rendered.
+
+    One with `only_seen` is given the splats that may touch a pixel of the step's view, and not the others; there may be
+    none.
+    """
+
+    only_seen: ClassVar[bool] = False
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:
@@ -106,3 +141,14 @@ class Regularizer(Component):
     @abstractmethod
     def __call__(self, splats: Splats) -> Tensor:
         """The unweighted term, a scalar that is differentiable in the splats' tensors."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Maps of the step's view that `in_step` looks at; only these are sure to be rendered."""
+        return ()
+
+    def in_step(self, splats: Splats, given: RegularizerInput) -> Tensor:
+        """The unweighted term in a step of a stage, for terms that draw at random, look at the view, or remember
+        something from step to step; by default that of the splats alone, or of those that are seen.
+        """
+        return self(splats.take(given.seen) if self.only_seen else splats)

@@ -13,6 +13,7 @@ from surfkit.core.schedule import log_linear
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.ssim import ssim_map
+from surfkit.scene.align import SCALE_BAND
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,18 @@ class DepthRegression(Loss):
     """Which rendered depth is compared: that of the splat where a ray becomes half opaque, or the mean along the ray,
     from which all its splats learn."""
 
+    scale_band: tuple[float, float] = SCALE_BAND
+    """Depth priors that are known up to their scale are not used where it is below or above these multiples of the
+    median over all photographs; the released code of CityGaussianV2 has 0.01 and 50 for streets."""
+
     def __post_init__(self) -> None:
         if not (self.start > 0 and self.end > 0):
             raise BadInput(f"the depth loss has start {self.start:g} and end {self.end:g}; both must be above 0")
+        if not 0 < self.scale_band[0] <= 1 <= self.scale_band[1] < float("inf"):
+            raise BadInput(
+                f"the depth loss has scale_band {self.scale_band[0]:g} {self.scale_band[1]:g}; give a multiple above 0 "
+                "and at most 1, and one of at least 1"
+            )
 
     @property
     def reads(self) -> tuple[str, ...]:

@@ -41,9 +41,9 @@ class Reprojection(TwoViews, Loss):
             return 0 * depth.sum()
         height, width = depth.shape
         camera = target.view.camera
-        y, x = spread((height, width), self.stride, target.seed)
+        y, x = spread((height, width), self.stride, target.seed, depth.device)
         at = y * width + x
-        rays = camera.rays(depth.dtype).flatten(1)[:, at]
+        rays = camera.rays(depth.dtype, depth.device).flatten(1)[:, at]
         error, valid = round_trip(depth.flatten()[at], rays, camera, Opposite.of(neighbour, self.depth))
         weight, counts = agreement(error, valid, self.limit)
         return (weight * error).sum() / counts.sum().clamp_min(1)

@@ -54,7 +54,7 @@ class NormalConsistency(Loss):
 class Distortion(Loss):
     """Spread of the splats along each ray, in inverse depth (2DGS, depth distortion)."""
 
-    reads: ClassVar[tuple[str, ...]] = ("distortion",)
+    reads: ClassVar[tuple[str, ...]] = ("alpha", "distortion")
 
     weight: float = 0.0
     """Loss weight; the paper finds that it harms large scenes."""
@@ -65,8 +65,12 @@ class Distortion(Loss):
     unit: float = 0.04
     """Depth at which the inverse depth counts as 1, as a share of the scene extent (2DGS: 0.2 scene units)."""
 
+    normalise: bool = False
+    """Divide the spread of each pixel by its squared alpha, so that faint pixels count as much as opaque ones (GOF)."""
+
     def weight_at(self, index: int, steps: int) -> float:
         return self.weight if index > self.start else 0.0
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
-        return maps.distortion.mean() * self.unit**2
+        spread = maps.distortion / (maps.alpha.square() + 1e-7) if self.normalise else maps.distortion
+        return spread.mean() * self.unit**2

@@ -19,6 +19,7 @@ OPAQUE = 0.5
 """The expected depth counts as a surface where alpha is above this, as the median depth does."""
 WHOLE = 0.999
 """A bilinear sample counts if at least this share of it comes from pixels that count."""
+CPU = torch.device("cpu")
 TINY = 1e-4
 """Depths and inverse depths below this, in local units, are as good as none."""
 
@@ -60,7 +61,7 @@ def surface_depth(maps: Maps, which: Literal["median", "expected"]) -> Tensor:
     return torch.where(maps.alpha > OPAQUE, maps.expected_depth(), 0.0)
 
 
-def spread(size: tuple[int, int], side: int, seed: int) -> tuple[Tensor, Tensor]:
+def spread(size: tuple[int, int], side: int, seed: int, device: torch.device = CPU) -> tuple[Tensor, Tensor]:
     """Rows and columns, (K,) each, of one pixel at random in every square of a picture of (H, W) pixels.
 
     None comes twice, so that no gradient is added up in an order that threads decide. Of the squares that reach over
@@ -69,19 +70,23 @@ def spread(size: tuple[int, int], side: int, seed: int) -> tuple[Tensor, Tensor]
     Args:
         size: (H, W).
         side: Of the squares, pixels.
-        seed: Of the draw.
+        seed: Of the draw, which is the same on every device.
+        device: That the two lie on.
     """
     y, x = (torch.arange(0, length, side) for length in size)
     draws = torch.randint(side, (2, len(y), len(x)), generator=torch.Generator().manual_seed(seed))
     y, x = y[:, None] + draws[0], x[None] + draws[1]
     inside = (y < size[0]) & (x < size[1])
-    return y[inside], x[inside]
+    return y[inside].to(device), x[inside].to(device)
 
 
-def motion(camera: Camera, other: Camera, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Rotation (3, 3) and shift (3, 1) that take points from the frame of one camera to that of another."""
+def motion(camera: Camera, other: Camera, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotation (3, 3) and shift (3, 1) that take points from the frame of one camera to that of another.
+
+    `like`: has the type and the device that both shall have.
+    """
     both = other.world_to_camera @ torch.linalg.inv(camera.world_to_camera)
-    return both[:3, :3].to(dtype), both[:3, 3:].to(dtype)
+    return both[:3, :3].to(like), both[:3, 3:].to(like)
 
 
 def projected(camera: Camera, points: Tensor) -> Tensor:
@@ -144,7 +149,7 @@ def round_trip(depth: Tensor, rays: Tensor, camera: Camera, opposite: Opposite) 
         picture, where it has a depth and no mask.
     """
     lens = opposite.camera
-    rotation, shift = motion(camera, lens, depth.dtype)
+    rotation, shift = motion(camera, lens, depth)
     points = rotation @ (rays * depth) + shift
     at = projected(lens, points)
     inverse = sampled(opposite.inverse, at)

@@ -68,7 +68,7 @@ class WarpedPatches(TwoViews, Loss):
         if neighbour is None or not len(at):
             return nothing
         z, normal = depth.flatten()[at], maps.normal.flatten(1)[:, at]
-        rays = camera.rays(depth.dtype).flatten(1)[:, at]
+        rays = camera.rays(depth.dtype, depth.device).flatten(1)[:, at]
         facing = -(normal * rays).sum(0) > GRAZING * normal.square().sum(0).sqrt() * rays.square().sum(0).sqrt()
         with torch.no_grad():
             opposite = Opposite.of(neighbour, self.depth)
@@ -87,15 +87,15 @@ class WarpedPatches(TwoViews, Loss):
         r = self.radius
         inner = (height - 2 * r, width - 2 * r)
         if min(inner) < 1:
-            return torch.zeros(0, dtype=torch.int64)
+            return torch.zeros(0, dtype=torch.int64, device=target.photo.device)
         side = max(1, math.ceil(math.sqrt(inner[0] * inner[1] / self.pixels)))
         while math.ceil(inner[0] / side) * math.ceil(inner[1] / side) > self.pixels:
             side += 1
-        y, x = spread(inner, side, target.seed)
+        y, x = spread(inner, side, target.seed, target.photo.device)
         at = (y + r) * width + x + r
         if target.mask is None:
             return at
-        return at[target.mask.flatten()[at[:, None] + self.offsets(width)].all(1)]
+        return at[target.mask.flatten()[at[:, None] + self.offsets(width).to(at.device)].all(1)]
 
     def offsets(self, width: int) -> Tensor:
         """(S,) what to add to the flat position of a pixel to get those of its patch, in rows."""
@@ -104,7 +104,7 @@ class WarpedPatches(TwoViews, Loss):
 
     def patches(self, target: Target, at: Tensor) -> Tensor:
         """(K, S) grey values of the photograph around the pixels `at`."""
-        return grey(target.photo).flatten()[at[:, None] + self.offsets(target.photo.shape[2])]
+        return grey(target.photo).flatten()[at[:, None] + self.offsets(target.photo.shape[2]).to(at.device)]
 
     def warped(self, plane: Tensor, rays: Tensor, camera: Camera, neighbour: Neighbour) -> tuple[Tensor, Tensor]:
         """(K, S) grey values of the neighbour where planes take the pixels of patches, and whether all S are there.
@@ -115,8 +115,8 @@ class WarpedPatches(TwoViews, Loss):
             camera: The first one.
             neighbour: To look into.
         """
-        rotation, shift = motion(camera, neighbour.view.camera, plane.dtype)
-        steps = torch.arange(-self.radius, self.radius + 1, dtype=plane.dtype)
+        rotation, shift = motion(camera, neighbour.view.camera, plane)
+        steps = torch.arange(-self.radius, self.radius + 1, dtype=plane.dtype, device=plane.device)
         y, x = (part.flatten() for part in torch.meshgrid(steps / camera.fy, steps / camera.fx, indexing="ij"))
         around = rays[:, :, None] + torch.stack([x, y, torch.zeros_like(x)])[:, None]  # (3, K, S)
         inverse = (plane[:, :, None] * around).sum(0)  # of the depth of the plane along these rays
@@ -124,7 +124,7 @@ class WarpedPatches(TwoViews, Loss):
         turned = (rotation @ around.flatten(1)).view_as(around)
         points = turned + shift[:, :, None] * inverse
         at = projected(neighbour.view.camera, points)
-        counts = torch.ones(neighbour.photo.shape[1:]) if neighbour.mask is None else neighbour.mask
+        counts = plane.new_ones(neighbour.photo.shape[1:]) if neighbour.mask is None else neighbour.mask
         inside = (inverse > TINY) & (points[2] > TINY) & is_whole(counts, at)
         return sampled(grey(neighbour.photo).to(at), at), inside.all(1)
 

@@ -91,6 +91,13 @@ class Mesher(Component):
             BadInput: A package that it needs cannot be loaded on this machine.
         """
 
+    def refuse_unfit(self, frame: Frame) -> None:  # noqa: B027 (most meshers suit every frame)
+        """Check, before hours are spent, whether its settings suit the data set.
+
+        Raises:
+            BadInput: A length is in metres, and the data set does not say how long its unit is.
+        """
+
     @abstractmethod
     def mesh(self, subject: MeshInput) -> Mesh:
         """The surface.

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from surfkit.core.events import Progress, emit
 from surfkit.mesh.base import MeshInput
+from surfkit.primitives.drawing import PrimitiveRasterizer
+from surfkit.raster.rays import ray_opacity
 
 NEAR_SURFACE = 0.01
 """A vertex is seen where its depth is that of the picture, to this share of it."""
@@ -46,6 +48,47 @@ class Field:
             open_to += looks & (opacity <= self.level)
             emit(Progress(what, index + 1, len(given.views)))
         return open_to < (self.agree * looking).clamp_min(1), looking
+
+
+def least_opacity(subject: MeshInput, points: Tensor, what: str, enough: float | None = None) -> tuple[Tensor, Tensor]:
+    """The opacity field (GOF): how much the splats hide of places from the view that sees them best.
+
+    Gaussians hide in part what lies in them (`raster.rays`), unless they draw themselves; splats of other kinds hide as
+    `Rasterizer.opacity_before` has it.
+
+    Args:
+        subject: Splats and views.
+        points: (P, 3).
+        what: The work, for those who wait.
+        enough: No further view looks at a place that one has found to be hidden by no more than this, which saves most
+            of the work where only the side of a level matters.
+
+    Returns:
+        (P,) float32 in [0, 1], 1 where no view looks, and (P,) int32 how many views look; with `enough`, how many have
+        looked so far.
+    """
+    splats, near = subject.splats, subject.near
+    in_space = splats.kind == "gaussian" and not isinstance(subject.rasterizer, PrimitiveRasterizer)
+    least, looking = torch.ones(len(points)), torch.zeros(len(points), dtype=torch.int32)
+    for index, view in enumerate(subject.views):
+        camera = view.camera
+        x, y, z = camera.project(points).unbind(1)
+        rows = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        if enough is not None:
+            rows &= least > enough
+        rows = rows.nonzero()[:, 0]
+        if (keep := subject.keep(index)) is not None and len(rows):
+            rows = rows[shown(keep.float(), camera.project(points[rows])) > 0.5]
+        if len(rows):
+            if in_space:
+                found = ray_opacity(splats, camera, near, points[rows])
+            else:
+                found = subject.rasterizer.opacity_before(splats, camera, near, points[rows])
+            looks = ~found.isnan()
+            least[rows] = torch.where(looks, torch.minimum(least[rows], found.float()), least[rows])
+            looking[rows] += looks
+        emit(Progress(what, index + 1, len(subject.views)))
+    return least, looking
 
 
 def shown(image: Tensor, places: Tensor) -> Tensor:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.picture import Which, depth_of
+from surfkit.scene.lengths import Length, to_local
 from surfkit.scene.scene import Frame
 
-Length = float | Literal["auto"]
 SAMPLED = 16
 """Views that automatic lengths are taken from."""
 PIXELS = 1.0
@@ -28,12 +27,6 @@ class Lengths:
     voxel: float
     truncation: float
     limit: float
-
-
-def check_length(name: str, value: Length) -> None:
-    """BadInput for a length that is not one."""
-    if value != "auto" and not 0 < value < float("inf"):
-        raise BadInput(f"{name} is {value:g}; it must be more than 0 metres, or auto")
 
 
 def resolve(
@@ -57,18 +50,6 @@ def resolve(
             "it must be at least two voxels"
         )
     return Lengths(size, cut, far)
-
-
-def to_local(value: Length, frame: Frame) -> float | None:
-    """A length in metres in local units; None if it is automatic."""
-    if value == "auto":
-        return None
-    if frame.local_metres is None:
-        raise BadInput(
-            f"a length of {value:g} m cannot be used: the data set does not say how long its unit is; give "
-            "--metres-per-unit (1 if its coordinates are metres), or leave the length at auto"
-        )
-    return value / frame.local_metres
 
 
 def with_unit(length: float, frame: Frame) -> str:

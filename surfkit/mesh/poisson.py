@@ -49,44 +49,88 @@ class Poisson(Mesher):
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
-        open3d = require_open3d("mesh:poisson")
-        found = [self._seen(subject, at) for at in range(len(subject.views))]
-        points, normals, colors = (torch.cat(parts).double().numpy() for parts in zip(*found, strict=True))
+        share = -(-self.points // len(subject.views))
+        found = [seen_pixels(subject, at, share, self.depth) for at in range(len(subject.views))]
+        points, normals, colors = (torch.cat([getattr(p, n) for p in found]) for n in ("points", "normals", "colors"))
         if len(points) < ENOUGH:
             raise BadInput(f"mesh: only {len(points)} pixels of {len(subject.views)} views have a depth; train longer")
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        cloud.normals = open3d.utility.Vector3dVector(normals)
-        cloud.colors = open3d.utility.Vector3dVector(colors)
-        emit(Progress("Poisson reconstruction", 0, 1))
-        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            made, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-                cloud, depth=self.octree, n_threads=torch.get_num_threads()
-            )
-        emit(Progress("Poisson reconstruction", 1, 1))
-        density, vertices = np.asarray(density), np.asarray(made.vertices)
-        beyond = ((vertices < points.min(0)) | (vertices > points.max(0))).any(1)
-        made.remove_vertices_by_mask(beyond | (density < np.quantile(density, self.thin)))
-        return Mesh(
-            np.asarray(made.vertices, np.float32),
-            np.asarray(made.triangles, np.int32),
-            (np.asarray(made.vertex_colors) * 255).round().astype(np.uint8),
-        )
+        return reconstructed(points, normals, colors, self.octree, self.thin, "mesh:poisson")
 
-    def _seen(self, subject: MeshInput, at: int) -> tuple[Tensor, Tensor, Tensor]:
-        """(P, 3) positions, outward normals and colours in [0, 1] of some pixels of a view."""
-        view = subject.views[at]
-        camera, maps = view.camera, subject.draw(view)
-        depth = maps.median if self.depth == "median" else maps.expected_depth()
-        length = maps.normal.norm(dim=0)
-        solid = (depth > 0) & (maps.alpha > 0.5) & (length > 0)
-        if (keep := subject.keep(at)) is not None:
-            solid &= keep
-        rows = solid.flatten().nonzero()[:, 0]
-        share = -(-self.points // len(subject.views))
-        rows = rows[torch.randperm(len(rows), generator=subject.generator)[:share].sort().values]
-        turn = camera.world_to_camera[:3, :3].float()
-        local = (camera.rays() * depth).flatten(1)[:, rows].T
-        normals = (maps.normal / length.clamp_min(1e-10)).flatten(1)[:, rows].T
-        colors = maps.color.clamp(0, 1).flatten(1)[:, rows].T
-        emit(Progress("taking points", at + 1, len(subject.views)))
-        return local @ turn + camera.centre.float(), normals @ turn, colors
+
+@dataclass(frozen=True)
+class SeenPixels:
+    """Some pixels of a view that show a surface.
+
+    Attributes:
+        points: (P, 3) positions, local frame.
+        rays: (P, 3) unit directions from the camera to them.
+        normals: (P, 3) rendered normals, outward, of length 1.
+        colors: (P, 3) in [0, 1].
+    """
+
+    points: Tensor
+    rays: Tensor
+    normals: Tensor
+    colors: Tensor
+
+
+def seen_pixels(subject: MeshInput, at: int, most: int, which: Literal["median", "expected"]) -> SeenPixels:
+    """Pixels of a view that have a depth, at random `most` of them where there are more.
+
+    Args:
+        subject: What is to be meshed.
+        at: Position of the view.
+        most: How many.
+        which: Depth that counts.
+    """
+    view = subject.views[at]
+    camera, maps = view.camera, subject.draw(view)
+    depth = maps.median if which == "median" else maps.expected_depth()
+    length = maps.normal.norm(dim=0)
+    solid = (depth > 0) & (maps.alpha > 0.5) & (length > 0)
+    if (keep := subject.keep(at)) is not None:
+        solid &= keep
+    rows = solid.flatten().nonzero()[:, 0]
+    rows = rows[torch.randperm(len(rows), generator=subject.generator)[:most].sort().values]
+    turn, rays = camera.world_to_camera[:3, :3].float(), camera.rays()
+    local = (rays * depth).flatten(1)[:, rows].T
+    normals = (maps.normal / length.clamp_min(1e-10)).flatten(1)[:, rows].T
+    colors = maps.color.clamp(0, 1).flatten(1)[:, rows].T
+    emit(Progress("taking points", at + 1, len(subject.views)))
+    directions = torch.nn.functional.normalize(rays.flatten(1)[:, rows].T @ turn, dim=1)
+    return SeenPixels(local @ turn + camera.centre.float(), directions, normals @ turn, colors)
+
+
+def reconstructed(points: Tensor, normals: Tensor, colors: Tensor, octree: int, thin: float, what: str) -> Mesh:
+    """Screened Poisson reconstruction of oriented points, without what lies beyond their box or is thinly seen.
+
+    Args:
+        points: (P, 3).
+        normals: (P, 3) outward, of length 1.
+        colors: (P, 3) in [0, 1].
+        octree: Depth: the longest side is divided into 2^octree cells.
+        thin: Share of the vertices to remove, those with the lowest point density.
+        what: The component that needs open3d, for messages.
+
+    Raises:
+        BadInput: open3d cannot be loaded.
+    """
+    open3d = require_open3d(what)
+    places, outward, shown = (value.double().cpu().numpy() for value in (points, normals, colors))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(places))
+    cloud.normals = open3d.utility.Vector3dVector(outward)
+    cloud.colors = open3d.utility.Vector3dVector(shown)
+    emit(Progress("Poisson reconstruction", 0, 1))
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        made, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            cloud, depth=octree, n_threads=torch.get_num_threads()
+        )
+    emit(Progress("Poisson reconstruction", 1, 1))
+    density, vertices = np.asarray(density), np.asarray(made.vertices)
+    beyond = ((vertices < places.min(0)) | (vertices > places.max(0))).any(1)
+    made.remove_vertices_by_mask(beyond | (density < np.quantile(density, thin)))
+    return Mesh(
+        np.asarray(made.vertices, np.float32),
+        np.asarray(made.triangles, np.int32),
+        (np.asarray(made.vertex_colors) * 255).round().astype(np.uint8),
+    )

@@ -13,7 +13,7 @@ from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.readers.depth_prior import DepthPrior
-from surfkit.scene.scene import View
+from surfkit.scene.scene import Frame, View
 
 POINTS = 2_000_000
 """About as many points of the maps tell where the surface lies, and so how much memory it takes."""
@@ -37,6 +37,10 @@ class Stereo(Mesher):
     def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
         return True
+
+    def refuse_unfit(self, frame: Frame) -> None:
+        """See `Mesher.refuse_unfit`."""
+        self.fusion.refuse_unfit(frame)
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""

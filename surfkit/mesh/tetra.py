@@ -7,6 +7,7 @@ is a half.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,10 +74,78 @@ class Tetra(Mesher):
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
-        points, sizes = self._points(subject)
+        points, rows, half = pivots(subject, self.faint, self.reach, self.thickness)
         field = Field(subject, self.level, self.agree)
         hidden, views = field.hidden(points, "looking at points")
-        known, inside = (views >= self.min_views).numpy(), hidden.numpy()
+        edges = Edges(points, half.norm(dim=1)[rows], (views >= self.min_views).numpy(), hidden.numpy())
+        return edges.surface(subject, self.bisections, self.longest, lambda at, what: field.hidden(at, what)[0])
+
+
+def pivots(subject: MeshInput, faint: float, reach: float, thickness: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The points to tetrahedralise: the centre and the eight corners of a box around each splat (GOF).
+
+    Args:
+        subject: Splats, and the generator that moves the points a little: the corners of a box lie on one sphere, where
+            a tetrahedralisation is not unique.
+        faint: Minimum opacity of splats that give points.
+        reach: Half sides of the boxes, in standard deviations.
+        thickness: Half thickness of the box of a surfel, as a share of its smaller half side.
+
+    Returns:
+        (P, 3) float64 points, (P,) int64 which of the M splats used each belongs to, and (M, 3) the half sides of their
+        boxes.
+
+    Raises:
+        BadInput: All splats are too faint.
+    """
+    splats = subject.splats
+    kept = splats.opacities >= faint
+    if not kept.any():
+        raise BadInput(f"mesh: none of {len(splats):,} splats has an opacity of {faint}; lower --mesh.faint")
+    half = reach * splats.scales[kept].double()
+    if half.shape[1] == 2:
+        half = torch.cat([half, thickness * half.amin(1, keepdim=True)], 1)
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    signs = torch.cat([torch.zeros(1, 3, dtype=torch.float64), signs])
+    offsets = (half[:, None] * signs) @ rotations(splats.quats[kept].double()).transpose(1, 2)
+    points = (splats.means[kept].double()[:, None] + offsets).flatten(0, 1)
+    rows = torch.arange(len(half)).repeat_interleave(len(signs))
+    size = half.norm(dim=1)[rows]
+    points += 1e-3 * size[:, None] * (torch.rand(points.shape, generator=subject.generator, dtype=torch.float64) - 0.5)
+    return points, rows, half
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Points on both sides of a surface.
+
+    Attributes:
+        points: (P, 3) float64, in general position.
+        sizes: (P,) lengths; an edge is long compared with the sum of those at its ends.
+        known: (P,) bool, whether it is known on which side a point lies.
+        inside: (P,) bool.
+    """
+
+    points: Tensor
+    sizes: Tensor
+    known: np.ndarray
+    inside: np.ndarray
+
+    def surface(
+        self, subject: MeshInput, bisections: int, longest: float, hidden: Callable[[Tensor, str], Tensor]
+    ) -> Mesh:
+        """The surface between the points inside and those outside, coloured, by marching tetrahedra.
+
+        Args:
+            subject: What is meshed.
+            bisections: Steps in which it is searched along each edge.
+            longest: Maximum length of an edge, as a multiple of the sizes at its ends; 0 sets no limit.
+            hidden: Tells (E,) bool whether (E, 3) places are inside; and is told what the work is, for those who wait.
+
+        Raises:
+            BadInput: All points are on the same side.
+        """
+        points, inside, known = self.points, self.inside, self.known
         if not (known & inside).any() or not (known & ~inside).any():
             raise BadInput(
                 f"mesh: of {len(points):,} points around the splats {int((known & inside).sum()):,} are hidden and "
@@ -91,36 +160,16 @@ class Tetra(Mesher):
         ends = torch.from_numpy(edges)
         low, high = points[ends[:, 0]], points[ends[:, 1]]  # inside, outside
         length = (low - high).norm(dim=1)
-        for at in range(self.bisections):
+        for at in range(bisections):
             middle = (low + high) / 2
-            hidden, _ = field.hidden(middle, f"searching the surface, {at + 1} of {self.bisections}")
-            low, high = torch.where(hidden[:, None], middle, low), torch.where(hidden[:, None], high, middle)
+            within = hidden(middle, f"searching the surface, {at + 1} of {bisections}")[:, None]
+            low, high = torch.where(within, middle, low), torch.where(within, high, middle)
         vertices = (low + high) / 2
-        if self.longest:
-            near = (length <= self.longest * (sizes[ends[:, 0]] + sizes[ends[:, 1]])).numpy()
+        if longest:
+            near = (length <= longest * (self.sizes[ends[:, 0]] + self.sizes[ends[:, 1]])).numpy()
             faces = faces[near[faces].all(1)]
         vertices, faces = used(vertices.numpy(), faces)
         return Mesh(vertices.astype(np.float32), faces.astype(np.int32), vertex_colors(subject, vertices))
-
-    def _points(self, subject: MeshInput) -> tuple[Tensor, Tensor]:
-        """(P, 3) float64 centres and corners of boxes, and (P,) the half diagonals of these boxes."""
-        splats = subject.splats
-        kept = splats.opacities >= self.faint
-        if not kept.any():
-            raise BadInput(f"mesh: none of {len(splats):,} splats has an opacity of {self.faint}; lower --mesh.faint")
-        half = self.reach * splats.scales[kept].double()
-        if half.shape[1] == 2:
-            half = torch.cat([half, self.thickness * half.amin(1, keepdim=True)], 1)
-        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
-        signs = torch.cat([torch.zeros(1, 3, dtype=torch.float64), signs])
-        offsets = (half[:, None] * signs) @ rotations(splats.quats[kept].double()).transpose(1, 2)
-        points = (splats.means[kept].double()[:, None] + offsets).flatten(0, 1)
-        size = half.norm(dim=1).repeat_interleave(len(signs))
-        # The corners of a box lie on one sphere, where a tetrahedralisation is not unique.
-        points += (
-            1e-3 * size[:, None] * (torch.rand(points.shape, generator=subject.generator, dtype=torch.float64) - 0.5)
-        )
-        return points, size
 
 
 def triangles(tets: np.ndarray, inside: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

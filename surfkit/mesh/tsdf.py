@@ -15,10 +15,12 @@ from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import Length, Lengths, check_length, resolve, with_unit
+from surfkit.mesh.lengths import Lengths, resolve, with_unit
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
+from surfkit.scene.lengths import Length, check_length, to_local
+from surfkit.scene.scene import Frame
 
 LEAST_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
@@ -76,6 +78,11 @@ class TSDF(Mesher):
     def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
         return self.trust is not None and self.trust.needs_prior
+
+    def refuse_unfit(self, frame: Frame) -> None:
+        """See `Mesher.refuse_unfit`."""
+        for name in ("voxel", "truncation", "depth_limit"):
+            to_local(getattr(self, name), frame, f"mesh.{name}: ")
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""

@@ -19,6 +19,7 @@ class SplatOptimisation(Method):
         "start",
         "pretrain",
         "partition",
+        "partition_pretrain",
         "assign",
         "min_views",
         "tune",

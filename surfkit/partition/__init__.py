@@ -9,6 +9,8 @@ from surfkit.partition.balanced import Balanced
 from surfkit.partition.base import Cells, CoarseModel, Partition
 from surfkit.partition.camera_grid import CameraGrid
 from surfkit.partition.grid import ContractedGrid, QuantileGrid
+from surfkit.partition.sparse_points import SparsePoints
+from surfkit.partition.square_grid import SquareGrid
 
 
 @hookimpl
@@ -18,10 +20,12 @@ def surfkit_components() -> Mapping[str, type[Component]]:
         "contracted-grid": ContractedGrid,
         "quantile-grid": QuantileGrid,
         "camera-grid": CameraGrid,
+        "square-grid": SquareGrid,
         "balanced": Balanced,
         "ssim-difference": SSIMDifference,
         "picture-share": PictureShare,
         "airspace": Airspace,
+        "sparse-points": SparsePoints,
     }
 
 
@@ -36,5 +40,7 @@ __all__ = [
     "PictureShare",
     "QuantileGrid",
     "SSIMDifference",
+    "SparsePoints",
+    "SquareGrid",
     "CoarseModel",
 ]

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
-from surfkit.partition.assign import Assign, check_threshold
-from surfkit.partition.base import CoarseModel, Ground
+from surfkit.partition.assign import Assign, check_threshold, inside
+from surfkit.partition.base import Cells, CoarseModel, Ground
 from surfkit.scene.camera import Camera
 
 SIDE = 48
@@ -40,13 +40,16 @@ class Airspace(Assign):
         if not 0 <= self.growth < float("inf"):
             raise BadInput(f"assign: airspace.growth is {self.growth}; it must be 0 or more")
 
-    @property
-    def least(self) -> float:
-        """See `Assign.least`."""
-        return self.threshold
+    def joins(self, sight: CoarseModel, cells: Cells) -> Tensor:
+        """See `Assign.joins`; those with their camera inside always join."""
+        owner = cells.owner(sight.splats.means)
+        return inside(sight, cells) | (self.measure(sight, owner, cells.count) > self.threshold)
 
     def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
-        """Shoot rays through the pictures; 1 for a camera inside."""
+        """(V, B) the share of a view that the space of each of `count` blocks fills, by rays; 1 for a camera in it.
+
+        `owner` is the block of each splat, (N,).
+        """
         axes = Ground.under(sight.centres, sight.splats.means).axes
         places, spaces = sight.splats.means.double() @ axes.T, {}
         for block in owner[owner >= 0].unique().tolist():

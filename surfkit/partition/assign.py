@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -11,21 +12,32 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.registry import Component
-from surfkit.partition.base import CoarseModel
+from surfkit.partition.base import Cells, CoarseModel
 from surfkit.raster.ssim import ssim
 
 
 class Assign(Component):
-    """A way to find the views that a block matters to; those with their camera inside always join."""
+    """A way to find the views that a block is tuned on."""
+
+    needs_observations: ClassVar[bool] = False
+    """Whether it looks at the sparse points that each view shows; only then are they read."""
 
     @abstractmethod
-    def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
-        """(V, B) how much each of `count` blocks matters to each view; `owner` is the block of each splat, (N,)."""
+    def joins(self, sight: CoarseModel, cells: Cells) -> Tensor:
+        """(V, B) bool, which views each block is tuned on.
+
+        What is drawn by chance is drawn from the seed of `sight`, and is the same again.
+        """
 
     @property
-    @abstractmethod
-    def least(self) -> float:
-        """A view joins a block that matters more than this."""
+    def most_views(self) -> int | None:
+        """A block has at most so many views, drawn by chance where more join; None for no limit."""
+        return None
+
+
+def inside(sight: CoarseModel, cells: Cells) -> Tensor:
+    """(V, B) bool, which cameras stand in each block."""
+    return torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
 
 
 @dataclass(frozen=True)
@@ -38,13 +50,16 @@ class SSIMDifference(Assign):
     def __post_init__(self) -> None:
         check_threshold(self.threshold, "ssim-difference")
 
-    @property
-    def least(self) -> float:
-        """See `Assign.least`."""
-        return self.threshold
+    def joins(self, sight: CoarseModel, cells: Cells) -> Tensor:
+        """See `Assign.joins`; those with their camera inside always join."""
+        owner = cells.owner(sight.splats.means)
+        return inside(sight, cells) | (self.measure(sight, owner, cells.count) > self.threshold)
 
     def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
-        """Draw each view once whole, and once without each block of which it shows anything."""
+        """(V, B) how much a view changes without each of `count` blocks; `owner` is the block of each splat, (N,).
+
+        Each view is drawn once whole, and once without each block of which it shows anything.
+        """
         difference = torch.zeros(len(sight.views), count)
         for at, view in enumerate(sight.views):
             whole = sight.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False)
@@ -70,13 +85,13 @@ class PictureShare(Assign):
     def __post_init__(self) -> None:
         check_threshold(self.threshold, "picture-share")
 
-    @property
-    def least(self) -> float:
-        """See `Assign.least`."""
-        return self.threshold
+    def joins(self, sight: CoarseModel, cells: Cells) -> Tensor:
+        """See `Assign.joins`; those with their camera inside always join."""
+        owner = cells.owner(sight.splats.means)
+        return inside(sight, cells) | (self.measure(sight, owner, cells.count) > self.threshold)
 
     def measure(self, sight: CoarseModel, owner: Tensor, count: int) -> Tensor:
-        """Sum the shares of the splats of each block."""
+        """(V, B) the share of a view that each of `count` blocks makes up; `owner` is the block of each splat, (N,)."""
         share = torch.zeros(len(sight.views), count)
         for at in range(len(sight.views)):
             share[at].index_add_(0, owner, sight.share(at).float())

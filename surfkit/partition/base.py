@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
 from surfkit.raster.api import Rasterizer, Splats
-from surfkit.scene.scene import View
+from surfkit.scene.observations import Observations
+from surfkit.scene.scene import Frame, View
 
 UPRIGHT = math.cos(math.radians(25))
 """A ground this close to two axes of the frame is taken to lie along them."""
@@ -128,11 +130,14 @@ class Cells:
         """Blocks."""
         return max(self.blocks) + 1
 
+    def flat(self, points: Tensor) -> Tensor:
+        """(N, 2) float64 places of (N, 3) points, where the boxes lie: on the ground, or in the unit square."""
+        flat = self.ground.flat(points)
+        return flat if self.contraction is None else self.contraction.contracted(flat)
+
     def owner(self, points: Tensor) -> Tensor:
         """(N,) int64, the block that owns each of (N, 3) points; -1 for one that is not finite."""
-        flat = self.ground.flat(points)
-        if self.contraction is not None:
-            flat = self.contraction.contracted(flat)
+        flat = self.flat(points)
         owner = torch.full((len(points),), -1, dtype=torch.int64)
         for (x0, y0, x1, y1), block in zip(self.boxes, self.blocks, strict=True):
             here = flat.isfinite().all(1)
@@ -154,12 +159,18 @@ class CoarseModel:
         views: Training views.
         rasterizer: Draws the splats.
         near: Local units.
+        frame: Where the local frame lies, for lengths in metres.
+        observations: The sparse points that each view shows; none unless the assignment needs them.
+        seed: Of random draws.
     """
 
     splats: Splats
     views: Sequence[View]
     rasterizer: Rasterizer
     near: float
+    frame: Frame = field(default_factory=lambda: Frame(np.zeros(3), 1.0))
+    observations: Observations | None = None
+    seed: int = 0
 
     @property
     def centres(self) -> Tensor:
@@ -179,6 +190,13 @@ class CoarseModel:
 
 class Partition(Component):
     """A way to cut a scene into blocks."""
+
+    def refuse_unfit(self, frame: Frame) -> None:
+        """Check, before hours are spent, whether its settings suit the data set.
+
+        Raises:
+            BadInput: A length is in metres, and the data set does not say how long its unit is.
+        """
 
     @abstractmethod
     def cells(self, sight: CoarseModel) -> Cells:

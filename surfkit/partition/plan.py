@@ -10,7 +10,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.partition.assign import Assign
+from surfkit.partition.assign import Assign, inside
 from surfkit.partition.base import Cells, CoarseModel, Partition
 
 LOOKS = 16
@@ -74,23 +74,45 @@ class Fewest:
         return max(1, min(self.views, round(self.share * views / blocks)))
 
 
-def plan(sight: CoarseModel, partition: Partition, assign: Assign, fewest: Fewest | None = None) -> Plan:
+def plan(
+    sight: CoarseModel,
+    partition: Partition,
+    assign: Assign,
+    fewest: Fewest | None = None,
+    begun: CoarseModel | None = None,
+) -> Plan:
     """Cut, find the views of every block, and join blocks with too few of them to their neighbours.
+
+    Args:
+        sight: The model that decides.
+        partition: How to cut.
+        assign: How to choose views.
+        fewest: What a block needs.
+        begun: The model that the blocks begin with, whose points are counted; the one that decides if None.
 
     Raises:
         BadInput: The scene cannot be cut, or no block has a view.
     """
     cells = partition.cells(sight)
     owner = cells.owner(sight.splats.means)
-    measure = assign.measure(sight, owner, cells.count)
-    inside = torch.nn.functional.one_hot(cells.owner(sight.centres), cells.count).bool()
-    joins = inside | (measure > assign.least)
+    joins = assign.joins(sight, cells)
     if not joins.any():
         raise BadInput("partition: no view shows any block; lower the threshold of the assignment")
+    here = inside(sight, cells) & joins
     fewest = fewest or Fewest()
     poor = torch.bincount(owner, minlength=cells.count) < fewest.points * len(owner) / cells.count
-    cells, joins, inside = with_enough(cells, joins, inside, fewest.of(len(sight.views), cells.count), poor)
-    return Plan(cells, blocks_of(sight, cells, joins, inside))
+    cells, joins, here = with_enough(cells, joins, here, fewest.of(len(sight.views), cells.count), poor)
+    if assign.most_views is not None:
+        joins = thinned(joins, assign.most_views, sight.seed)
+    return Plan(cells, blocks_of(begun or sight, cells, joins, here & joins))
+
+
+def thinned(joins: Tensor, most: int, seed: int) -> Tensor:
+    """(V, B) views that join each block, without those, drawn by chance, that are more than `most`."""
+    # not the draws that views may have joined by, which would favour some
+    ranks = torch.rand(joins.shape, generator=torch.Generator().manual_seed((seed + 1) % 2**63)).where(joins, 2.0)
+    order = ranks.argsort(dim=0, stable=True).argsort(dim=0, stable=True)
+    return joins & (order < most)
 
 
 def blocks_of(sight: CoarseModel, cells: Cells, joins: Tensor, inside: Tensor) -> tuple[Block, ...]:

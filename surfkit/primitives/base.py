@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -39,6 +39,10 @@ class Primitive(Component):
     """Whether its `render` can give absolute pixel gradients, for signals that want them (AbsGS); `AutogradRender`
     cannot."""
 
+    has_free_points: ClassVar[bool] = True
+    """Whether points can be moved, copied and split; those that are bound to something cannot, and stages that densify
+    them are refused."""
+
     sh_degree: int = 3
     """Highest degree of the spherical harmonics of a colour, 0 to 3; 0 is one colour for all directions."""
 
@@ -69,12 +73,12 @@ class Primitive(Component):
         By default two children for each point, at places drawn from the point's own Gaussian, smaller by SHRINK. The
         draws come from `generator` on the CPU, so that the device does not change them.
         """
-        splats = self.activate(params, 0)
-        scales = torch.nn.functional.pad(splats.scales, (0, 3 - splats.scales.shape[1]))
         twin = {name: torch.cat([value, value]) for name, value in self.per_point(params).items()}
-        draw = torch.randn(2 * len(scales), 3, generator=generator).to(scales)
-        shift = rotated(draw * torch.cat([scales, scales]), torch.cat([splats.quats, splats.quats]))
-        return self.scaled(self.moved(twin, shift), 1 / SHRINK)
+        return self.scaled(self.moved(twin, self._drawn(params, 2, generator)), 1 / SHRINK)
+
+    def scattered(self, params: Columns, generator: torch.Generator) -> Columns:
+        """Raw parameters of the points, each moved to a place drawn from its own Gaussian; draws as for `split`."""
+        return self.moved(self.per_point(params), self._drawn(params, 1, generator))
 
     def moved(self, params: Columns, shift: Tensor) -> Columns:
         """Raw parameters of the points moved by (N, 3) local units."""
@@ -91,6 +95,30 @@ class Primitive(Component):
         raw = params["opacities"]
         wanted = self._activation("opacities").inverse(opacities.double()).to(raw)
         return params | {"opacities": torch.where(opacities.isnan(), raw, wanted.view_as(raw))}
+
+    def dependent(self, params: Columns) -> Columns:
+        """The columns that other parameters determine, such as the positions of points that are bound to a mesh.
+
+        A trainer asks for them before the first step, after each edit and after each step, so that they always fit.
+        Their learning rate is 0. None by default.
+
+        Args:
+            params: Raw columns of N points, and the shared ones.
+        """
+        return {}
+
+    def observed(self, params: Columns, cameras: Sequence[Camera], near: float) -> Columns:
+        """The columns that follow from the training cameras, not from gradients, such as sampling intervals.
+
+        A trainer asks for them before the first step, after each edit and every 100 steps. Their learning rate is 0.
+        None by default.
+
+        Args:
+            params: Raw columns of N points, and the shared ones.
+            cameras: Of the training views; of a block, of those that it is tuned on.
+            near: Nothing nearer to a camera is drawn; local units.
+        """
+        return {}
 
     def render(
         self,
@@ -135,7 +163,7 @@ class Primitive(Component):
                     f"primitive {kebab(type(self).__name__)}: PLY files of splats have no place for it, only for "
                     f"{'s and '.join(KINDS)}s; the checkpoint in the run folder holds the model"
                 )
-            exact = "opacities" in params and self._activation("opacities") is SIGMOID
+            exact = "opacities" in params and torch.equal(SIGMOID.value(params["opacities"]), splats.opacities)
             return SplatTable(
                 kind=splats.kind,
                 means=splats.means,
@@ -169,6 +197,13 @@ class Primitive(Component):
     def shared(self) -> frozenset[str]:
         """Names of the parameters that belong to no point."""
         return frozenset(name for name, column in self.columns().items() if column.shared)
+
+    def _drawn(self, params: Columns, times: int, generator: torch.Generator) -> Tensor:
+        """(times x M, 3) offsets of places drawn from the Gaussians of M points: one of each, then the next of each."""
+        splats = self.activate(params, 0)
+        scales = torch.nn.functional.pad(splats.scales, (0, 3 - splats.scales.shape[1]))
+        draw = torch.randn(times * len(scales), 3, generator=generator).to(scales)
+        return rotated(draw * scales.repeat(times, 1), splats.quats.repeat(times, 1))
 
     def _activation(self, name: str) -> Activation:
         found = self.columns().get(name)

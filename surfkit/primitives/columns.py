@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.core.schedule import LearningRate
 
 
@@ -71,7 +72,8 @@ class Column:
     """A trainable parameter.
 
     Attributes:
-        shape: Of one point's values, such as (3,); of all values if `shared`.
+        shape: Of one point's values, such as (3,); of all values if `shared`. None stands for a size of a shared
+            parameter that is only known when there are points, as in (None, 3) for the vertices of a mesh.
         rate: Its learning rate, unless a stage has another; of positions in scene extents.
         activation: What its raw numbers stand for.
         shared: It belongs to no point: the weights of a network, a code of each photograph. It is optimised, saved and
@@ -79,10 +81,19 @@ class Column:
             number of points that it gives.
     """
 
-    shape: tuple[int, ...]
+    shape: tuple[int | None, ...]
     rate: LearningRate
     activation: Activation = IDENTITY
     shared: bool = False
+
+    def __post_init__(self) -> None:
+        if None in self.shape and not self.shared:
+            raise BadInput(f"a column of points has shape {self.shape}; only that of a shared parameter may have None")
+
+    def fits(self, shape: tuple[int, ...], points: int) -> bool:
+        """Whether values of `shape` are those of so many points, or all values of a shared parameter."""
+        wanted = self.shape if self.shared else (points, *self.shape)
+        return len(shape) == len(wanted) and all(a in (None, b) for a, b in zip(wanted, shape, strict=True))
 
 
 def standard_columns(axes: int, sh_degree: int) -> dict[str, Column]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
@@ -24,6 +25,10 @@ class PrimitiveRasterizer(Rasterizer):
     def title(self) -> str:
         """See `Rasterizer.title`."""
         return self.inner.title()
+
+    def where(self) -> torch.device:
+        """See `Rasterizer.where`."""
+        return self.inner.where()
 
     def render(
         self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
@@ -51,7 +56,7 @@ def refuse_wrong_maps(
         primitive: What drew.
         maps: What it drew; colour and alpha are always wanted.
         camera: Of the view.
-        read_by: By the name of a map that a loss reads, the name of the loss.
+        read_by: By the name of a map that is read, the path of the term that reads it, such as losses.normal.
     """
     size, present, who = (
         (camera.height, camera.width),
@@ -61,11 +66,11 @@ def refuse_wrong_maps(
     for name in ("color", "alpha"):
         if name not in present:
             raise BadInput(f"{who} gives no {name}, which every view needs; see `surfkit.raster.api.Maps`")
-    for name, loss in (read_by or {}).items():
+    for name, path in (read_by or {}).items():
         if name not in present:
             raise BadInput(
-                f"{who} gives no {name}, which loss {loss} reads; leave the loss out with losses.{loss}:none, or let "
-                "the render draw that map"
+                f"{who} gives no {name}, which {path} reads; leave that out with {path}:none, or let the render draw "
+                "that map"
             )
     for name, value in present.items():
         wanted = (3, *size) if name in ("color", "normal") else size

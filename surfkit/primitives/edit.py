@@ -8,8 +8,33 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive
-from surfkit.primitives.points import Points
+from surfkit.primitives.points import Columns, Points
+from surfkit.scene.scene import View
+
+OBSERVED_EVERY = 100
+"""Steps after which the columns that follow from the cameras are computed again: positions move slowly."""
+
+
+@dataclass(frozen=True)
+class NewPoints:
+    """M points to add that are no copies of others.
+
+    Attributes:
+        params: Raw parameters, M rows of each that belongs to points.
+        parent: (M,) int64, the point that each is added for: where that may not be densified, it is left out.
+    """
+
+    params: Columns
+    parent: Tensor
+
+    def __len__(self) -> int:
+        return len(self.parent)
+
+    def take(self, rows: Tensor) -> NewPoints:
+        """Those of a mask or of indices."""
+        return NewPoints({name: value[rows] for name, value in self.params.items()}, self.parent[rows])
 
 
 @dataclass(frozen=True)
@@ -25,8 +50,13 @@ class Edit:
         opacities: (N,) new opacities, between 0 and 1; NaN leaves a point's as it is.
         scale_by: (N,) factors of the scales, above 0.
         forget: (N,) bool, points whose past the optimiser forgets.
+        scatter: (N,) bool, points whose copies lie at places drawn from the point's own Gaussian; those of the others
+            lie where the point is.
+        new: Points to add beside the clones, such as anchors at places of their own.
+        values: Raw values by name that take the place of a parameter, of all points or shared; for parameters that no
+            gradient changes, such as a level of detail.
 
-    Points are moved, dimmed and scaled before they are copied.
+    Points are moved, dimmed and scaled, and given their values, before they are copied.
     """
 
     drop: Tensor | None = None
@@ -37,18 +67,32 @@ class Edit:
     opacities: Tensor | None = None
     scale_by: Tensor | None = None
     forget: Tensor | None = None
+    scatter: Tensor | None = None
+    new: NewPoints | None = None
+    values: Columns | None = None
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """How many points are dropped, how many added by copying or as new ones, and how many split."""
+        drop, clone, split = (0 if mask is None else int(mask.sum()) for mask in (self.drop, self.clone, self.split))
+        return drop, clone + (0 if self.new is None else len(self.new)), split
 
 
 def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Generator) -> Points:
-    """Points after an edit: the kept in their order, then clones, then children. Moments and statistics follow rows."""
+    """Points after an edit: the kept in their order, then clones, children and new points."""
     points, added, keep = _adjusted(primitive, points, edit), [], None
     if edit.clone is not None and edit.clone.any():
         rows = torch.arange(len(points)).to(edit.clone.device).repeat_interleave(edit.clone.to(torch.int64))
-        added.append({name: value[rows] for name, value in points.params.items()})
+        copies = {name: value[rows] for name, value in points.params.items()}
+        if edit.scatter is not None:
+            copies = _scattered(primitive, copies, points.shared, edit.scatter[rows], generator)
+        added.append(copies)
     if edit.split is not None and edit.split.any():
         rows = {name: value[edit.split] for name, value in points.params.items()}
         added.append(primitive.split(rows | points.shared, generator))
         keep = ~edit.split
+    if edit.new is not None and len(edit.new):
+        added.append(edit.new.params)
     if edit.drop is not None and edit.drop.any():
         keep = ~edit.drop if keep is None else keep & ~edit.drop
     if keep is not None:
@@ -59,11 +103,13 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
 
 
 def withheld(edit: Edit, may: Tensor) -> Edit:
-    """An edit that copies and splits no others than the points of a (N,) mask.
+    """An edit that copies, splits and adds new points for no others than the points of a (N,) mask.
 
     Of a point that was to be copied or split and may not, the rest of the edit but for its removal is left out, too:
     such changes were to make up for its copies.
     """
+    if edit.new is not None:
+        edit = replace(edit, new=edit.new.take(may[edit.new.parent]))
     asked = [mask > 0 for mask in (edit.clone, edit.split) if mask is not None]
     if not asked:
         return edit
@@ -86,11 +132,27 @@ def withheld(edit: Edit, may: Tensor) -> Edit:
     )
 
 
+def fitted(primitive: Primitive, points: Points) -> Points:
+    """The points with the columns that the others determine (`Primitive.dependent`)."""
+    with torch.no_grad():
+        found = primitive.dependent(points.all_params())
+    return replace(points, params=points.params | found) if found else points
+
+
+def observe(primitive: Primitive, points: Points, views: Sequence[View], near: float) -> Points:
+    """The points with the columns that the others determine, and those that follow from the training cameras as these
+    are now (`Primitive.observed`)."""
+    points = fitted(primitive, points)
+    with torch.no_grad():
+        found = primitive.observed(points.all_params(), [view.camera for view in views], near)
+    return replace(points, params=points.params | found) if found else points
+
+
 def merge(edits: Sequence[Edit | None]) -> Edit | None:
     """One edit from several: a dropped point is neither cloned nor split, a split one not cloned; None if none asks.
 
     Of the copies that several ask for the most are made; moves add up, factors of scales multiply, and of several
-    opacities the lowest counts.
+    opacities the lowest counts. New points of all are added; of several values of a parameter the last counts.
     """
     asked = [edit for edit in edits if edit is not None]
     if not asked:
@@ -119,7 +181,16 @@ def merge(edits: Sequence[Edit | None]) -> Edit | None:
         opacities=_lowest(wanted) if (wanted := given("opacities")) else None,
         scale_by=torch.stack(factors).prod(0) if (factors := given("scale_by")) else None,
         forget=most_of("forget"),
+        scatter=most_of("scatter"),
+        new=_together(new) if (new := given("new")) else None,
+        values={name: value for each in given("values") for name, value in each.items()} or None,
     )
+
+
+def _together(new: Sequence[NewPoints]) -> NewPoints:
+    """The new points of all, in this order."""
+    params = {name: torch.cat([each.params[name] for each in new]) for name in new[0].params}
+    return NewPoints(params, torch.cat([each.parent for each in new]))
 
 
 def _lowest(opacities: list[Tensor]) -> Tensor:
@@ -138,6 +209,8 @@ def _adjusted(primitive: Primitive, points: Points, edit: Edit) -> Points:
     if edit.scale_by is not None:
         params = primitive.scaled(params, edit.scale_by)
     points = replace(points, params=params)
+    if edit.values is not None:
+        points = _given(points, edit.values)
     if edit.forget is None or not edit.forget.any():
         return points
     kept = ~edit.forget
@@ -146,6 +219,28 @@ def _adjusted(primitive: Primitive, points: Points, edit: Edit) -> Points:
         for group in (points.exp_avg, points.exp_avg_sq)
     ]
     return replace(points, exp_avg=moments[0], exp_avg_sq=moments[1])
+
+
+def _scattered(
+    primitive: Primitive, params: Columns, shared: Columns, which: Tensor, generator: torch.Generator
+) -> Columns:
+    """Raw parameters of points of which those of a mask lie at places drawn from their own Gaussians."""
+    rows = which.nonzero()[:, 0]
+    moved = primitive.scattered({name: value[rows] for name, value in params.items()} | shared, generator)
+    return {name: value.index_copy(0, rows, moved[name]) for name, value in params.items()}
+
+
+def _given(points: Points, values: Columns) -> Points:
+    """Points with other raw values of some parameters, of points or shared."""
+    known = points.all_params()
+    for name, value in values.items():
+        if name not in known or value.shape != known[name].shape:
+            shape = tuple(known[name].shape) if name in known else "no such parameter"
+            raise BadInput(f"Edit.values: {name!r} has shape {tuple(value.shape)}, and the points have {shape}")
+    params, shared = (
+        {name: values.get(name, old) for name, old in group.items()} for group in (points.params, points.shared)
+    )
+    return replace(points, params=params, shared=shared)
 
 
 def _dimmed(primitive: Primitive, points: Points, most: float) -> Points:

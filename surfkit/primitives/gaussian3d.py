@@ -3,41 +3,63 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
+from surfkit.core.check import BadInput
 from surfkit.primitives.base import Primitive, harmonics
-from surfkit.primitives.columns import SIGMOID, Column, standard_columns
+from surfkit.primitives.columns import Column
 from surfkit.primitives.init import seeds
 from surfkit.primitives.points import Columns
-from surfkit.raster.api import Splats
+from surfkit.primitives.smoothing import Smoothable
+from surfkit.raster.api import DILATION, Splats
 from surfkit.scene.scene import Cloud
 
 
 @dataclass(frozen=True)
-class Gaussian3D(Primitive):
+class Gaussian3D(Smoothable, Primitive):
     """Ellipsoids: sharpest pictures, fuzzy surfaces (3DGS, Kerbl et al. 2023)."""
 
     antialias: bool = False
-    """Dim splats smaller than a pixel by what the 0.3 px blur adds to them."""
+    """Dim splats smaller than a pixel by what the dilation adds to them, as the 2D filter of Mip-Splatting does."""
+
+    dilation: float = DILATION
+    """Variance that is added to the footprint of a splat in an image, px^2: 0.3 in 3DGS, 0.1 in Mip-Splatting. Files of
+    splats do not hold it: other programs add 0.3."""
+
+    geometry: Literal["axis", "plane", "ray"] = "axis"
+    """Normals and densities. axis: projected as in 3DGS, the shortest axis is the normal; plane: projected, the normal
+    is that of the plane that gives the depth (RaDe-GS); ray: the largest density along each ray, not projected (GOF).
+    Files of splats do not hold it: other programs draw as axis."""
+
+    def __post_init__(self) -> None:
+        Smoothable.__post_init__(self)
+        if not 0 < self.dilation < float("inf"):
+            raise BadInput(f"primitive.dilation is {self.dilation:g}; it must be above 0")
+        if self.antialias and self.geometry == "ray":
+            raise BadInput("primitive.antialias makes up for the blur of the projection, and geometry ray has none")
 
     def columns(self) -> dict[str, Column]:
-        """The standard ones."""
-        return standard_columns(3, self.sh_degree)
+        """The standard ones, and the sampling intervals if scales are smoothed."""
+        return self.smoothable_columns(3)
 
     def init(self, cloud: Cloud, generator: torch.Generator) -> Columns:
         """Balls."""
         quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(cloud.xyz), 1)
-        return seeds(self.columns(), cloud) | {"quats": quats}
+        return seeds(self.columns(), cloud) | {"quats": quats} | self.unobserved(len(quats))
 
     def activate(self, params: Columns, degree: int) -> Splats:
         """Gaussians."""
+        scales, opacities = self.filtered(params)
         return Splats(
             kind="gaussian",
             means=params["means"],
             quats=params["quats"],
-            scales=params["scales"].exp(),
-            opacities=SIGMOID.value(params["opacities"]),
+            scales=scales,
+            opacities=opacities,
             sh=harmonics(params, degree),
             antialias=self.antialias,
+            dilation=self.dilation,
+            geometry=self.geometry,
         )

@@ -19,7 +19,7 @@ class Points:
         params: Trainable raw values, each (N, ...).
         exp_avg: Adam's running mean of the gradient of each parameter, also of the shared ones; same shapes.
         exp_avg_sq: Adam's running mean of the squared gradient; same shapes.
-        stats: What policies accumulate between edits, each (N,).
+        stats: What policies accumulate between edits, each (N, ...).
         shared: Trainable values that belong to no point, of any shape.
     """
 
@@ -43,10 +43,10 @@ class Points:
         """Every trainable value, per point and shared."""
         return self.params | self.shared
 
-    def stat(self, name: str) -> Tensor:
-        """(N,) a policy's own column, zeros the first time it is asked for."""
+    def stat(self, name: str, *shape: int) -> Tensor:
+        """(N, *shape) a policy's own column, zeros the first time it is asked for."""
         if name not in self.stats:
-            self.stats[name] = self.params["means"].new_zeros(len(self))
+            self.stats[name] = self.params["means"].new_zeros(len(self), *shape)
         return self.stats[name]
 
     def take(self, rows: Tensor) -> Points:

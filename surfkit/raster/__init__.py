@@ -8,7 +8,8 @@ from surfkit.core.registry import Component, hookimpl
 @hookimpl
 def surfkit_components() -> Mapping[str, type[Component]]:
     """Rasterizers, by name."""
+    from surfkit.raster.cuda.gpu import CudaRasterizer
     from surfkit.raster.native import NativeRasterizer
     from surfkit.raster.reference import Reference
 
-    return {"native": NativeRasterizer, "reference": Reference}
+    return {"native": NativeRasterizer, "reference": Reference, "nvidia": CudaRasterizer}

@@ -31,14 +31,27 @@ T_MIN = float(np.float32(1e-4))
 CUTOFF = math.sqrt(2 * math.log(255))
 """Sigmas at which a splat of opacity 1 falls to ALPHA_MIN."""
 
+MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
+"""Names in the order of `Maps`; the kernels make the first 2, the first 5 or all of them."""
+
 STANDARD = ("means", "quats", "scales", "opacities", "sh")
 """Tensors that all splats have."""
+
+DILATION = 0.3
+"""Variance that 3DGS adds to the footprint of an ellipsoid, px^2."""
 
 EDGE_ON = 2e-3
 """Radians between a disc's plane and the ray to its centre, below which only the low-pass filter draws it."""
 
 KINDS = ("surfel", "gaussian")
 """What the rasterizers of surfkit draw: flat discs (2DGS) and ellipsoids (3DGS)."""
+
+GEOMETRIES = ("axis", "plane", "ray")
+"""How ellipsoids are evaluated; see `Splats.geometry`."""
+
+MIN_FOOTPRINT = 1e-6
+"""Pixels: ellipsoids of geometry "ray" whose standard deviation on the screen is below this in a direction are not
+drawn, as nothing widens them there."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +65,11 @@ class Splats:
         scales: (N, 2) for surfels, (N, 3) for gaussians; local units, positive.
         opacities: (N,) in [0, 1].
         sh: (N, K, 3) spherical harmonics with K in {1, 4, 9, 16}.
-        antialias: Gaussians only: lower the opacity by what the 0.3 px dilation adds to the footprint.
+        antialias: Gaussians only: lower the opacity by what the dilation adds to the footprint.
+        dilation: Gaussians only: variance that is added to the footprint, px^2.
+        geometry: Gaussians only. "axis": footprint by EWA splatting, the normal is the shortest axis. "plane": the same
+            footprint, the normal is that of the plane that gives the depth (RaDe-GS). "ray": density and depth at the
+            largest density along each ray, without EWA and dilation, the normal is that of the ellipsoid there (GOF).
         extra: Further tensors (N, ...) by name, for primitives that draw themselves.
         shared: Further tensors that belong to no splat.
     """
@@ -64,6 +81,8 @@ class Splats:
     opacities: Tensor
     sh: Tensor
     antialias: bool = False
+    dilation: float = DILATION
+    geometry: str = "axis"
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     shared: Mapping[str, Tensor] = field(default_factory=dict)
 
@@ -142,6 +161,40 @@ class Maps:
 
 
 @dataclass(frozen=True)
+class Derived:
+    """The M splats that were made of others for one view, such as Gaussians from anchors, and their signal.
+
+    Attributes:
+        splats: M of them, detached.
+        owner: (M,) int64, the splat that each was made of.
+        seen: (M,) bool, as `Render.seen`.
+        signal: (M, 2) as `Gradients.signal`.
+        chosen: (M, 2) as `Gradients.chosen`.
+        grad_norm: (M,) length of the densification signal, as `Step.grad_norm`; None before a trainer has chosen it.
+    """
+
+    splats: Splats
+    owner: Tensor
+    seen: Tensor
+    signal: Tensor
+    chosen: Tensor | None = None
+    grad_norm: Tensor | None = None
+
+    def combined(self, combine: Callable[[Tensor, Tensor], Tensor]) -> Derived:
+        """The same with `grad_norm` set by a function of the chosen and the total signal, as `Signal.combine`."""
+        chosen = self.signal if self.chosen is None else self.chosen
+        return replace(self, grad_norm=combine(chosen, self.signal).norm(dim=-1))
+
+    def first(self, count: int | None) -> Derived:
+        """Those that were made of the first `count` splats; all for None."""
+        if count is None:
+            return self
+        kept = self.owner < count
+        chosen = None if self.chosen is None else self.chosen[kept]
+        return Derived(self.splats.take(kept), self.owner[kept], self.seen[kept], self.signal[kept], chosen)
+
+
+@dataclass(frozen=True)
 class Gradients:
     """dL/d(splats) of one backward pass, and the densification signal.
 
@@ -154,6 +207,7 @@ class Gradients:
         chosen: (N, 2) of the chosen losses, or the sum of the sizes of its shares of the pixels; None if no second
             cotangent was given.
         extra: By the `extra` and `shared` tensors of the splats that have an influence, by name.
+        derived: The splats that were drawn in place of these, and their signal; None where these were drawn.
     """
 
     means: Tensor
@@ -164,6 +218,7 @@ class Gradients:
     signal: Tensor
     chosen: Tensor | None = None
     extra: Mapping[str, Tensor] = field(default_factory=dict)
+    derived: Derived | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """The five standard gradients by name, in the order of `Splats.tensors`."""
@@ -214,6 +269,11 @@ class Rasterizer(Component):
     def missing(self) -> str | None:
         """Why it cannot run on this machine, and what to do, in one sentence; None if it can."""
         return None
+
+    def where(self) -> torch.device:
+        """The device that it draws on. Splats from another one are copied there; what is drawn lies where the splats
+        lie."""
+        return torch.device("cpu")
 
     @abstractmethod
     def title(self) -> str:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.api import STANDARD, Derived, Gradients, Maps, Render, Splats
 from surfkit.scene.camera import Camera
 
 
@@ -111,9 +111,10 @@ class DerivedRender(Render):
             self._made, self._owner = derive(splats.with_named(self._leaves))
         self._inner = draw(self._made.detached())
         self._count, self._owner = len(splats), self._owner.to(torch.int64)
-        self.seen = torch.zeros(len(splats), dtype=torch.bool)
+        self.seen = self._inner.seen.new_zeros(len(splats))
         self.seen[self._owner[self._inner.seen]] = True
-        self.radii = torch.zeros(len(splats)).scatter_reduce(0, self._owner, self._inner.radii, "amax")
+        radii = self._inner.radii
+        self.radii = radii.new_zeros(len(splats)).scatter_reduce(0, self._owner, radii, "amax")
 
     @property
     def maps(self) -> Maps:  # type: ignore[override] (drawn when it is asked for)
@@ -139,7 +140,9 @@ class DerivedRender(Render):
             for (name, leaf), grad in zip(self._leaves.items(), grads, strict=True)
         }
         part = None if inner.chosen is None else self._summed(inner.chosen)[:rows]
-        return gathered(found, self._summed(inner.signal)[:rows], part, rows, self._shared)
+        derived = Derived(self._made.detached(), self._owner, self._inner.seen, inner.signal, inner.chosen).first(rows)
+        gradients = gathered(found, self._summed(inner.signal)[:rows], part, rows, self._shared)
+        return replace(gradients, derived=derived)
 
     def _summed(self, signal: Tensor) -> Tensor:
         return signal.new_zeros(self._count, 2).index_add(0, self._owner, signal)

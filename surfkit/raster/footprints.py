@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from surfkit.raster.api import ALPHA_MIN, CUTOFF, EDGE_ON, Splats
+from surfkit.raster.api import ALPHA_MIN, CUTOFF, EDGE_ON, MIN_FOOTPRINT, Splats
 from surfkit.scene.camera import Camera
 
-DILATION = 0.3
 ANTIALIAS_FLOOR = 2.5e-5
 LOW_PASS_SIGMA = 3.0
 """The contour whose box has the low-pass filter's centre in its middle."""
@@ -34,6 +33,7 @@ class Footprints:
         half: (N, 2) pixels, half sides of the box in which alpha reaches ALPHA_MIN.
         radius: (N,) pixels, half the larger side of the contour's own box, the low-pass disc's at least.
         screen: What the densification signal is the gradient of: (N, 3, 3) homographies or (N, 2) centres.
+        normals: (rows, x, y) to normals (n, P, 3) that differ from pixel to pixel; None where `normal` holds.
         at: (rows, x, y, shift) to rho, depth and opacity, (n, P), (n, P) and (n, 1), at P pixel positions; shift is
             added to what the signal is the gradient of, (n, P, 2) or 0.
     """
@@ -47,6 +47,14 @@ class Footprints:
     radius: Tensor
     screen: Tensor
     at: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+    normals: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
+
+
+def footprints(splats: Splats, camera: Camera, near: float) -> Footprints:
+    """Project splats of any kind and geometry."""
+    if splats.kind == "surfel":
+        return surfels(splats, camera, near)
+    return (along_rays if splats.geometry == "ray" else gaussians)(splats, camera, near)
 
 
 def rotations(quats: Tensor) -> Tensor:
@@ -193,7 +201,7 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
     )
     half_axes = jacobian @ axes * splats.scales[:, None]
     raw = half_axes @ half_axes.transpose(1, 2)
-    footprint = raw + DILATION * torch.eye(2).to(raw)
+    footprint = raw + splats.dilation * torch.eye(2).to(raw)
     opacity = splats.opacities
     if splats.antialias:
         kept, whole = (m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0] for m in (raw, footprint))
@@ -204,8 +212,8 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
     # Density along a ray d0 + offset is largest at z (1 - offset . P d0 / d0 . P d0), P the precision matrix.
     ray = centre / z[:, None]
     weight = (splats.scales.amin(1, keepdim=True) / splats.scales) ** 2 * (axes * ray[:, :, None]).sum(1)
-    steep = (axes * weight[:, None]).sum(2)
-    steep = steep / (steep * ray).sum(1, keepdim=True)
+    upright = (axes * weight[:, None]).sum(2)
+    steep = upright / (upright * ray).sum(1, keepdim=True)
     slope = -z[:, None] * steep[:, :2] / torch.tensor([camera.fx, camera.fy], dtype=steep.dtype)
     with torch.no_grad():
         k = (2 * (opacity / ALPHA_MIN).clamp_min(1).log()).sqrt()
@@ -221,5 +229,68 @@ def gaussians(splats: Splats, camera: Camera, near: float) -> Footprints:
 
     thin = splats.scales.argmin(1)
     normal = facing(axes[torch.arange(len(z)), :, thin], centre.detach())
+    if splats.geometry == "plane":
+        size = upright.norm(dim=1, keepdim=True)
+        normal = torch.where(size > 0, -upright / torch.where(size > 0, size, 1.0), normal)
     radius = half.amax(1)
     return Footprints(drawn, centre[:, 2], colors(splats, camera), normal, screen.detach(), half, radius, screen, at)
+
+
+def along_rays(splats: Splats, camera: Camera, near: float) -> Footprints:
+    """Ellipsoids evaluated in space at the largest density along each ray (GOF, section 4.1).
+
+    In the frame in which the ellipsoid is the unit sphere the ray is o + t r with A = r.r, B = 2 o.r, C = o.o: depth is
+    t = -B / 2A and rho is C - B^2 / 4A = |o x r|^2 / A. Not drawn where the contour at CUTOFF reaches the camera plane.
+    """
+    to_camera = camera.world_to_camera.to(splats.means)
+    turn = to_camera[:3, :3]
+    centre = splats.means @ turn.T + to_camera[:3, 3]
+    axes = turn @ rotations(splats.quats)
+    focal = torch.tensor([camera.fx, camera.fy], dtype=centre.dtype, device=centre.device)
+    with torch.no_grad():
+        z = centre[:, 2]
+        drawn = (z > near) & (splats.opacities > ALPHA_MIN)
+        ahead = torch.where(drawn, z, 1.0)
+        sized = axes * splats.scales[:, None]
+        spread = (sized[:, :2] - (centre[:, :2] / ahead[:, None])[:, :, None] * sized[:, 2:]) * focal[:, None]
+        across = spread / ahead[:, None, None]  # (N, 2, 3): pixels per axis
+        xx, xy, yy = (across[:, i] * across[:, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        xx, xy, yy = xx.sum(1), xy.sum(1), yy.sum(1)
+        det = torch.linalg.cross(across[:, 0], across[:, 1]).square().sum(1)
+        drawn &= (MIN_FOOTPRINT**2 * torch.maximum(xx, yy) < det) & (MIN_FOOTPRINT**2 < torch.minimum(xx, yy))
+        drawn &= CUTOFF**2 * sized[:, 2].square().sum(1) < z**2
+    centre = torch.where(drawn[:, None], centre, torch.tensor([0, 0, 1]).to(centre))
+    scales, z = torch.where(drawn[:, None], splats.scales, 1.0), centre[:, 2]
+    least = scales.detach().amin(1, keepdim=True)  # all is in units of it, lest the squares leave the range
+    into = axes.transpose(1, 2) * (least / scales)[:, :, None]
+    origin = -(into @ centre[:, :, None])[:, :, 0]
+    screen = torch.stack([camera.fx * centre[:, 0] / z + camera.cx, camera.fy * centre[:, 1] / z + camera.cy], 1)
+    with torch.no_grad():
+        k = (2 * (splats.opacities / ALPHA_MIN).clamp_min(1).log()).clamp_max(CUTOFF**2)[:, None]
+        depth2 = torch.where(drawn, z**2 - k[:, 0] * sized[:, 2].square().sum(1), 1.0)[:, None]
+        tilt = (spread * sized[:, 2:]).sum(2)
+        off = -k * tilt / depth2
+        half = (off**2 + k * spread.square().sum(2) / depth2).sqrt()
+        reach = CUTOFF * scales.amax(1)
+        z_low, z_high = (z - reach).clamp_min(near)[:, None], (z + reach)[:, None]
+
+    def at(rows: Tensor, x: Tensor, y: Tensor, shift: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        offset = torch.stack([x[None] - screen[rows, :1], y[None] - screen[rows, 1:]], -1) - shift
+        # The ray is that through the centre and an offset; what the former adds to the cross product is 0.
+        turned = torch.einsum("nij,npj->npi", into[rows][:, :, :2], offset / focal)
+        start = origin[rows][:, None]
+        ray = turned - start / z[rows][:, None, None]
+        a, b = (ray**2).sum(-1), 2 * (start * ray).sum(-1)
+        rho = torch.linalg.cross(start.expand_as(turned), turned).square().sum(-1) / a / least[rows] ** 2
+        depth = -b / (2 * a)
+        return rho, clamped(depth, z_low[rows], z_high[rows]), splats.opacities[rows][:, None]
+
+    def normals(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        ray = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+        steep = torch.einsum("nki,nkj,pj->npi", into[rows], into[rows], ray)
+        return -steep / steep.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+
+    normal = facing(axes[torch.arange(len(z)), :, scales.argmin(1)], centre.detach())
+    radius = half.amax(1)
+    middle = screen.detach() + off
+    return Footprints(drawn, z, colors(splats, camera), normal, middle, half, radius, screen, at, normals)

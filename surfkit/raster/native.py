@@ -11,12 +11,9 @@ from torch import Tensor
 
 from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
-
-MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
-"""In the order of `api.Maps`; the kernels make the first 2, the first 5 or all of them."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +67,14 @@ class _Pass:
         self.radii = torch.empty(len(splats), dtype=torch.float32)
         self.native = native.module().Pass(
             splats.kind == "surfel",
+            GEOMETRIES.index(splats.geometry),
             self.arrays,
             camera.world_to_camera.double().flatten().tolist(),
             [camera.fx, camera.fy, camera.cx, camera.cy],
             camera.width,
             camera.height,
             near,
+            splats.dilation,
             splats.antialias,
             rim,
             self.seen,

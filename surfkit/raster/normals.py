@@ -22,8 +22,8 @@ def normals_of(depth: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     Returns:
         (3, H - 2, W - 2) unit normals of the inner pixels in the camera frame, facing the camera, and a mask.
     """
-    x = (torch.arange(camera.width, dtype=depth.dtype) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=depth.dtype) + 0.5 - camera.cy) / camera.fy
+    x = (torch.arange(camera.width, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, dtype=depth.dtype, device=depth.device) + 0.5 - camera.cy) / camera.fy
     points = torch.stack([depth * x, depth * y[:, None], depth])
     across = points[:, 1:-1, 2:] - points[:, 1:-1, :-2]
     down = points[:, 2:, 1:-1] - points[:, :-2, 1:-1]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, T_MIN, Gradients, Maps, Rasterizer, Render, Splats
-from surfkit.raster.footprints import Footprints, gaussians, surfels
+from surfkit.raster.footprints import Footprints, footprints
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -42,7 +42,7 @@ def draw(splats: Splats, camera: Camera, near: float, *, cull: bool = True) -> D
         cull: Skip splats whose box misses a tile; off, every splat is evaluated at every pixel.
     """
     validate(splats)
-    prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
+    prints = footprints(splats, camera, near)
     near_threshold = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     seen = torch.zeros(len(splats), dtype=torch.bool)
     blocks = []
@@ -123,7 +123,11 @@ def _blend(
     ahead, ahead1, ahead2 = (torch.cumsum(weight * inverse**p, 0) - weight * inverse**p for p in (0, 1, 2))
     bend = (weight * (inverse**2 * ahead + ahead2 - 2 * inverse * ahead1)).sum(0)
     parts = [prints.color[rows].T @ weight, total[None], (weight * depth).sum(0)[None], median[None]]
-    block = torch.cat([*parts, prints.normal[rows].T @ weight, bend[None]])
+    if prints.normals is None:
+        normal = prints.normal[rows].T @ weight
+    else:
+        normal = torch.einsum("npi,np->ip", prints.normals(rows, x, y), weight)
+    block = torch.cat([*parts, normal, bend[None]])
     return block, risky, touched
 
 
@@ -150,7 +154,7 @@ class Reference(Rasterizer):
         total = torch.zeros(len(splats), dtype=splats.means.dtype)
         count = torch.zeros(len(splats), dtype=torch.int64)
         with torch.no_grad():
-            prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
+            prints = footprints(splats, camera, near)
             for tile in _tiles(camera):
                 rows, x, y = _in_tile(prints, tile, True), *_pixels(tile, total.dtype)
                 alpha, before, *_ = _alphas(prints, rows, x, y)
@@ -165,7 +169,7 @@ class Reference(Rasterizer):
         inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
         found = torch.full_like(z, torch.nan)
         with torch.no_grad():
-            prints = (surfels if splats.kind == "surfel" else gaussians)(splats, camera, near)
+            prints = footprints(splats, camera, near)
             rows = prints.drawn.nonzero()[:, 0]
             for some in inside.nonzero()[:, 0].split(TILE * TILE):
                 rho, depth, opacity = prints.at(rows, x[some], y[some], x.new_zeros(2))
@@ -180,7 +184,8 @@ class ReferenceRender(Render):
     def __init__(self, splats: Splats, camera: Camera, near: float, left_out: set[str]) -> None:
         leaves = {name: value.detach().requires_grad_() for name, value in splats.tensors().items()}
         with torch.enable_grad():
-            self._drawn = draw(Splats(splats.kind, *leaves.values(), splats.antialias), camera, near)
+            form = splats.antialias, splats.dilation, splats.geometry
+            self._drawn = draw(Splats(splats.kind, *leaves.values(), *form), camera, near)
         self._leaves, self._camera = leaves, camera
         self._surfel = splats.kind == "surfel"
         self._half_image = torch.tensor([camera.width / 2, camera.height / 2]).to(splats.means)

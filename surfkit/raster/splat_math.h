@@ -19,8 +19,11 @@ constexpr float kAlphaMin = 1.0f / 255.0f;
 constexpr float kTransmittanceMin = 1e-4f;
 constexpr double kCutoffSquared = 11.082527090316832;  // 2 ln 255: opacity 1 falls to kAlphaMin at this many sigmas^2
 constexpr double kEdgeOn = 2e-3;                       // radians between a disc's plane and its centre's ray
-constexpr double kDilation = 0.3;                      // px^2, added to a gaussian's footprint
 constexpr double kAntialiasFloor = 2.5e-5;
+constexpr double kMinFootprint = 1e-6;  // px, of gaussians along rays, which nothing widens
+
+// How gaussians are evaluated; see `Splats.geometry` in raster/api.py.
+enum Geometry { kAxis = 0, kPlane = 1, kRay = 2 };
 
 // ---- small vectors
 
@@ -300,7 +303,8 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
     const Vec<R> u = o.h.u - o.ax * o.h.w, v = o.h.v - o.ay * o.h.w;
     const Vec<R> a = cross(v, o.h.w), b = cross(o.h.w, u), c = cross(u, v);
     R size = 0;
-    for (const Vec<R>& q : {a, b, c})
+    const Vec<R> columns[3] = {a, b, c};
+    for (const Vec<R>& q : columns)
         size = largest(size, largest(magnitude(q.x), largest(magnitude(q.y), magnitude(q.z))));
     if (!(size > 0)) return false;
     o.unit = size;
@@ -379,16 +383,29 @@ SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const Came
 
 // ---- gaussians
 
+// How gaussians are evaluated.
+struct GaussianForm {
+    double dilation;      // px^2, added to the footprint, which makes it at least about a pixel wide; not along rays
+    bool is_compensated;  // whether the opacity is lowered by what that adds to the footprint
+    Geometry geometry;
+};
+
 template <class R>
 struct Gaussian {
     R x, y;              // projected centre, pixels
     R l00, l01, l11;     // rho = (l00 dx + l01 dy)^2 + (l11 dy)^2
-    R compensation;      // factor on the opacity (antialias)
+    R compensation;      // factor on the opacity
     R slope_x, slope_y;  // depth per pixel
     R z, z_low, z_high;
     Vec<R> normal;
     int thin;  // the axis of the smallest scale
     R flip;
+    R upright;  // length of the vector that the plane's normal is made of; 0 where the normal is an axis
+    // Along rays rho is r / (u^2 + kappa r) and the depth z u / (u^2 + kappa r), with r that of the affine footprint,
+    // u = 1 - slope . offset / z and 1 / kappa the camera's squared distance in sigmas. The normal is the direction of
+    // -(steep + dx steep_x + dy steep_y).
+    R kappa;
+    Vec<R> steep, steep_x, steep_y;
     Bound<R> bound;
     // for the backward
     R cov[3], raw[2];  // footprint xx, xy, yy; xx and yy before dilation
@@ -405,11 +422,52 @@ SPLAT_FN Vec<R> column(const Mat<R>& m, int k) {
     return k == 0 ? m.c0 : k == 1 ? m.c1 : m.c2;
 }
 
+// Determinant of the footprint without dilation, by a sum of squares: nothing cancels in it.
 template <class R>
-SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, bool antialias,
+SPLAT_FN R ray_footprint(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, R jx, R jy) {
+    R det = 0, mx[3], my[3];
+    for (int k = 0; k < 3; k++) {
+        const Vec<R> r = column(p.axes, k);
+        mx[k] = s.scale[k] * cam.fx / p.c.z * (r.x - jx * r.z);
+        my[k] = s.scale[k] * cam.fy / p.c.z * (r.y - jy * r.z);
+        for (int l = 0; l < k; l++) det += (mx[k] * my[l] - mx[l] * my[k]) * (mx[k] * my[l] - mx[l] * my[k]);
+    }
+    return det;
+}
+
+// What evaluation along rays adds to a gaussian, with the exact bound (GOF, section 4.1). False where the contour at
+// the cutoff reaches the camera plane.
+template <class R>
+SPLAT_FN bool ray_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, R q, R smin, R k2,
+                          Gaussian<R>& o) {
+    const Vec<R> c = p.c;
+    R deep = 0, tx = 0, ty = 0;
+    o.steep = o.steep_x = o.steep_y = {0, 0, 0};
+    for (int k = 0; k < 3; k++) {
+        const Vec<R> r = column(p.axes, k);
+        const R e = (smin / s.scale[k]) * (smin / s.scale[k]), size = s.scale[k] * s.scale[k];
+        deep += size * r.z * r.z;
+        tx += size * cam.fx * (r.x - o.jx * r.z) * r.z;
+        ty += size * cam.fy * (r.y - o.jy * r.z) * r.z;
+        o.steep = o.steep + (e * (r.x * o.jx + r.y * o.jy + r.z)) * r;
+        o.steep_x = o.steep_x + (e * r.x / cam.fx) * r;
+        o.steep_y = o.steep_y + (e * r.y / cam.fy) * r;
+    }
+    if (!(R(kCutoffSquared) * deep < c.z * c.z && q > 0)) return false;
+    const R more = smallest(k2, R(kCutoffSquared)), rest = c.z * c.z - more * deep, mx = -more * tx / rest,
+            my = -more * ty / rest, wide = more * c.z * c.z / rest;
+    o.kappa = smin * smin / (c.z * c.z * q);
+    o.bound = {o.x + mx, o.y + my, mx * mx + wide * o.cov[0], mx * my + wide * o.cov[1], my * my + wide * o.cov[2],
+               o.x + mx, o.y + my, R(-1)};
+    return true;
+}
+
+template <class R>
+SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm& form,
                                Gaussian<R>& o) {
     const Vec<R> c = p.c;
     if (!(c.z > cam.near)) return false;
+    const bool rays = form.geometry == kRay;
     const R tan_x = R(0.5) * cam.width / cam.fx, tan_y = R(0.5) * cam.height / cam.fy;
     const R dx = c.x / c.z, dy = c.y / c.z;
     o.x = cam.fx * dx + cam.cx;
@@ -417,6 +475,7 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     // Far outside the image the affine approximation explodes: the Jacobian is taken at the edge of a wider view.
     o.jx = smallest(largest(dx, -(cam.cx / cam.fx + R(0.3) * tan_x)), (cam.width - cam.cx) / cam.fx + R(0.3) * tan_x);
     o.jy = smallest(largest(dy, -(cam.cy / cam.fy + R(0.3) * tan_y)), (cam.height - cam.cy) / cam.fy + R(0.3) * tan_y);
+    if (rays) o.jx = dx, o.jy = dy;
     o.clamped_x = o.jx != dx;
     o.clamped_y = o.jy != dy;
     R xx = 0, xy = 0, yy = 0, smin = s.scale[0], smax = s.scale[0];
@@ -433,16 +492,21 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     }
     o.raw[0] = xx;
     o.raw[1] = yy;
-    const R raw_det = largest(xx * yy - xy * xy, R(0));
-    xx += R(kDilation);
-    yy += R(kDilation);
+    const R raw_det = rays ? ray_footprint(s, p, cam, dx, dy) : largest(xx * yy - xy * xy, R(0));
+    const R dilation = rays ? R(0) : R(form.dilation);
+    xx += dilation;
+    yy += dilation;
     o.cov[0] = xx;
     o.cov[1] = xy;
     o.cov[2] = yy;
     // The dilation keeps the determinant away from 0; summing it apart avoids the cancellation in xx yy - xy xy.
-    const R det = raw_det + R(kDilation) * (o.raw[0] + o.raw[1]) + R(kDilation) * R(kDilation);
+    const R det = raw_det + dilation * (o.raw[0] + o.raw[1]) + dilation * dilation;
     if (!(det > 0)) return false;
-    o.compensation = antialias ? square_root(largest(raw_det / det, R(kAntialiasFloor))) : R(1);
+    if (rays) {
+        const R least = R(kMinFootprint) * R(kMinFootprint);
+        if (!(least * largest(xx, yy) < det && least < smallest(xx, yy))) return false;
+    }
+    o.compensation = form.is_compensated ? square_root(largest(raw_det / det, R(kAntialiasFloor))) : R(1);
     const R opacity = s.opacity * o.compensation;
     if (!(opacity > R(kAlphaMin))) return false;
     o.l00 = square_root(yy / det);
@@ -468,7 +532,12 @@ SPLAT_FN bool gaussian_project(const SplatIn<R>& s, const Posed<R>& p, const Cam
     o.normal = column(p.axes, o.thin);
     o.flip = dot(o.normal, c) > 0 ? R(-1) : R(1);
     o.normal = o.flip * o.normal;
-    return true;
+    o.upright = 0;
+    if (form.geometry == kPlane) {
+        o.upright = square_root(dot(g, g));
+        if (o.upright > 0) o.normal = (-1 / o.upright) * g;
+    }
+    return !rays || ray_project(s, p, cam, q, smin, k2, o);
 }
 
 // What the pixels hand back for a gaussian: moments of e = dL/d(power) about the centre, and the rest.
@@ -478,14 +547,45 @@ struct GaussianSums {
     R z, z_x, z_y;  // sums of dL/dz, and of it times the offset
     Vec<R> normal;
     R opacity;  // of the compensated opacity
+    R along;    // sum of dL/d(slope . offset): that of dL/dz, except along rays
 };
 
+// What the pixels hand back for a gaussian along rays. e is of the affine footprint's power; its moments are by
+// p = l00 dx + l01 dy and q = l11 dy.
 template <class R>
-SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, bool antialias,
-                                const Gaussian<R>& o, const GaussianSums<R>& g, SplatGrad<R>& out) {
+struct RaySums {
+    R e_p, e_q, e_pp, e_pq, e_qq;
+    R z, u, u_x, u_y, kappa;  // z: of the factor z in the depth alone
+    Vec<R> steep, steep_x, steep_y;
+    R opacity;
+};
+
+// The same in terms of the depth plane z + slope . offset = z (2 - u).
+template <class R>
+SPLAT_FN GaussianSums<R> plane_sums(const Gaussian<R>& o, const RaySums<R>& g) {
+    const R z = g.z + (o.slope_x * g.u_x + o.slope_y * g.u_y) / (o.z * o.z);
+    const R a = o.l00, b = o.l01, c = o.l11, e_y = g.e_q / c, e_yy = g.e_qq / (c * c), e_py = g.e_pq / c;
+    return {(g.e_p - b * e_y) / a,
+            e_y,
+            (g.e_pp - 2 * b * e_py + b * b * e_yy) / (a * a),
+            (e_py - b * e_yy) / a,
+            e_yy,
+            z,
+            -g.u_x / o.z,
+            -g.u_y / o.z,
+            {0, 0, 0},
+            g.opacity,
+            -g.u / o.z};
+}
+
+template <class R>
+SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, const GaussianForm& form,
+                                const Gaussian<R>& o, const GaussianSums<R>& g, const RaySums<R>* ray,
+                                SplatGrad<R>& out) {
     const Vec<R> c = p.c;
     const R qa = o.l00 * o.l00, qb = o.l00 * o.l01, qc = o.l01 * o.l01 + o.l11 * o.l11;
-    const R mean_x = qa * g.e_x + qb * g.e_y - o.slope_x * g.z, mean_y = qb * g.e_x + qc * g.e_y - o.slope_y * g.z;
+    const R mean_x = qa * g.e_x + qb * g.e_y - o.slope_x * g.along,
+            mean_y = qb * g.e_x + qc * g.e_y - o.slope_y * g.along;
     out.signal[0] = mean_x * R(0.5) * cam.width;
     out.signal[1] = mean_y * R(0.5) * cam.height;
     // dL/d(footprint) = -Q G Q with G = -1/2 sum e d d^T.
@@ -493,7 +593,7 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
     const R txx = qa * gxx + qb * gxy, txy = qa * gxy + qb * gyy, tyx = qb * gxx + qc * gxy, tyy = qb * gxy + qc * gyy;
     R dxx = -(txx * qa + txy * qb), dxy = -(txx * qb + txy * qc), dyy = -(tyx * qb + tyy * qc);
     out.opacity = g.opacity * o.compensation;
-    if (antialias) {
+    if (form.is_compensated) {
         const R det = qa > 0 ? o.cov[2] / qa : R(1), raw_det = largest(o.raw[0] * o.raw[1] - o.cov[1] * o.cov[1], R(0));
         if (raw_det / det > R(kAntialiasFloor)) {
             const R dratio = g.opacity * s.opacity / (2 * o.compensation), d0 = dratio / det,
@@ -557,7 +657,37 @@ SPLAT_FN void gaussian_backward(const SplatIn<R>& s, const Posed<R>& p, const Ca
         dc.y += dd0.y / c.z;
         dc.z += -(dd0.x * c.x + dd0.y * c.y) / zz;
     }
-    *columns[o.thin] = *columns[o.thin] + o.flip * g.normal;
+    if (ray) {
+        for (int k = 0; k < 3; k++) {
+            const Vec<R> r = column(p.axes, k);
+            // W r and W^T r with W = sum of dL/d(steep at the pixel) (ray)^T.
+            const Vec<R> wr = h[k] * ray->steep + (r.x / cam.fx) * ray->steep_x + (r.y / cam.fy) * ray->steep_y;
+            const R ts = dot(r, ray->steep);
+            const Vec<R> wtr =
+                ts * d0 + Vec<R>{dot(r, ray->steep_x) / cam.fx, dot(r, ray->steep_y) / cam.fy, R(0)};
+            const R dk = ray->kappa * o.kappa * 2 * e[k] * h[k] / q;
+            *columns[k] = *columns[k] + e[k] * (wr + wtr) - dk * d0;
+            out.scale[k] += (dk * h[k] - 2 * e[k] * dot(r, wr)) / s.scale[k];
+            dc.x -= dk * r.x / c.z;
+            dc.y -= dk * r.y / c.z;
+            dc.z += dk * (r.x * c.x + r.y * c.y) / zz;
+        }
+        dc.z -= 2 * ray->kappa * o.kappa / c.z;
+    } else if (o.upright > 0) {
+        // The normal is -g / |g| with g the sum of e h r, whose length says nothing.
+        const Vec<R> t = (-1 / o.upright) * (g.normal - dot(g.normal, o.normal) * o.normal);
+        for (int k = 0; k < 3; k++) {
+            const Vec<R> r = column(p.axes, k);
+            const R along = dot(r, t), dh = e[k] * along;
+            out.scale[k] -= 2 * e[k] / s.scale[k] * h[k] * along;
+            *columns[k] = *columns[k] + (e[k] * h[k]) * t + dh * d0;
+            dc.x += dh * r.x / c.z;
+            dc.y += dh * r.y / c.z;
+            dc.z -= dh * (r.x * c.x + r.y * c.y) / zz;
+        }
+    } else {
+        *columns[o.thin] = *columns[o.thin] + o.flip * g.normal;
+    }
     pose_backward(s, cam, p.length, dc, daxes, out);
 }
 

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from surfkit import native
+from surfkit.raster.cuda import ssim as gpu
 
 C1, C2 = 0.01**2, 0.03**2
 RADIUS, SIGMA = 5, 1.5
@@ -21,6 +22,8 @@ def ssim(x: Tensor, y: Tensor) -> Tensor:
     """
     if native.module() is not None and x.device.type == "cpu" and x.dtype == torch.float32:
         return _Fused.apply(x, y)
+    if x.device.type == "cuda" and x.dtype == torch.float32:
+        return _OnGpu.apply(x, y)
     return ssim_reference(x, y)
 
 
@@ -65,3 +68,19 @@ class _Fused(torch.autograd.Function):
     @staticmethod
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         return upstream * ctx.gradient, None
+
+
+class _OnGpu(torch.autograd.Function):
+    """By the CUDA kernels; nothing waits for the GPU."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, y: Tensor) -> Tensor:
+        x, y = x.detach().contiguous(), y.detach().to(x).contiguous()
+        value, derivatives = gpu.forward(x, y, ctx.needs_input_grad[0])
+        ctx.save_for_backward(x, y, *derivatives)
+        return value
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        x, y, *derivatives = ctx.saved_tensors
+        return gpu.backward(x, y, tuple(derivatives), upstream), None

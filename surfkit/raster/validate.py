@@ -7,7 +7,7 @@ import math
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.raster.api import KINDS, Splats
+from surfkit.raster.api import GEOMETRIES, KINDS, Splats
 
 
 def validate(splats: Splats, values: bool = True) -> None:
@@ -21,6 +21,13 @@ def validate(splats: Splats, values: bool = True) -> None:
             f"splats of kind {splats.kind!r}: the rasterizers draw {'s and '.join(KINDS)}s; the primitive needs a "
             "`render` of its own, a `contribution` for blocks and trimming, and an `opacity_before` for mesh:tetra"
         )
+    if splats.geometry not in GEOMETRIES or (splats.kind == "surfel" and splats.geometry != "axis"):
+        raise BadInput(
+            f"splats.geometry: {splats.geometry!r} of kind {splats.kind!r}; gaussians have {', '.join(GEOMETRIES)}, "
+            "surfels only axis"
+        )
+    if splats.geometry == "ray" and splats.antialias:
+        raise BadInput("splats.antialias: gaussians of geometry 'ray' have no dilation to make up for; leave it off")
     count = len(splats)
     columns = 2 if splats.kind == "surfel" else 3
     wanted = {"means": (3,), "quats": (4,), "scales": (columns,), "opacities": (), "sh": None}

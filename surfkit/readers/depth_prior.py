@@ -180,11 +180,12 @@ def read_priors(
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
 
-def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
+def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float, float] = SCALE_BAND) -> Alignment:
     """How the depth maps of a data set fit its sparse points, and a warning where there are none.
 
     Photographs without a map, or with one that cannot be used, are listed in one warning; where `normals` are wanted
-    too, another one says that there are none.
+    too, another one says that there are none. A map whose scale is outside `band`, lowest and highest multiple of the
+    median over all maps, cannot be used.
     """
     maps = prior_files(data, scene)
     if not maps:
@@ -196,7 +197,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False) -> Alignment:
         answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
-    for at in _outliers(fits):
+    for at in _outliers(fits, band):
         reasons[scene.train[at].name] = "its scale is far from that of the other images"
         fits[at] = None
     if not any(fits):
@@ -300,13 +301,14 @@ def _check_units(values: np.ndarray, inverse: np.ndarray) -> None:
         raise BadInput("its depths are not those of the sparse points")
 
 
-def _outliers(fits: Sequence[Fit | None]) -> list[int]:
+def _outliers(fits: Sequence[Fit | None], band: tuple[float, float]) -> list[int]:
     """Positions of the images whose alignment failed; maps that came in input units share one scale."""
     scales = {at: fit.scale for at, fit in enumerate(fits) if fit is not None and not fit.file.aligned}
     if not scales:
         return []
     usual = float(np.median(list(scales.values())))
-    return [at for at, scale in scales.items() if not usual / SCALE_BAND <= scale <= usual * SCALE_BAND]
+    low, high = (usual * multiple for multiple in band)
+    return [at for at, scale in scales.items() if not low <= scale <= high]
 
 
 def _warn_of_leaks(data: Data, scene: Scene) -> None:

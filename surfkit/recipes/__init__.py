@@ -1,6 +1,7 @@
 """Recipes by name."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from surfkit.compress.vectree import Vectree
@@ -19,7 +20,7 @@ from surfkit.primitives.flat3d import Flat3D
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
-from surfkit.recipes import city
+from surfkit.recipes import city, city_datasets
 from surfkit.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS
 from surfkit.refine.light import DistilSH, PruneAndRecover, slowing
 from surfkit.train.stage import Stage
@@ -44,6 +45,13 @@ SURFELS = Recipe(
     mesh=TSDF(),
 )
 
+# "2DGS*" of the paper: what CityGaussian does with 3DGS, without anything that CityGaussianV2 changes in 2DGS.
+SURFELS_IN_BLOCKS = replace(
+    SURFELS,
+    about="2DGS in blocks that are tuned separately as those of CityGaussian (2DGS* of the paper of CityGaussianV2)",
+    partition=city.FIRST.partition,
+    tune=replace(SURFELS.pretrain, rates=city.FIRST.tune.rates),
+)
 
 FLAT = Recipe(
     about="3D Gaussians with one axis pinned to almost nothing: between 3dgs and 2dgs",
@@ -52,10 +60,15 @@ FLAT = Recipe(
     mesh=TSDF(),
 )
 
+MIP = Recipe(
+    about="3DGS with a 3D smoothing and a 2D filter, for views from nearer or further away (Mip-Splatting, 2024)",
+    primitive=Gaussian3D(antialias=True, dilation=0.1, smoothing=0.2),
+)
+
 ABSOLUTE = Recipe(
     about="3DGS that splits by the sizes of the pixels' gradients, which signs do not cancel (AbsGS, Ye et al. 2024)",
     primitive=Gaussian3D(),
-    pretrain=Stage(signal=AbsGradient(), densify=ADC(threshold=4e-4, small=0.001)),
+    pretrain=Stage(signal=AbsGradient(), densify=ADC(split_threshold=4e-4, small=0.001)),
 )
 
 TRIMMED = Recipe(
@@ -81,7 +94,11 @@ LIGHT = Recipe(
     about="3DGS, then two thirds of the points dropped, simpler colours, most of them codes (LightGaussian, 2023)",
     primitive=Gaussian3D(),
     refine=(
-        PruneAndRecover(Stage(5_000, densify=None, prune=(Importance(at=(0,), ratio=0.66),), rates=LIGHT_RATES)),
+        PruneAndRecover(
+            Stage(
+                5_000, densify=None, prune=(Importance(at=(0,), ratio=0.66, score="significance"),), rates=LIGHT_RATES
+            )
+        ),
         DistilSH(Stage(5_000, densify=None, rates=LIGHT_RATES | {"opacities": LearningRate(0.0)})),
     ),
     compress=Vectree(ratio=0.6),
@@ -94,30 +111,41 @@ IMPORTED = Recipe(
 )
 
 
+RECIPES = {
+    "2dgs": SURFELS,
+    "2dgs-blocks": SURFELS_IN_BLOCKS,
+    "3dgs": GAUSSIANS,
+    "flat3dgs": FLAT,
+    "mip-splatting": MIP,
+    "absgs": ABSOLUTE,
+    "trim2dgs": TRIMMED,
+    "lightgaussian": LIGHT,
+    "surface": SURFACE,
+    "surface-blocks": SURFACE_BLOCKS,
+    "stereo": STEREO,
+    "import": IMPORTED,
+    "citygs": city.FIRST,
+    "citygs2-coarse": city.COARSE,
+    "citygs2": city.CITY,
+    "citygs2-short": city.SHORT,
+    "citygs2-s": city.SMALL,
+    "citygs2-t": city.TINY,
+    "citygs2-residence": city_datasets.RESIDENCE,
+    "citygs2-russian": city_datasets.RUSSIAN,
+    "citygs2-modern": city_datasets.MODERN,
+    "citygs2-aerial": city_datasets.AERIAL,
+    "citygs2-street": city_datasets.STREET,
+    "citygs2-released": city_datasets.RELEASED,
+    "citygs2-released-aerial": city_datasets.RELEASED_AERIAL,
+    "citygs2-released-street": city_datasets.RELEASED_STREET,
+}
+"""The recipes of surfkit, by name."""
+
+
 @hookimpl
 def surfkit_recipes() -> Mapping[str, Recipe]:
     """The recipes of surfkit."""
-    return {
-        "2dgs": SURFELS,
-        "3dgs": GAUSSIANS,
-        "flat3dgs": FLAT,
-        "absgs": ABSOLUTE,
-        "trim2dgs": TRIMMED,
-        "lightgaussian": LIGHT,
-        "surface": SURFACE,
-        "surface-blocks": SURFACE_BLOCKS,
-        "stereo": STEREO,
-        "import": IMPORTED,
-        "citygs": city.FIRST,
-        "citygs2-coarse": city.COARSE,
-        "citygs2": city.CITY,
-        "citygs2-short": city.SHORT,
-        "citygs2-s": city.SMALL,
-        "citygs2-t": city.TINY,
-        "citygs2-released": city.RELEASED,
-        "citygs2-aerial": city.AERIAL,
-        "citygs2-street": city.STREET,
-    }
+    return RECIPES
 
 
 @hookimpl

@@ -15,8 +15,7 @@ from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.tsdf import TSDF
-from surfkit.partition.assign import SSIMDifference
-from surfkit.partition.grid import ContractedGrid, QuantileGrid
+from surfkit.partition.grid import ContractedGrid
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
@@ -39,8 +38,9 @@ def cut_short(stage: Stage, steps: int) -> Stage:
     rates = {
         n: rate if rate.end is None else replace(rate, end=rate.at(steps, stage.steps)) for n, rate in RATES.items()
     }
-    depth = replace(stage.losses["depth"], end=stage.losses["depth"].weight_at(steps, stage.steps))
-    return replace(stage, steps=steps, rates=rates, losses=stage.losses | {"depth": depth})
+    fading = {name: loss for name, loss in stage.losses.items() if isinstance(loss, DepthRegression)}
+    losses = {name: replace(loss, end=loss.weight_at(steps, stage.steps)) for name, loss in fading.items()}
+    return replace(stage, steps=steps, rates=rates, losses=stage.losses | losses)
 
 
 # The upper half of the paper's ablation table, from `recipes.ablations.COARSE_BASELINE` to here.
@@ -89,55 +89,6 @@ TINY = replace(
     SMALL,
     about="CityGaussianV2, tiny: as small, and the blocks begin from the first 7,000 steps of pretraining",
     pretrain=cut_short(SMALL.pretrain, 7_000),
-)
-
-AERIAL = replace(
-    CITY,
-    about="CityGaussianV2 for aerial photographs of a whole city, as in MatrixCity: 36 blocks, densified less often",
-    partition=ContractedGrid(blocks=(6, 6)),
-    tune=replace(CITY.tune, densify=ADC(cull_opacity=0.005, every=200, filters=FILTERS)),
-)
-
-# Streets are seen by few views, and none sees far: small steps, rare edits, opacities that are never reset, no trim.
-STREET = replace(
-    CITY,
-    about="CityGaussianV2 for photographs from streets, as in MatrixCity: 20 blocks, slow and rarely densified",
-    pretrain=replace(
-        COARSE.pretrain,
-        losses=LOSSES | {"depth": DepthRegression(start=1.0, end=0.1)},
-        densify=ADC(threshold=5e-5, start=4_000, every=1_000, reset_every=20_000, filters=FILTERS),
-        rates={"means": LearningRate(1.6e-5, 1.6e-6), "scales": LearningRate(1e-3)},
-    ),
-    partition=ContractedGrid(blocks=(5, 4)),
-    assign=SSIMDifference(threshold=0.01),
-    tune=replace(
-        CITY.tune,
-        steps=60_000,
-        losses=TUNED_LOSSES | {"depth": DepthRegression(start=0.5, end=0.025)},
-        densify=ADC(threshold=7.5e-5, until=30_000, every=1_000, reset_every=30_000, filters=FILTERS),
-        prune=(),
-        rates={"means": LearningRate(8e-6, 8e-7), "scales": LearningRate(2.5e-3)},
-    ),
-)
-
-# What the released code does in another way than the paper says, on GauU-Scene; the rest is as in `CITY`.
-RELEASED = replace(
-    CITY,
-    about="CityGaussianV2 as in its released code for GauU-Scene, where that differs from the paper",
-    pretrain=replace(
-        CITY.pretrain,
-        losses=LOSSES | {"depth": DepthRegression(start=0.5, end=0.0025, error="ssim")},
-        signal=LossGradient(terms=("ssim", "normal", "depth")),
-    ),
-    partition=QuantileGrid(blocks=(2, 2)),
-    tune=replace(
-        CITY.tune,
-        losses=TUNED_LOSSES | {"depth": DepthRegression(start=0.5, end=0.025, error="ssim")},
-        signal=LossGradient(terms=("ssim", "normal", "depth")),
-        prune=(Trim(ratio=0.05, score="released", recovery=0),),
-    ),
-    context="densified",
-    compress=Vectree(),
 )
 
 # The first version: no surface, but the pipeline that the second goes on from.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 from surfkit.core.registry import Component
+from surfkit.mesh.base import Mesher, MeshInput
 from surfkit.primitives.base import Primitive
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.scene.scene import View
 from surfkit.train.stage import Stage
@@ -33,6 +35,23 @@ class Refine(Component):
     def params(self, params: Columns) -> Columns:
         """Raw parameters to begin with, given those of the model before."""
         return params
+
+    def begin(self, before: SplatModel, to_mesh: Callable[[Mesher], MeshInput]) -> Columns:
+        """Raw parameters to begin with; by default those that `params` gives.
+
+        Args:
+            before: The model before.
+            to_mesh: That model and its training views, as one of the `meshers` needs them.
+
+        Raises:
+            BadInput: The model cannot be refined so.
+        """
+        return self.params(before.params)
+
+    @property
+    def meshers(self) -> tuple[Mesher, ...]:
+        """What it makes meshes with; before anything is trained they are asked whether they can work."""
+        return ()
 
     def views(self, views: Sequence[View], seed: int) -> tuple[View, ...]:
         """The cameras to look from, given those of the training photographs: all of them, unless it is taught.

@@ -7,27 +7,47 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.registry import unknown
+from surfkit.core.events import Warned, emit
+from surfkit.core.registry import offered, offered_once, unknown
+from surfkit.core.schedule import rescale
 from surfkit.core.tree import evolve
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe, unused, without_unused
+from surfkit.report.columns import COLUMNS
 
 
 @dataclass(frozen=True)
 class Row:
-    """A recipe that differs from the last kept row above in a few values.
+    """A recipe that differs from that of a row above in a few values, or one of its own.
 
     Attributes:
         label: Its name in the table.
         change: New values, by dotted path into the recipe.
         kept: Later rows build on this one; False for a change that was tried and given up.
-        paper: What was published for it, by the names of `surfkit.report.compare`; points as a count.
+        paper: What was published for it, by the names of `surfkit.report.columns`: seconds, bytes and counts as such.
+        recipe: What is changed; None for that of the row it builds on.
+        on: Label of the row above that it builds on, and that it is compared with; None for the last kept one.
+        group: Heading of the part of the table that begins with it; "" goes on with the part above. The best values are
+            those of each part.
     """
 
     label: str
     change: Mapping[str, Any] = field(default_factory=dict)
     kept: bool = True
     paper: Mapping[str, float] = field(default_factory=dict)
+    recipe: Recipe | None = None
+    on: str | None = None
+    group: str = ""
+
+    def __post_init__(self) -> None:
+        for name in self.paper:
+            if name not in COLUMNS:
+                raise BadInput(f"row {self.label!r}, paper: {unknown('column', name, COLUMNS)}")
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether it is a change that was tried and not kept, rather than a method of its own."""
+        return not self.kept and self.recipe is None
 
 
 @dataclass(frozen=True)
@@ -50,22 +70,47 @@ class Table:
         labels = [row.label for row in self.rows]
         if twice := [label for label in labels if labels.count(label) > 1]:
             raise BadInput(f"table:{self.name} has two rows {twice[0]!r}; each needs a label of its own")
+        for at, row in enumerate(self.rows):
+            if row.on is not None and row.on not in labels[:at]:
+                raise BadInput(f"table:{self.name}, row {row.label!r}: {unknown('row above', row.on, labels[:at])}")
+
+
+def offered_tables() -> dict[str, Table]:
+    """The tables that packages offer, by name, each with the rows that other packages add to it.
+
+    Raises:
+        BadInput: Two packages offer the same table, or the same row of a table.
+    """
+    tables = offered_once("surfkit_tables", "an ablation table")
+    for owner, name, rows in offered("surfkit_rows"):
+        if name not in tables:
+            emit(Warned(f"plugin {owner} adds rows to table:{name}, which no package offers; they are left out"))
+            continue
+        tables[name] = replace(tables[name], rows=(*tables[name].rows, *rows))
+    return tables
 
 
 def build(table: Table) -> dict[str, Recipe]:
     """The recipe of every row, by label."""
-    recipes, base = {}, table.base
+    recipes, below = {}, built_on(table)
     for row in table.rows:
-        recipe = base
-        for path, value in row.change.items():
-            try:
-                recipe = evolve(recipe, path, value)
-            except BadInput as error:
-                raise BadInput(f"table:{table.name}, row {row.label!r}: {error}") from error
-        recipe = settled(recipe, row, table)
-        recipes[row.label] = replace(recipe, about=f"{row.label}, a row of table:{table.name}")
-        base = recipe if row.kept else base
+        recipes[row.label] = with_changes(table, row, recipes.get(below[row.label], table.base))
     return recipes
+
+
+def with_changes(table: Table, row: Row, base: Recipe) -> Recipe:
+    """The recipe of a row that is built on another's.
+
+    Raises:
+        BadInput: The row cannot be built.
+    """
+    recipe = row.recipe or base
+    for path, value in row.change.items():
+        try:
+            recipe = evolve(recipe, path, value)
+        except BadInput as error:
+            raise BadInput(f"table:{table.name}, row {row.label!r}: {error}") from error
+    return replace(settled(recipe, row, table), about=f"{row.label}, a row of table:{table.name}")
 
 
 def settled(recipe: Recipe, row: Row, table: Table) -> Recipe:
@@ -84,7 +129,7 @@ def built_on(table: Table) -> dict[str, str | None]:
     """The label of the row that each row is built on, by label; None for a first one."""
     found, last = {}, None
     for row in table.rows:
-        found[row.label] = last
+        found[row.label] = row.on or last
         last = row.label if row.kept else last
     return found
 
@@ -94,7 +139,9 @@ def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
     if steps is None or recipe.length is None:
         return recipe
     share = recipe.length / table.base.length if table.base.length else 1.0
-    return with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
+    whole = with_steps(recipe, steps if steps < 1 else max(1, round(steps * share)))
+    # The factor of the base is taken as it is: stages after a shorter one would else be a little longer than others'.
+    return rescale(recipe, steps / table.base.length) if recipe.has_stages and table.base.length else whole
 
 
 def limit_points(recipe: Recipe, points: int | None) -> Recipe:

@@ -7,29 +7,45 @@ import statistics
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.report.ablation import Row, Table, built_on
-
-MEASURED = ("psnr", "ssim", "points", "f1", "seconds", "cpu_seconds")
-"""What is taken from the metrics of a run; `f1` where its mesh was compared with the truth, PSNR and SSIM where its
-method draws pictures, and points where it makes some."""
+from surfkit.report.columns import COLUMNS
 
 Figures = Mapping[str, float]
-"""Numbers of a run, by the names in `MEASURED`."""
+"""Numbers of a run, by the names in `COLUMNS`."""
 
 
-def figures(metrics: Mapping[str, Any]) -> dict[str, float]:
+def figures(metrics: Mapping[str, Any], compressed: bool = False) -> dict[str, float]:
     """The numbers that are compared, out of the metrics of a run; depth maps made for it are part of its CPU time.
+
+    Precision, recall and F1 are there where its mesh was compared with the truth, PSNR and SSIM where its method draws
+    pictures, points where it makes some.
+
+    Args:
+        metrics: Of the run.
+        compressed: Quality, size and frames per second are those of its compressed model.
 
     Raises:
         BadInput: Some are not there, or no numbers.
     """
     images = load(dict[str, Any], metrics.get("images"), "images")
-    known = {**load(dict[str, Any], metrics.get("geometry", {}), "geometry"), **metrics, **images}
-    lacking = {"f1"} - known.keys() | ({"psnr", "ssim"} if "not_measured" in images else set())
-    if "points" in known and known["points"] is None:
-        lacking |= {"points"}
-    wanted = [name for name in MEASURED if name not in lacking]
+    geometry = load(dict[str, Any], metrics.get("geometry") or {}, "geometry")
+    known = dict(metrics)
+    if compressed:
+        small = load(dict[str, Any] | None, metrics.get("compressed"), "compressed")
+        if small is None:
+            raise BadInput("there is no compressed model, which the recipe wants; the notes in run.json say why")
+        images = load(dict[str, Any], small.get("images"), "compressed.images")
+        geometry = load(dict[str, Any], small.get("geometry") or {}, "compressed.geometry")
+        both = load(tuple[float | None, float | None] | None, small.get("fps_before_and_after"), "compressed.fps")
+        known |= {"bytes": small.get("bytes"), "fps": both and both[1]}
+    known |= {name: geometry.get(name) for name in ("precision", "recall", "f1")}
+    known |= {name: images.get(name) for name in ("psnr", "ssim")}
+    known["lpips"] = images.get("lpips_alex")  # AlexNet, as in CityGaussianV2's released code
+    needed = {"seconds", "cpu_seconds"} | (set() if "not_measured" in images else {"psnr", "ssim"})
+    needed |= set() if "points" in known and known["points"] is None else {"points"}
+    wanted = [name for name in COLUMNS if name in needed or known.get(name) is not None]
     found = {name: load(int if name == "points" else float, known.get(name), name) for name in wanted}
     made = load(float, metrics.get("prepare_cpu_seconds") or 0.0, "prepare_cpu_seconds")
     return found | {"cpu_seconds": found["cpu_seconds"] + made}
@@ -53,8 +69,11 @@ def _compared(at: int, row: Row, base: Row | None, measured: Mapping[str, Mappin
     return {
         "number": at,
         "label": row.label,
+        "group": row.group,
         "built_on": base.label if base else None,
         "kept": row.kept,
+        "given_up": row.is_given_up,
+        "own_recipe": row.recipe is not None,
         "change": {path: dump(value) for path, value in row.change.items()},
         "mean": {name: statistics.fmean(values) for name, values in columns.items()},
         "sd": {name: deviation(values) for name, values in columns.items()},
@@ -88,7 +107,7 @@ def difference(here: Mapping[int, Figures], there: Mapping[int, Figures]) -> dic
 
 def _known(runs: Collection[Figures]) -> list[str]:
     """Names that all of some runs have a number for."""
-    return [name for name in MEASURED if runs and all(name in run for run in runs)]
+    return [name for name in COLUMNS if runs and all(name in run for run in runs)]
 
 
 def deviation(values: list[float]) -> float | None:

@@ -62,6 +62,11 @@ def curve(out: Path, what: What, place: Place | None = None) -> tuple[np.ndarray
         raise BadInput(f"{folder / journal.NAME}: no step is made yet, or the method of the run makes none")
     if what == "points" and not rows[:, 1].any():
         raise BadInput(f"{out}: the method of the run has no points; draw --of loss")
+    return thinned(rows)
+
+
+def thinned(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) steps and (T,) values of at most `DOTS` dots, out of (N, 2) steps and values, N at least 1."""
     pieces = np.array_split(rows, min(DOTS, len(rows)))
     steps, values = np.array([(piece[-1, 0], piece[:, 1].mean()) for piece in pieces]).T
     return steps, values

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -14,11 +15,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from surfkit.report.study import Outcome, Trial
+from surfkit.report.columns import COLUMNS
+from surfkit.report.rows import Outcome, Trial
 from surfkit.report.table import drawing
 from surfkit.train.progress import outer
 
-TOLD = {"psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "f1": "F1 {:.3f}", "points": "{:,} points"}
+TOLD = {"psnr": "PSNR {} dB", "ssim": "SSIM {}", "lpips": "LPIPS {}", "f1": "F1 {}", "points": "{} points"}
 """What is told of a run that has ended, as far as it was measured."""
 
 
@@ -30,6 +32,7 @@ class Screen:
         self.live: Live | None = None
         self.report: Mapping[str, Any] = {}
         self.label, self.heading = "", ""
+        self.headings: dict[Path, str] = {}
         self.within = ExitStack()
 
     def __enter__(self) -> Screen:
@@ -45,7 +48,9 @@ class Screen:
     def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
         """See `Watch.begin`."""
         self.report, self.label = report, trial.label
-        self.heading = f"run {at} of {count}: {trial.label}, seed {trial.seed}"
+        where = f" on {trial.data.path.name}" if len(report["data_sets"]) > 1 else ""
+        self.heading = f"run {at} of {count}: {trial.label}, seed {trial.seed}{where}"
+        self.headings[trial.folder] = self.heading
         if self.live is None:
             say(f"{self.heading}, in {trial.folder}")
         else:
@@ -59,13 +64,13 @@ class Screen:
 
     def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
         """See `Watch.end`."""
-        self.report = report
+        self.report, heading = report, self.headings[trial.folder]
         if outcome.failed is not None:
-            say(f"{self.heading}: failed: {outcome.failed}")
+            say(f"{heading}: failed: {outcome.failed}")
         elif self.live is None and outcome.figures is not None:
             found = outcome.figures
-            told = [text.format(found[name]) for name, text in TOLD.items() if name in found]
-            say(f"{self.heading}: {', '.join(told)}, {found['seconds'] / 60:.1f} minutes")
+            told = [text.format(COLUMNS[name].text(found[name])) for name, text in TOLD.items() if name in found]
+            say(f"{heading}: {', '.join(told)}, {found['seconds'] / 60:.1f} minutes")
 
     def draw(self, below: Any) -> None:
         """Show the table with something below it."""

@@ -5,33 +5,42 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import traceback
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
-from surfkit import pipeline
-from surfkit.blocks.schedule import Compute
-from surfkit.core.check import BadInput, Fault
-from surfkit.core.codec import dump, read_json, write_json, write_text
-from surfkit.core.registry import records
+from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, write_json, write_text
+from surfkit.core.lock import locked
+from surfkit.execute.base import Executor, Inline
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.report.ablation import Table, build, limit_points, pick, scaled
-from surfkit.report.compare import compare, figures
+from surfkit.report.columns import refuse_unknown_columns
+from surfkit.report.compare import compare
+from surfkit.report.latex import latex
+from surfkit.report.notes import notes_of
+from surfkit.report.perceptual import refuse_unmeasurable
+from surfkit.report.rows import Outcome, Trial, Work, attempt, finished, run_elsewhere
+from surfkit.report.runs_csv import comma_separated
+from surfkit.report.sharing import finished_keys, next_wave, shared_stages
 from surfkit.report.table import markdown
 from surfkit.report.truth import Truth
-from surfkit.run.notes import collect_notes
+from surfkit.run.shared import versions
 from surfkit.run.stage import select_rasterizer
+from surfkit.run.store import StageStore
 
-TRACE = "failed.txt"
-"""Where a run that failed in an unforeseen way leaves its traceback."""
+FORMS = {"md": markdown, "tex": latex, "csv": comma_separated}
+"""What a table is written as beside JSON, by the ending of the file."""
+STORE = "stages"
+"""Folder of the stages that rows share, in that of the table."""
 
 
 @dataclass(frozen=True)
@@ -40,107 +49,195 @@ class Plan:
 
     Attributes:
         table: The rows.
-        data: What to train on.
+        data: What to train on: one data set or more.
         out: Folder of the results.
         steps: Length of a run of the table's base; the recipe's own if None.
         seeds: Runs of each row.
         rows: Numbers or labels of those to run; all if empty.
         device: Where to compute.
         max_points: No row grows beyond this number of points.
-        truth: What the meshes of all rows are compared with, for their F1; rows without a mesh get one then.
+        truth: For each data set, what the meshes of all rows are compared with, for their F1; rows without a mesh get
+            one then. Empty to compare none.
+        columns: Those of the written tables; what was measured if empty. LPIPS is measured only if it is named.
+        workers: The executor of the rows.
+        shared: Whether a stage that several rows have in common is computed once.
     """
 
     table: Table
-    data: Data
+    data: tuple[Data, ...]
     out: Path
     steps: int | None = None
     seeds: int = 1
     rows: tuple[str, ...] = ()
     device: Device = "auto"
     max_points: int | None = None
-    truth: Truth | None = None
+    truth: tuple[Truth, ...] = ()
+    columns: tuple[str, ...] = ()
+    workers: Executor = Inline()
+    shared: bool = True
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
             raise BadInput(f"--seeds {self.seeds}: give 1 or more")
+        refuse_unknown_columns(self.columns)
+        paths = [data.path.resolve() for data in self.data]
+        if not paths:
+            raise BadInput("--data: name at least one data set")
+        if twice := [path for path in paths if paths.count(path) > 1]:
+            raise BadInput(f"--data: {twice[0]} is there twice; name each data set once")
+        if self.truth and len(self.truth) != len(self.data):
+            raise BadInput(
+                f"--gt: {len(self.truth)} ground truths for {len(self.data)} data sets; give one for each, in the "
+                "same order"
+            )
 
+    @property
+    def sets(self) -> list[tuple[Data, Truth | None]]:
+        """Each data set with its truth."""
+        return list(zip(self.data, self.truth or [None] * len(self.data), strict=True))
 
-@dataclass(frozen=True)
-class Trial:
-    """One row with one seed, and the folder of its run, which rows with the same recipe share."""
+    def work(self, trial: Trial) -> Work:
+        """What a process needs to know to run a trial."""
+        return Work(trial, self.out, self.device, self.out / STORE if self.shared else None, lpips=self.lpips)
 
-    label: str
-    seed: int
-    recipe: Recipe
-    folder: Path
+    @property
+    def lpips(self) -> bool:
+        """Whether LPIPS is measured."""
+        return "lpips" in self.columns
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a run came to: numbers, the reason in one line why it failed, or both where only its mesh did."""
-
-    figures: Mapping[str, float] | None = None
-    failed: str | None = None
+    def is_done(self, trial: Trial, outcome: Outcome) -> bool:
+        """Whether all that is wanted of a trial was measured."""
+        wanted = ({"f1"} if trial.truth is not None else set()) | ({"lpips"} if self.lpips else set())
+        return outcome.figures is not None and wanted <= outcome.figures.keys()
 
 
 class Watch(Protocol):
     """Who is told how it goes."""
 
     def begin(self, trial: Trial, at: int, count: int, report: Mapping[str, Any]) -> None:
-        """A run begins, the `at`-th of `count`."""
+        """A run begins, the `at`-th of `count`; with an executor, it is handed over."""
 
     def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
         """It has ended."""
 
 
-def ablate(plan: Plan, watch: Watch) -> dict[str, Any]:
+def ablate(plan: Plan, watch: Watch, before: Callable[[Plan, Sequence[Trial]], None] | None = None) -> dict[str, Any]:
     """Run what is not finished yet, keep the results up to date in the folder, and return them as they are saved.
 
+    Args:
+        plan: What to run.
+        watch: Is told how it goes.
+        before: Called with the trials that are to be run, before the first of them begins.
+
     Raises:
-        BadInput: Nothing can be run as planned; nothing has been written then.
+        BadInput: Nothing can be run as planned, or another process works in the folder; nothing has been written then.
         KeyboardInterrupt: Someone asked to stop; the same plan goes on from there.
     """
-    every = trials(plan)
-    outcomes = {trial.folder: Outcome(found) for trial in every if (found := finished(trial.folder, plan.truth))}
-    done = [folder for folder, known in outcomes.items() if plan.truth is None or "f1" in known.figures]
-    left = unfinished(every, pick(plan.table, plan.rows), done)
+    if plan.out.exists() and not plan.out.is_dir():
+        raise BadInput(f"--out {plan.out}: a file, not a folder; name another one")
+    left = unfinished(plan)
     if left:
         refuse_unusable(plan)
-    report = save(plan, every, outcomes)
-    for at, trial in enumerate(left, 1):
-        if any(row["label"] == trial.label and row["failed"] for row in report["rows"]):
-            continue  # with another seed it would most likely fail again
-        watch.begin(trial, at, len(left), report)
-        outcomes[trial.folder] = outcome = attempt(trial, plan)
-        report = save(plan, every, outcomes)
-        watch.end(trial, outcome, report)
-    return report
+    with locked(plan.out):
+        if left and before is not None:
+            before(plan, left)
+        return Session(plan, watch).run(left)
+
+
+class Session:
+    """The runs of a plan, as they come to their ends.
+
+    Args:
+        plan: What to run.
+        watch: Is told how it goes.
+    """
+
+    def __init__(self, plan: Plan, watch: Watch) -> None:
+        self.plan, self.watch = plan, watch
+        self.every = trials(plan)
+        self.outcomes = known_outcomes(self.every)
+        self.report: dict[str, Any] = {}
+
+    def run(self, left: Sequence[Trial]) -> dict[str, Any]:
+        """Run some trials, and return the report."""
+        plan, waiting, count = self.plan, list(left), len(left)
+        StageStore(plan.out / STORE).sweep()
+        self.save()
+        while waiting:
+            wave = self.wave(waiting)
+            waiting = [trial for trial in waiting if trial not in wave]
+            wave = [trial for trial in wave if not self.has_failed(trial)]  # with another seed it would fail again
+            if not wave:
+                continue
+            for trial in wave:
+                self.watch.begin(trial, left.index(trial) + 1, count, self.report)
+            works = [plan.work(trial) for trial in wave]
+            here = plan.workers.in_process
+            ended = ((work, attempt(work)) for work in works) if here else run_elsewhere(works, plan.workers)
+            with closing(ended):
+                for work, outcome in ended:
+                    self.outcomes[work.trial.folder] = outcome
+                    self.save()
+                    self.watch.end(work.trial, outcome, self.report)
+        return self.report
+
+    def wave(self, waiting: Sequence[Trial]) -> list[Trial]:
+        """The trials to run now: the next one in this process, or at once all that share nothing unfinished."""
+        if self.plan.workers.in_process:
+            return list(waiting[:1])
+        return next_wave(waiting, finished_keys(self.every)) if self.plan.shared else list(waiting)
+
+    def has_failed(self, trial: Trial) -> bool:
+        """Whether the row has failed on the same data set, with whatever seed."""
+        same = (other for other in self.every if (other.label, other.data) == (trial.label, trial.data))
+        return any(self.outcomes[each.folder].failed for each in same if each.folder in self.outcomes)
+
+    def save(self) -> None:
+        """Write ablation.json and ablation.md."""
+        self.report = save(self.plan, self.every, self.outcomes)
+
+
+def known_outcomes(every: Sequence[Trial]) -> dict[Path, Outcome]:
+    """The outcomes of the trials that were finished before, by the folders of their runs."""
+    found = {trial.folder: finished(trial) for trial in every}
+    return {folder: Outcome(known) for folder, known in found.items() if known is not None}
+
+
+def report_so_far(plan: Plan) -> dict[str, Any]:
+    """Plain data of the whole table as far as it has been run; nothing is run, and nothing written."""
+    every = trials(plan)
+    return report_of(plan, every, known_outcomes(every))
 
 
 def trials(plan: Plan) -> list[Trial]:
-    """Every row with every seed; all rows with the first seed come first, so that the table is soon whole."""
+    """Every row with every seed on every data set; all rows with the first seed come first, so that the table is soon
+    whole."""
     recipes = {label: sized(recipe, plan) for label, recipe in build(plan.table).items()}
     found = []
     for at in range(plan.seeds):
-        for label, recipe in recipes.items():
-            seeded = replace(recipe, seed=recipe.seed + at)
-            found.append(Trial(label, seeded.seed, seeded, plan.out / "runs" / fingerprint(seeded, plan.data)))
+        for data, truth in plan.sets:
+            for label, recipe in recipes.items():
+                seeded = replace(recipe, seed=recipe.seed + at)
+                folder = plan.out / "runs" / fingerprint(seeded, data)
+                found.append(Trial(label, seeded.seed, seeded, folder, data, truth))
     return found
 
 
 def sized(recipe: Recipe, plan: Plan) -> Recipe:
     """A row's recipe at the length and with the limit of the plan, and with a mesh where F1 is wanted."""
-    if plan.truth is not None and recipe.mesh is None and "mesh" not in recipe.unused:
+    if plan.truth and recipe.mesh is None and "mesh" not in recipe.unused:
         recipe = replace(recipe, mesh=TSDF())
     recipe = scaled(recipe, plan.table, plan.steps)
     return limit_points(recipe, plan.max_points) if recipe.has_stages else recipe
 
 
-def unfinished(every: Sequence[Trial], labels: Collection[str], outcomes: Collection[Path]) -> list[Trial]:
-    """The trials of some rows that are still to be run, one for each folder."""
+def unfinished(plan: Plan) -> list[Trial]:
+    """The trials of the rows of a plan that are still to be run, one for each folder."""
+    every, labels = trials(plan), pick(plan.table, plan.rows)
+    known = known_outcomes(every)
     first: dict[Path, Trial] = {}
     for trial in every:
-        if trial.label in labels and trial.folder not in outcomes:
+        if trial.label in labels and not plan.is_done(trial, known.get(trial.folder, Outcome())):
             first.setdefault(trial.folder, trial)
     return list(first.values())
 
@@ -155,66 +252,56 @@ def fingerprint(recipe: Recipe, data: Data) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def versions() -> dict[str, str]:
-    """Of surfkit and of the installed plugins that offer parts of recipes."""
-    offering = [plugin for plugin in records() if plugin.distribution and "surfkit_components" in plugin.hooks]
-    return {plugin.distribution: plugin.version for plugin in offering}
-
-
-def finished(folder: Path, truth: Truth | None = None) -> dict[str, float] | None:
-    """The numbers of a run that is over: its metrics are written last, and deleted when it is trained further."""
-    path = folder / "metrics.json"
-    if not path.exists():
-        return None
-    metrics = read_json(path, dict[str, Any])
-    if truth is None or not truth.known(metrics):
-        metrics.pop("geometry", None)  # of another truth
-    try:
-        return figures(metrics)
-    except BadInput as error:
-        raise BadInput(f"{path}: {error}; delete it, and the row is measured again") from error
-
-
 def refuse_unusable(plan: Plan) -> None:
     """BadInput for what would make every run fail, before anything is written."""
-    if plan.out.exists() and not plan.out.is_dir():
-        raise BadInput(f"--out {plan.out}: a file, not a folder; name another one")
     select_rasterizer(plan.device)
-    if not read(plan.data).held_out:
-        raise BadInput("no photograph is kept from training, so rows cannot be compared; see --test-every")
-    if plan.truth is not None:
-        plan.truth.refuse_unusable()
-
-
-def attempt(trial: Trial, plan: Plan) -> Outcome:
-    """Run one recipe, or go on with it; what goes wrong becomes its outcome."""
-    trace, found = trial.folder / TRACE, finished(trial.folder)
-    try:
-        if found is None:
-            found = figures(pipeline.run(trial.recipe, plan.data, trial.folder, Compute(plan.device)))
-        if plan.truth is not None:
-            with collect_notes():
-                found = figures(plan.truth.measure(trial.folder, plan.out))
-    except (BadInput, Fault) as error:
-        return Outcome(found, " ".join(str(error).split()))
-    except Exception as error:
-        write_text(trace, traceback.format_exc())
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return Outcome(found, f"{reason[:200]}; see {trace}")
-    trace.unlink(missing_ok=True)
-    return Outcome(found)
+    plan.workers.ready()
+    for data, truth in plan.sets:
+        held_out = read(data).held_out
+        if not held_out:
+            raise BadInput(
+                f"{data.path}: no photograph is kept from training, so rows cannot be compared; see --test-every"
+            )
+        if truth is not None:
+            truth.refuse_unusable()
+        if plan.lpips:
+            refuse_unmeasurable(held_out)
 
 
 def save(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
-    """Write ablation.json and ablation.md, and return what is in the first."""
+    """Write the table as JSON, Markdown, LaTeX and CSV, and return what is in the first."""
     report = report_of(plan, every, outcomes)
     write_json(plan.out / "ablation.json", report)
-    write_text(plan.out / "ablation.md", markdown(report))
+    for ending, form in FORMS.items():
+        write_text(plan.out / f"ablation.{ending}", form(report))
     return report
 
 
-def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
+def report_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:
     """Plain data of the whole table as far as it has been run."""
+    return {
+        "table": plan.table.name,
+        "about": plan.table.about,
+        "steps": scaled(plan.table.base, plan.table, plan.steps).length or 0,
+        "max_points": plan.max_points,
+        "columns": list(plan.columns),
+        "seeds": plan.seeds,
+        "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},
+        "stages": shared_stages([trial for trial in every if trial.folder in outcomes]),
+        "data_sets": [
+            {
+                "data": dump(replace(data, path=data.path.resolve())),
+                "truth": None if truth is None else {"path": str(truth.path), "tau": truth.tau},
+                "rows": rows_of(plan, [trial for trial in every if trial.data == data], outcomes),
+                "notes": notes_of(trial for trial in every if trial.data == data and trial.folder in outcomes),
+            }
+            for data, truth in plan.sets
+        ],
+    }
+
+
+def rows_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcome]) -> list[dict[str, Any]]:
+    """Plain data of every row on one data set."""
     known = [(trial, outcomes[trial.folder]) for trial in every if trial.folder in outcomes]
     measured: dict[str, dict[int, Mapping[str, float]]] = {}
     failed: dict[str, str] = {}
@@ -228,14 +315,4 @@ def report_of(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) 
         folder = trial.folder.relative_to(plan.out).as_posix()
         runs.setdefault(trial.label, []).append({"seed": trial.seed, "folder": folder, **outcome.figures})
     rows = compare(plan.table, measured)
-    return {
-        "table": plan.table.name,
-        "about": plan.table.about,
-        "steps": scaled(plan.table.base, plan.table, plan.steps).length or 0,
-        "max_points": plan.max_points,
-        "truth": None if plan.truth is None else {"path": str(plan.truth.path), "tau": plan.truth.tau},
-        "seeds": plan.seeds,
-        "data": dump(replace(plan.data, path=plan.data.path.resolve())),
-        "versions": versions() | {"python": platform.python_version(), "torch": torch.__version__},
-        "rows": [row | {"runs": runs.get(row["label"], []), "failed": failed.get(row["label"])} for row in rows],
-    }
+    return [row | {"runs": runs.get(row["label"], []), "failed": failed.get(row["label"])} for row in rows]

@@ -13,9 +13,11 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.evaluate.geometry.comparison import Comparison, truth_side
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.pipeline import opened
+from surfkit.pipeline import loaded, mesh, opened
+from surfkit.raster.select import Device
 from surfkit.readers.read import read
-from surfkit.run.folder import note_metrics
+from surfkit.run.folder import Run, note_metrics
+from surfkit.run.measure import note_compressed
 
 
 @dataclass(frozen=True)
@@ -48,31 +50,48 @@ class Truth:
         digest = hashlib.sha256(f"{self.path} {self.tau}".encode()).hexdigest()[:12]
         return out / f"crop-{digest}.json"
 
-    def known(self, metrics: Mapping[str, Any]) -> bool:
-        """Whether the metrics of a run have its F1 against this."""
-        geometry = metrics.get("geometry") or {}
+    def known(self, metrics: Mapping[str, Any], compressed: bool = False) -> bool:
+        """Whether the metrics of a run have the F1 of its mesh, or of that of its compressed model, against this."""
+        geometry = (metrics.get("compressed") or {} if compressed else metrics).get("geometry") or {}
         given = self.tau is None or geometry.get("tau") == self.tau
         return geometry.get("truth") == str(self.path) and given
 
-    def measure(self, folder: Path, out: Path) -> dict[str, Any]:
+    def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
 
-        The first run that is measured decides the crop volume by its views; the others take it from there.
+        Where the recipe compresses the model, it is the mesh of the compressed model, which is made here. The first run
+        that is measured decides the crop volume by its views; the others take it from there.
 
         Args:
             folder: Of the run.
             out: Of the table.
+            device: For the depth of the compressed model.
 
         Raises:
             BadInput: There is no mesh, or it is nowhere near the truth.
         """
         run = opened(folder)
-        if not run.mesh_record.exists():
-            raise BadInput(f"{folder}: no mesh that could be compared with {self.path}")
+        shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
+        if not shown.mesh_record.exists():
+            raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
         crop, scene = self.crop(out), read(run.data)
         settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
-        files = (run.mesh, self.path)
-        found = measure_geometry(files, settings, folder / "geometry", scene.train, scene.frame)
+        files = (shown.mesh, self.path)
+        found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)
         if not crop.exists():
-            write_json(crop, read_json(folder / "geometry" / "crop.json", Any))
-        return note_metrics(run.metrics, {"geometry": found})
+            write_json(crop, read_json(shown.out / "geometry" / "crop.json", Any))
+        metrics = note_metrics(shown.metrics, {"geometry": found})
+        return metrics if shown is run else note_compressed(run, metrics)
+
+
+def mesh_of_compressed(run: Run, device: Device) -> Run:
+    """The folder of the compressed model of a run, with its mesh; made by the mesher of the recipe if it is not there.
+
+    Raises:
+        BadInput: There is no compressed model.
+    """
+    shown = replace(run, out=run.compressed)
+    if not shown.mesh_record.exists():
+        with loaded(run.out, device, compressed=True) as (ctx, made):
+            mesh(ctx, made, device)
+    return shown

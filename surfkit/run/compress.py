@@ -167,7 +167,7 @@ class Judge:
     """Tells how much of the PSNR of a model on training views another one loses."""
 
     def __init__(self, model: SplatModel, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        step = max(1, len(views) // JUDGED)
+        step = max(1, -(-len(views) // JUDGED))
         self.views, self.draws, self.near = views[::step], drawn_by(model.primitive, rasterizer), model.near
         self.photos: list[Tensor] = []
         self.renders: list[Tensor] = []

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from surfkit.raster.api import Rasterizer
 from surfkit.run.folder import Run
+from surfkit.run.shared import Shares
 from surfkit.run.stage import Intervals
 from surfkit.scene.scene import Scene
 from surfkit.train.material import CacheSettings
@@ -21,6 +22,7 @@ class RunContext:
         rasterizer: What draws.
         intervals: Steps between checkpoints and between pictures.
         caches: Where photographs are cached.
+        shares: What the run shares with others; nothing in a worker.
     """
 
     run: Run
@@ -28,3 +30,9 @@ class RunContext:
     rasterizer: Rasterizer
     intervals: Intervals
     caches: CacheSettings
+    shares: Shares | None = None
+
+    def keep(self, part: str) -> None:
+        """Put a finished part of the run where others find it, if the run shares any."""
+        if self.shares is not None:
+            self.shares.keep(part)

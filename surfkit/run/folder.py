@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ from surfkit.run import journal
 from surfkit.train import checkpoint
 from surfkit.train.stage import Stage
 
-FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply")
+SHARED = "shared.json"
+"""What a run shares with others, see `surfkit.run.shared`."""
+FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
 """In a run folder."""
-FOLDERS = ("pretrain", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
+FOLDERS = ("pretrain", "partition", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,11 @@ class RunStage:
         return self.folder / "checkpoint.safetensors"
 
     @property
+    def before(self) -> Path:
+        """What was measured of the model before, if the stage refines it."""
+        return self.folder / "before.json"
+
+    @property
     def learns_from_photographs(self) -> bool:
         """Whether it is shown photographs, and not what another model draws."""
         return self.refine is None or not self.refine.taught
@@ -98,6 +105,15 @@ class Run:
         return self.stages[0]
 
     @property
+    def partition(self) -> Run | None:
+        """The pretraining whose model decides the partition, as a run in a folder of this one; None if it is that of
+        this run."""
+        stage = self.recipe.partition_pretrain
+        if stage is None or self.recipe.partition is None:
+            return None
+        return replace(self, out=self.out / "partition", recipe=replace(self.recipe, pretrain=stage))
+
+    @property
     def merged(self) -> RunStage:
         """The stage of all blocks together, for a recipe with a partition."""
         return self.stages[1]
@@ -110,7 +126,13 @@ class Run:
     @property
     def color_stage(self) -> RunStage:
         """The last stage that is shown photographs: colours are as it has learnt them."""
-        return [stage for stage in self.stages if stage.learns_from_photographs][-1]
+        return self.color_stage_until(self.last)
+
+    def color_stage_until(self, last: RunStage) -> RunStage:
+        """The same, of the stages up to `last`."""
+        names = [stage.name for stage in self.stages]
+        before = self.stages[: names.index(last.name) + 1]
+        return [stage for stage in before if stage.learns_from_photographs][-1]
 
     @property
     def blocks(self) -> Path:
@@ -120,7 +142,7 @@ class Run:
     @property
     def needs_priors(self) -> bool:
         """Whether training looks at depth priors: the method, a loss of the recipe, or its start."""
-        losses = [loss for one in self.stages for loss in one.stage.losses.values()]
+        losses = [loss for _, stage, _ in self.recipe.stages() for loss in stage.losses.values()]
         needed = self.recipe.method.needs_prior or self.recipe.start.needs_prior
         return needed or any(loss.needs_prior for loss in losses)
 
@@ -131,8 +153,8 @@ class Run:
 
     @property
     def wants_priors(self) -> bool:
-        """Whether anything looks at depth priors: training, or the mesher."""
-        return self.needs_priors or (self.recipe.mesh is not None and self.recipe.mesh.needs_prior)
+        """Whether anything looks at depth priors: training, or a mesher."""
+        return self.needs_priors or any(mesher.needs_prior for mesher in self.recipe.meshers)
 
     @property
     def metrics(self) -> Path:

@@ -6,14 +6,14 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, from_json
-from surfkit.core.events import FileWritten, Progress, StageBegan, StageEnded
+from surfkit.core.events import FileWritten, Progress, StageBegan, StageEnded, Warned
 from surfkit.core.files import replacing
 from surfkit.core.registry import hookimpl, plugins
 
@@ -61,9 +61,14 @@ class Journal:
 
 
 @contextmanager
-def record_events(folder: Path) -> Iterator[None]:
-    """Within, events are written into the journal of a run folder, and not into that of a run around it."""
+def record_events(folder: Path, warned: Sequence[str] = ()) -> Iterator[None]:
+    """Within, events are written into the journal of a run folder, and not into that of a run around it.
+
+    The journal gets the warnings `warned` first, which the user has seen already.
+    """
     journal, name = Journal(folder), "journal of the run"
+    for text in warned:
+        journal.surfkit_event(Warned(text))
     around = plugins().unregister(name=name) if plugins().has_plugin(name) else None
     plugins().register(journal, name)
     try:

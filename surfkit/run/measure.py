@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
-from surfkit.core.codec import read_json
-from surfkit.core.events import MemoryTaken, emit
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import FileWritten, emit
 from surfkit.evaluate.images.lpips import networks
 from surfkit.evaluate.images.measure import evaluate_views, frames_per_second
 from surfkit.evaluate.images.pictures import panel, picture_path, write_picture
@@ -17,7 +17,7 @@ from surfkit.raster.api import Maps
 from surfkit.readers.masks import mask_cache
 from surfkit.run.compress import decompressed
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, note_metrics, read_record
+from surfkit.run.folder import Run, RunStage, note_metrics, read_record
 from surfkit.run.method import not_drawn
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
@@ -70,13 +70,14 @@ def evaluate(
     if lacking is not None:
         measured["images"]["lpips_not_measured"] = lacking
     if meter:
-        emit(MemoryTaken(meter.report()))
+        meter.tell()
     record = read_record(run.out)
     memory = record.get("memory_bytes") or {}
     metrics = {
         **measured,
         "fps": measured["fps"] or (frames_per_second(scene.train, colors) if colors else None),
         "points": None if made.splats is None else len(made.splats),
+        "bytes": run.cloud.stat().st_size if run.cloud.exists() else None,
         "steps": made.steps,
         "seconds": made.seconds,
         "cpu_seconds": made.cpu_seconds,
@@ -84,8 +85,40 @@ def evaluate(
         "peak_memory_bytes": max(made.peak_memory_bytes or 0, memory.get("peak", 0)) or None,
         "memory_bytes": memory,
         **({"method": dict(made.facts)} if made.facts else {}),
+        **({"before": before} if (before := measured_before(run)) else {}),
     }
     return note_metrics(run.metrics, metrics)
+
+
+def measure_before(stage: RunStage, made: Reconstruction, scene: Scene) -> None:
+    """Measure the model that a refinement begins with on the held-out photographs, and write it into its folder.
+
+    Args:
+        stage: The refinement.
+        made: The model, with a way to draw it.
+        scene: Held-out views.
+    """
+    if not scene.held_out:
+        return
+    ahead = AHEAD * max(3 * view.camera.width * view.camera.height for view in scene.held_out)
+    found = evaluate_views(
+        scene.held_out,
+        photo_cache(scene.held_out, ahead),
+        made.draw_color,
+        correct_color=made.correct_color,
+        masks=mask_cache(scene.held_out, ahead),
+    )["images"]
+    write_json(
+        stage.before,
+        {name: value for name, value in found.items() if name != "per_image"} | {"points": len(made.splats)},
+    )
+    emit(FileWritten(stage.before, "measurements before the refinement"))
+
+
+def measured_before(run: Run) -> dict[str, Any]:
+    """What was measured of the model before each refinement, by the name of its stage."""
+    stages = run.stages if run.recipe.has_stages else ()
+    return {stage.name: read_json(stage.before, dict[str, Any]) for stage in stages if stage.before.exists()}
 
 
 def measure_compressed(ctx: RunContext, made: Reconstruction, lpips_weights: str = "gpu") -> dict[str, Any]:
@@ -110,5 +143,6 @@ def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
     facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
     facts["fps_before_and_after"] = found.get("fps_before_and_after")
     if "geometry" in found:
-        facts["geometry"] = {name: found["geometry"][name] for name in ("precision", "recall", "f1")}
+        geometry = found["geometry"]
+        facts["geometry"] = {name: geometry[name] for name in ("precision", "recall", "f1", "truth", "tau")}
     return note_metrics(run.metrics, {"compressed": facts})

@@ -36,7 +36,7 @@ from surfkit.run.folder import Run, discard_results
 from surfkit.scene.cache import Cache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Scene, View
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 
 RESULT = Path("result", "result.json")
 """In the folder of a run, what its method has made; arrays lie beside it."""

@@ -51,7 +51,8 @@ class Notes:
             say(f"note: {self.prefix}{event.text}")
             self.keep(self.texts, self.prefix + event.text)
         elif isinstance(event, MemoryTaken):
-            if event.parts["peak"] >= self.memory.get("peak", 0):
+            known = (self.memory.get("peak", 0), len(self.memory))
+            if (event.parts["peak"], len(event.parts)) >= known:  # of equal peaks, the one with more parts
                 self.memory = dict(event.parts)
                 self.write()
         elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):

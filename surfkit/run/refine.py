@@ -8,18 +8,25 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from surfkit.mesh.base import Mesher, MeshInput
+from surfkit.method.base import Reconstruction
+from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Rasterizer
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, RunStage, discard_results
 from surfkit.run.journal import record_events
+from surfkit.run.measure import measure_before
+from surfkit.run.mesh import mesh_input
+from surfkit.run.method import with_drawing
 from surfkit.run.notes import prefix_notes
 from surfkit.run.stage import StageJob, drawing, load_state, optimise
 from surfkit.scene.cache import Cache
+from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel
 from surfkit.train.material import TrainingData, read_ahead
 from surfkit.train.meter import Meter
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 
 DRAWN_AHEAD = 2
 """Rendered pictures that are cached: each is needed once."""
@@ -35,6 +42,7 @@ def refine_model(ctx: RunContext, state: StageState) -> StageState:
     for before, stage in itertools.pairwise(ctx.run.stages):
         if stage.refine is not None:
             state = _refine_once(ctx, before, state, stage)
+            ctx.keep(stage.name)
     return state
 
 
@@ -46,16 +54,28 @@ def _refine_once(ctx: RunContext, before: RunStage, given: StageState, stage: Ru
         return state
     discard_results(run, stage)
 
+    def made() -> Reconstruction:  # made when it is needed, as its activated values take memory
+        model = SplatModel(before.primitive, before.stage.finished(given), given.sh_degree, before.stage.near)
+        corrected = run.color_stage_until(before).stage.appearance is not None
+        return with_drawing(Reconstruction(splats=model, correct_color=corrected), ctx.rasterizer)
+
     def start(_: torch.Generator) -> InitialModel:
-        params = refine.params(before.stage.finished(given))
+        found = made()
+
+        def to_mesh(mesher: Mesher) -> MeshInput:
+            return mesh_input(run, found, scene, ctx.rasterizer, cache_bytes("auto"), mesher)
+
+        params = refine.begin(found.splats, to_mesh)
         return InitialModel({name: value.clone() for name, value in params.items()}, given.sh_degree)
 
     intervals = replace(ctx.intervals, pictures=0)
     stage.folder.mkdir(exist_ok=True)
     with record_events(stage.folder), prefix_notes(f"{stage.title}: "):  # steps are counted from 1 again
+        if state is None:
+            measure_before(stage, made(), scene)
         shown = _rendered_data(before, given, scene, ctx.rasterizer) if refine.taught else None
         shown = shown or read_ahead(run.data, scene, stage.stage.losses, ctx.caches)
-        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, Meter(), start, given)
+        job = StageJob(run, stage, scene, ctx.rasterizer, intervals, shown, Meter.of_stage(), start, given)
         return optimise(job, state)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import FileWritten, MemoryTaken, StageBegan, StageEnded, Warned, emit, say
+from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
@@ -29,7 +29,8 @@ from surfkit.train.interrupt import graceful
 from surfkit.train.material import TrainingData
 from surfkit.train.meter import Meter
 from surfkit.train.progress import Display
-from surfkit.train.stage import StageState, Trainer
+from surfkit.train.stage import Trainer
+from surfkit.train.state import StageState
 
 CHECKPOINT_EVERY = 500
 WATCH_EVERY = 10
@@ -68,6 +69,7 @@ class StageJob:
         before: The state of the stage before, if its times count too.
         frozen: Gives points that are drawn with the others and never change; None for none.
         owns: As for `Trainer`.
+        until: Step after which to stop with a checkpoint; that of the stage if None.
     """
 
     run: Run
@@ -81,6 +83,7 @@ class StageJob:
     before: StageState | None = None
     frozen: Callable[[], InitialModel] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
+    until: int | None = None
 
 
 def load_state(run: Run, stage: RunStage, scene: Scene, repair: bool = False) -> StageState | None:
@@ -127,7 +130,9 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
         began = time.perf_counter(), time.process_time()
         begun = job.start(generator)
         fresh = trainer.begin(
-            Points.fresh(begun.params, primitive.shared()), generator, job.frozen().params if job.frozen else None
+            replace(Points.fresh(begun.params, primitive.shared()), stats=dict(begun.stats)),
+            generator,
+            job.frozen().params if job.frozen else None,
         )
         fresh.sh_degree = min(begun.sh_degree, primitive.sh_degree)
         fresh.seconds, fresh.cpu_seconds = time.perf_counter() - began[0], time.process_time() - began[1]
@@ -168,14 +173,16 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
             if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
                 with meter.adding("pictures"):
                     along.look(done.index, drawing(at, state, trainer.rasterizer))
-            if request.asked or done.index % intervals.checkpoint == 0 or done.index == steps:
+            is_over = request.asked or done.index == job.until
+            if is_over or done.index % intervals.checkpoint == 0 or done.index == steps:
                 save(at, state, meter)
-            if request.asked:
+            if is_over:
                 break
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
     emit(StageEnded(at.name, steps, len(state.points), state.seconds - seconds))
+    state.move(torch.device("cpu"))
     return state
 
 
@@ -185,7 +192,7 @@ def save(stage: RunStage, state: StageState, meter: Meter) -> None:
     with meter.adding("checkpoints"):
         checkpoint.save(stage.checkpoint, state)
     emit(FileWritten(stage.checkpoint, "checkpoint"))
-    emit(MemoryTaken(meter.report()))
+    meter.tell()
 
 
 def lower_caches(given: TrainingData, why: str) -> bool:
@@ -241,4 +248,6 @@ def select_rasterizer(device: Device) -> tuple[Rasterizer, str]:
         rasterizer, name = select(device)
     for warning in caught:
         emit(Warned(str(warning.message)))
+    if device == "auto" and rasterizer.device == "cuda":
+        say(f"--device auto: {name} draws and optimises")
     return rasterizer, name

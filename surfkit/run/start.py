@@ -11,7 +11,7 @@ from surfkit.readers.depth_prior import WITH_NORMALS, Alignment, alignment, prio
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel, StartInput
-from surfkit.train.material import TrainingData, needs_normals, needs_priors
+from surfkit.train.material import TrainingData, needs_normals, needs_priors, scale_band
 
 AHEAD = 4
 """Depth maps in memory while points are made of them: each is needed once."""
@@ -58,7 +58,7 @@ def align_priors(run: Run, scene: Scene, begun: bool) -> Alignment | None:
     needed, losses = run.recipe.start.needs_prior and not begun, run.recipe.pretrain.losses
     if not needed and not needs_priors(losses):
         return None
-    known = alignment(run.data, scene, needs_normals(losses))
+    known = alignment(run.data, scene, needs_normals(losses), scale_band(losses))
     if needed and not known.fits:
         raise BadInput(
             f"{run.data.path}: the start of the recipe needs depth maps, and there are none that can be used; "

@@ -12,8 +12,8 @@ MIN_POINTS = 10
 """More points than this are needed."""
 MIN_RANGE = 0.01
 """The inverse depths of the points must differ by this share of their median: a flat view determines no scale."""
-SCALE_BAND = 5.0
-"""A scale that differs by a larger factor from the median of all images is a failed alignment."""
+SCALE_BAND = (0.2, 5.0)
+"""A scale that is outside these multiples of the median of all images is a failed alignment."""
 
 
 def sample(values: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -49,7 +49,8 @@ class Camera:
 
     def project(self, points: Tensor) -> Tensor:
         """(P, 3) float64 x and y in pixels and z along the axis, of (P, 3) points of the world; z may be negative."""
-        local = points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        pose = self.world_to_camera.to(points.device)
+        local = points.double() @ pose[:3, :3].T + pose[:3, 3]
         z = local[:, 2]
         return torch.stack([self.fx * local[:, 0] / z + self.cx, self.fy * local[:, 1] / z + self.cy, z], 1)
 
@@ -58,9 +59,9 @@ class Camera:
         by = max(self.width, self.height) / longest
         return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
 
-    def rays(self, dtype: torch.dtype = torch.float32) -> Tensor:
+    def rays(self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
-        x = (torch.arange(self.width, dtype=dtype) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, dtype=dtype) + 0.5 - self.cy) / self.fy
+        x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])

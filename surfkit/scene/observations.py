@@ -37,6 +37,11 @@ class Observations:
     error_px: np.ndarray
     seen: Mapping[str, Seen]
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no photograph is known to show any point."""
+        return not any(len(seen.points) for seen in self.seen.values())
+
     def of(self, view: View, max_error_px: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Where a photograph shows points, and how deep they are.
 

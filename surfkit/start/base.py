@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -43,10 +43,12 @@ class InitialModel:
     Attributes:
         params: Their raw parameters, and the shared ones, as `Primitive.init` gives them.
         sh_degree: Of the spherical harmonics that they have learnt so far.
+        stats: What is kept with the points and not optimised, each (N, ...).
     """
 
     params: Columns
     sh_degree: int = 0
+    stats: Columns = field(default_factory=dict)
 
 
 class Start(Component):

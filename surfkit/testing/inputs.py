@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
+from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.scene import Cloud, Frame, View
 from surfkit.start.base import StartInput
 from surfkit.testing.synthetic import Flight, Synthetic, photograph, write_colmap
@@ -98,6 +99,7 @@ def crowd(count: int = 200) -> tuple[Points, Step]:
         since_reset=1_000,
         rates={"means": 1e-4},
         seed=1,
+        signed_norm=4e-4 * torch.rand(count, generator=draw),
     )
     return Points.fresh(params), step
 
@@ -194,7 +196,19 @@ def coarse_model(count: int = 1_500, seed: int = 0) -> CoarseModel:
     discs = Splats("surfel", means, quats, torch.full((count, 2), 0.025), torch.full((count,), 0.9), color)
     at = [(-0.8 + 1.6 * i / 5, -0.8 + 1.6 * j / 4) for j in range(5) for i in range(6)]
     views = tuple(View(f"{i:02}.png", above(*xy), path=None) for i, xy in enumerate(at))
-    return CoarseModel(discs, views, select("cpu")[0], 0.01)
+    return CoarseModel(discs, views, select("cpu")[0], 0.01, observations=_shown(means, views))
+
+
+def _shown(points: Tensor, views: Sequence[View]) -> Observations:
+    """All of (P, 3) points that lie in the picture of each view, as a sparse model has them."""
+    seen = {}
+    for view in views:
+        x, y, z = (points.double() @ view.camera.world_to_camera[:3, :3].T + view.camera.world_to_camera[:3, 3]).T
+        size = torch.tensor([view.camera.width, view.camera.height])
+        at = torch.stack([view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy], 1) / size
+        rows = ((z > 0) & ((at >= 0) & (at <= 1)).all(1)).nonzero()[:, 0]
+        seen[view.name] = Seen(rows.numpy(), at[rows].numpy())
+    return Observations(points.double().numpy(), np.zeros(len(points)), seen)
 
 
 def lod_input(primitive: Primitive | None = None, count: int = 400) -> LodInput:

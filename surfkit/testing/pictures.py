@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +17,9 @@ from torch.nn.functional import interpolate
 
 from surfkit.appearance.base import Appearance
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.losses.base import Loss, Regularizer
+from surfkit.losses.base import Loss, Regularizer, RegularizerInput
 from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.raster.api import Splats
 from surfkit.scene.camera import Camera
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import cloud, depth_input, maps, splats, target
@@ -58,24 +59,66 @@ def check_loss(loss: Loss, size: tuple[int, int] = (24, 32)) -> None:
         _check_gradients(f"{name}{what}", value, leaves)
 
 
-def check_regularizer(regularizer: Regularizer) -> None:
+def check_regularizer(regularizer: Regularizer, given: Splats | None = None) -> None:
     """A regularizer is one finite number that repeats itself, with finite gradients by the splats' tensors, for surfels
-    and ellipsoids, and its weight is 0 or more at any step.
+    and ellipsoids, of the splats alone and in a step, also of a view that shows none of them; it uses no map but those
+    it says it reads, keeps nothing but in its columns, which a resumed run has too, and its weight is 0 or more at any
+    step.
 
     Args:
         regularizer: To check.
+        given: What it looks at, for one that knows the splats of a certain primitive only; random surfels and
+            ellipsoids if None.
     """
     name = type(regularizer).__name__
     _check_weights(regularizer)
-    for kind in ("surfel", "gaussian"):
-        given = splats(kind)
-        leaves = {key: value.requires_grad_() for key, value in given.tensors().items()}
+    for each in [splats("surfel"), splats("gaussian")] if given is None else [given]:
+        leaves = {key: value.detach().clone() for key, value in each.named().items()}
+        leaves = {key: value.requires_grad_(value.is_floating_point()) for key, value in leaves.items()}
+        given, kind = each.with_named(leaves), each.kind
+        leaves = {key: value for key, value in leaves.items() if value.requires_grad}
         with unchanged(name, splats=given):
             value = regularizer(given)
-        assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
-        assert torch.isfinite(value), f"{name} of {kind}s is {value.item()}"
+        _check_number(f"{name} of {kind}s", value, leaves)
         assert torch.equal(value, regularizer(given)), f"{name} is not repeatable; {AGAIN}"
-        _check_gradients(f"{name} of {kind}s", value, leaves)
+        if regularizer.only_seen:
+            nothing = regularizer(given.first(0))
+            assert torch.isfinite(nothing), f"{name} of no {kind} is {nothing.item()}; a view may show none"
+        shown, empty = torch.ones(len(given), dtype=torch.bool), torch.zeros(len(given), dtype=torch.bool)
+        for what, seen in {" in a step": shown, " of a view that shows none": empty}.items():
+            _check_in_step(f"{name} of {kind}s{what}", regularizer, given, seen)
+
+
+def _check_in_step(name: str, regularizer: Regularizer, given: Splats, seen: Tensor) -> None:
+    """A term in some steps, and again with the columns that it has kept in between."""
+    draw, size, columns = torch.Generator().manual_seed(0), (24, 32), {}
+    about, alpha = target(size, draw), torch.rand(size, generator=draw)
+    drawn = maps(alpha if seen.any() else torch.zeros(size), {"color", "alpha", *regularizer.reads}, draw)
+    step = RegularizerInput(1_000, 30_000, about, drawn, seen, _stats(columns, len(given)))
+    for index in (1_000, 1_001):
+        step, kept = replace(step, index=index), {key: value.clone() for key, value in columns.items()}
+        with unchanged(f"{name}.in_step", splats=given, target=about, maps=drawn, seen=seen):
+            value = regularizer.in_step(given, step)
+        assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
+        assert torch.isfinite(value), f"{name} is {value.item()}"
+        resumed = replace(regularizer).in_step(given, replace(step, stat=_stats(kept, len(given))))
+        assert torch.equal(value, resumed), f"{name}: a resumed run differs; draw from `target.seed`, keep in `stat`"
+        _check_gradients(name, value, {key: each for key, each in given.named().items() if each.requires_grad})
+
+
+def _stats(columns: dict[str, Tensor], count: int) -> Callable[..., Tensor]:
+    def stat(name: str, *shape: int) -> Tensor:
+        return columns.setdefault(name, torch.zeros(count, *shape))
+
+    return stat
+
+
+def _check_number(what: str, value: Tensor, leaves: Mapping[str, Tensor]) -> None:
+    """A scalar that is finite, with finite gradients by some leaves."""
+    name = what.split(" ")[0]
+    assert value.shape == (), f"{name} gives shape {tuple(value.shape)}, not one number"
+    assert torch.isfinite(value), f"{what} is {value.item()}"
+    _check_gradients(what, value, leaves)
 
 
 def check_appearance(appearance: Appearance) -> None:

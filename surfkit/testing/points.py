@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from surfkit.densify.base import Densify, Filter, Policy, Prune, Signal, Step
-from surfkit.primitives.edit import Edit
+from surfkit.primitives.edit import Edit, NewPoints
 from surfkit.primitives.points import Points
 from surfkit.testing.compare import assert_same, unchanged
 from surfkit.testing.inputs import crowd, splats
@@ -39,21 +39,26 @@ def check_policy(policy: Policy, points: Points | None = None, step: Step | None
     assert any(edit is not None for edit in edits), _idle(policy, "asks for no change")
 
 
-def check_densify(densify: Densify) -> None:
+def check_densify(densify: Densify, given: tuple[Points, Step] | None = None) -> None:
     """A densifier keeps to `check_policy`, adds points, only at steps that it told before, and none beyond a limit.
 
     Args:
         densify: With settings as for `check_policy`.
+        given: The points, and a step about them, to take it through, for one that knows a certain primitive only;
+            random surfels if None.
     """
+    given = given or crowd()
     name, foretold = type(densify).__name__, densify.edits(STEPS)
     if foretold is not None:
         steps = list(foretold)
         assert steps == sorted(set(steps)), f"{name}.edits: steps must be in order, each of them once"
         assert not steps or 1 <= steps[0] <= steps[-1] <= STEPS, f"{name}.edits: steps must lie in 1 to {STEPS}"
-    added = [index for index, edit in _taken_through(densify) if edit is not None and _adds(edit)]
+    added = [index for index, edit in _taken_through(densify, given) if edit is not None and _adds(edit)]
     assert added, _idle(densify, "neither clones nor splits a point")
-    most = 205  # five more than there are
-    over = [index for index, edit in _taken_through(densify.limited(most)) if edit is not None and _after(edit) > most]
+    count = len(given[0])
+    most = count + 5
+    taken = _taken_through(densify.limited(most), given)
+    over = [index for index, edit in taken if edit is not None and _after(edit, count) > most]
     assert not over, f"{name}.limited({most}) adds points beyond {most} after step {over[0]}"
     late = [index for index in added if foretold is not None and index not in foretold]
     assert not late, f"{name} adds points after step {late[0]}, which edits({STEPS}) does not name"
@@ -117,9 +122,10 @@ def check_signal(signal: Signal) -> None:
         assert_same(f"{name}.combine{what}", found, replace(signal).combine(a, b), "it may depend on its inputs only")
 
 
-def _taken_through(policy: Policy) -> Iterator[tuple[int, Edit | None]]:
+def _taken_through(policy: Policy, given: tuple[Points, Step] | None = None) -> Iterator[tuple[int, Edit | None]]:
     """Steps of a stage of 30,000, and what the policy asks for after each; the points stay as they are."""
-    points, step = crowd()
+    points, step = given or crowd()
+    points = replace(points, stats={})
     for index in [*range(1, 30), *range(100, STEPS + 1, 100)]:
         yield index, _edit(policy, points, replace(step, index=index, since_reset=index, seed=index))
 
@@ -131,15 +137,16 @@ def _idle(policy: Policy, does: str) -> str:
     )
 
 
-def _after(edit: Edit) -> int:
-    """How many points there are after an edit of the 200 through which policies are taken."""
-    nobody = torch.zeros(200, dtype=torch.bool)
+def _after(edit: Edit, count: int) -> int:
+    """How many points there are after an edit of `count`."""
+    nobody = torch.zeros(count, dtype=torch.bool)
     drop, clone, split = (nobody if mask is None else mask for mask in (edit.drop, edit.clone, edit.split))
-    return int(torch.where(drop, 0, torch.where(split, 2, 1 + clone.long())).sum())
+    new = 0 if edit.new is None else len(edit.new)
+    return new + int(torch.where(drop, 0, torch.where(split, 2, 1 + clone.long())).sum())
 
 
 def _adds(edit: Edit) -> bool:
-    return any(mask is not None and bool(mask.any()) for mask in (edit.clone, edit.split))
+    return bool(edit.new) or any(mask is not None and bool(mask.any()) for mask in (edit.clone, edit.split))
 
 
 def _edit(policy: Policy, points: Points, step: Step) -> Edit | None:
@@ -154,7 +161,8 @@ def _edit(policy: Policy, points: Points, step: Step) -> Edit | None:
         for key, value in points.params.items():
             assert torch.equal(value, before[key]), f"{name} changed the parameter {key!r}; return an Edit instead"
     for key, value in points.stats.items():
-        assert value.shape == (len(points),), f"{name}: the statistic {key!r} has shape {tuple(value.shape)}, not (N,)"
+        shape = tuple(value.shape)
+        assert shape[:1] == (len(points),), f"{name}: the statistic {key!r} has shape {shape}, not (N, ...)"
         assert key not in stats or torch.equal(value, stats[key]), f"{name}.edit changed {key!r}; only watch may"
     _check_repeated(name, first, second)
     if first is not None:
@@ -178,12 +186,32 @@ def _check_edit(name: str, edit: Edit, points: Points) -> None:
         value: Any = getattr(edit, field.name)
         if field.name == "max_opacity":
             assert value is None or 0 < value < 1, f"{name}: max_opacity must lie between 0 and 1"
+        elif field.name == "new":
+            _check_new(f"{name}: new", value, points)
+        elif field.name == "values":
+            for key, column in (value or {}).items():
+                known = points.all_params().get(key)
+                assert known is not None, f"{name}: values has {key!r}, and the points have no such parameter"
+                assert column.shape == known.shape, f"{name}: values: {key!r} has another shape than the parameter"
         elif value is not None:
             _check_rows(f"{name}: {field.name}", value, field.name, len(points))
 
 
+def _check_new(what: str, new: NewPoints | None, points: Points) -> None:
+    if new is None:
+        return
+    assert new.parent.dtype == torch.int64, f"{what}.parent is {new.parent.dtype}, not int64"
+    inside = bool(((new.parent >= 0) & (new.parent < len(points))).all())
+    assert inside, f"{what}.parent names points that do not exist"
+    assert set(new.params) == set(points.params), f"{what} has {sorted(new.params)}, not {sorted(points.params)}"
+    for key, value in new.params.items():
+        wanted = (len(new), *points.params[key].shape[1:])
+        assert value.shape == wanted, f"{what}: {key!r} has shape {tuple(value.shape)}, not {wanted}"
+        assert torch.isfinite(value).all(), f"{what}: {key!r} is not finite"
+
+
 def _check_rows(what: str, value: Tensor, field: str, count: int) -> None:
-    if field in ("drop", "clone", "split", "forget"):
+    if field in ("drop", "clone", "split", "forget", "scatter"):
         counts = field == "clone"
         allowed = (torch.bool, torch.int64) if counts else (torch.bool,)
         assert value.dtype in allowed, f"{what} is {value.dtype}, not bool{' or int64' * counts}"

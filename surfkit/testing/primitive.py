@@ -36,8 +36,11 @@ def check_primitive(primitive: Primitive, count: int = 50) -> None:
             splats = primitive.activate(params, degree)
         _check_splats(f"{name}.activate", splats, degree)
     assert torch.allclose(primitive.activate(params, 0).means, given.xyz, atol=1e-5), f"{name}: points begin elsewhere"
+    _check_dependent(name, primitive, params)
+    if primitive.has_free_points:
+        _check_moved(name, primitive, params)
+        _check_split(name, primitive, params, count // 2)
     _check_edits(name, primitive, params)
-    _check_split(name, primitive, params, count // 2)
     _check_table(name, primitive, params)
     if type(primitive).render is not Primitive.render:
         _check_render(f"{name}.render", primitive, primitive.activate(params, primitive.sh_degree).detached())
@@ -51,7 +54,7 @@ def _check_columns(name: str, primitive: Primitive, params: Columns, count: int)
     assert set(params) == set(columns), f"{name} gives {sorted(params)}, and columns() declares {sorted(columns)}"
     for key, column in columns.items():
         value, wanted = params[key], column.shape if column.shared else (count, *column.shape)
-        assert tuple(value.shape) == tuple(wanted), f"{name}: {key!r} has shape {tuple(value.shape)}, not {wanted}"
+        assert column.fits(value.shape, count), f"{name}: {key!r} has shape {tuple(value.shape)}, not {wanted}"
         assert value.dtype == torch.float32, f"{name}: {key!r} is {value.dtype}, not float32"
         assert torch.isfinite(value).all(), f"{name}: {key!r} is not finite"
         raw = torch.linspace(-2, 2, 9, dtype=torch.float64)
@@ -76,11 +79,32 @@ def _check_splats(name: str, splats: Splats, degree: int) -> None:
     assert not set(splats.extra) & set(splats.shared), f"{name}: extra and shared tensors have names in common"
 
 
-def _check_edits(name: str, primitive: Primitive, params: Columns) -> None:
-    """Moved, scaled and dimmed points are so when they are drawn."""
-    before, count = primitive.activate(params, 0), len(params["means"])
-    moved = primitive.activate(primitive.moved(params, torch.full((count, 3), 0.25)), 0)
+def _check_dependent(name: str, primitive: Primitive, params: Columns) -> None:
+    """What other parameters determine belongs to points, is not trained, and is so from the beginning."""
+    with unchanged(f"{name}.dependent", params=params):
+        found = primitive.dependent(params)
+    for key, value in found.items():
+        column = primitive.columns().get(key)
+        assert column is not None and not column.shared, f"{name}.dependent gives {key!r}, which is no column of points"
+        assert column.rate.start == 0, f"{name}.dependent gives {key!r}, whose learning rate is not 0"
+        close = value.shape == params[key].shape and torch.allclose(value, params[key], atol=1e-5)
+        assert close, f"{name}.init gives {key!r} other values than dependent does"
+    if not found.keys() & {"means"}:
+        return
+    drawn = primitive.activate(params, 0).means
+    assert torch.allclose(found["means"], drawn, atol=1e-5), f"{name}.dependent gives other means than are drawn"
+
+
+def _check_moved(name: str, primitive: Primitive, params: Columns) -> None:
+    """Moved points are so when they are drawn."""
+    before, shift = primitive.activate(params, 0), torch.full((len(params["means"]), 3), 0.25)
+    moved = primitive.activate(primitive.moved(params, shift), 0)
     assert torch.allclose(moved.means, before.means + 0.25, atol=1e-5), f"{name}.moved does not move as asked"
+
+
+def _check_edits(name: str, primitive: Primitive, params: Columns) -> None:
+    """Scaled and dimmed points are so when they are drawn."""
+    before, count = primitive.activate(params, 0), len(params["means"])
     factor = torch.linspace(0.5, 2, count)
     for given, wanted in ((0.5, torch.tensor(0.5)), (factor, factor[:, None])):
         scaled = primitive.activate(primitive.scaled(params, given), 0).scales

@@ -5,6 +5,7 @@ Each check returns nothing and raises AssertionError with a sentence that says w
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,9 +15,10 @@ import numpy as np
 import torch
 
 from surfkit.partition.assign import Assign
-from surfkit.partition.base import CoarseModel, Partition
+from surfkit.partition.base import Cells, CoarseModel, Ground, Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import RATES
+from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.readers.base import Reader
@@ -26,7 +28,7 @@ from surfkit.refine.base import Refine
 from surfkit.scene.scene import Cloud, View
 from surfkit.start.base import Start, StartInput
 from surfkit.testing.compare import assert_same, unchanged
-from surfkit.testing.inputs import cloud, coarse_model, start_input, survey
+from surfkit.testing.inputs import cloud, coarse_model, mesh_input, start_input, survey
 from surfkit.testing.synthetic import Synthetic
 
 ABOUT = 10.0
@@ -99,26 +101,27 @@ def check_partition(partition: Partition, sight: CoarseModel | None = None) -> N
 
 
 def check_assign(assign: Assign) -> None:
-    """How much blocks matter to views is finite and 0 or more, one row a view and one column a block; some view joins
-    each block of points in the middle of the scene, and none joins a block without points.
+    """One row a view and one column a block, the same again for the same seed; some view joins each block of points in
+    the middle of the scene, and none joins one that is far from all points and views.
 
     Args:
-        assign: With any threshold that some view of a scene of two blocks passes.
+        assign: With settings by which some view joins each half of a scene of 1,500 points and 30 views.
     """
     name, sight = type(assign).__name__, coarse_model()
-    owner = (sight.splats.means[:, 0] > -0.4).to(torch.int64)
-    with unchanged(f"{name}.measure", splats=sight.splats, views=sight.views, owner=owner):
-        matters = assign.measure(sight, owner, 3)
+    sides = (None, -0.4, 1e3, None)
+    boxes = tuple((low, None, high, None) for low, high in itertools.pairwise(sides))
+    cells = Cells(Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), boxes, (0, 1, 2))
+    with unchanged(f"{name}.joins", splats=sight.splats, views=sight.views):
+        joins = assign.joins(sight, cells)
     wanted = (len(sight.views), 3)
-    assert matters.shape == wanted, f"{name}.measure has shape {tuple(matters.shape)}, not {wanted}"
-    assert torch.isfinite(matters).all(), f"{name}.measure is not finite"
-    assert (matters >= 0).all(), f"{name}.measure is below 0 for some view"
-    assert_same(f"{name}.measure", matters, assign.measure(sight, owner, 3), "draw nothing")
-    least = assign.least
-    assert least >= 0, f"{name}.least is {least}; it must be 0 or more"
-    joined = (matters > least).sum(0).tolist()
+    assert joins.shape == wanted, f"{name}.joins has shape {tuple(joins.shape)}, not {wanted}"
+    assert joins.dtype == torch.bool, f"{name}.joins is {joins.dtype}, not bool"
+    assert_same(f"{name}.joins", joins, assign.joins(sight, cells), "draw from the seed of the model")
+    joined = joins.sum(0).tolist()
     assert all(joined[:2]), f"{name}: no view joins block {joined.index(0)}, to which half of the points belong"
     assert not joined[2], f"{name}: a view joins a block without points"
+    most = assign.most_views
+    assert most is None or most >= 1, f"{name}.most_views is {most}; it must be 1 or more, or None"
 
 
 def check_refine(
@@ -138,13 +141,14 @@ def check_refine(
     name, primitive = type(refine).__name__, primitive or Surfel2D()
     params = params or primitive.init(cloud(), torch.Generator().manual_seed(0))
     views = views or survey().scene.train
-    with unchanged(f"{name}.params", params=params):
-        begun = refine.params(params)
+    with unchanged(f"{name}.begin", params=params):
+        begun = refine.begin(SplatModel(primitive, params, primitive.sh_degree), lambda _: mesh_input())
     after = refine.primitive(primitive)
-    fresh = after.init(cloud(4), torch.Generator().manual_seed(0))
-    shapes, wanted = ({key: tuple(value.shape[1:]) for key, value in columns.items()} for columns in (begun, fresh))
-    assert shapes == wanted, f"{name}: its points have the columns {shapes}, and what they are then has {wanted}"
-    assert len({len(value) for value in begun.values()}) == 1, f"{name}: the columns differ in length"
+    columns, shapes = after.columns(), {key: tuple(value.shape) for key, value in begun.items()}
+    wanted = {key: column.shape for key, column in columns.items()}
+    assert shapes.keys() == columns.keys(), f"{name}: its points have {sorted(shapes)}, not {sorted(wanted)}"
+    wrong = [key for key, column in columns.items() if not column.fits(shapes[key], len(begun["means"]))]
+    assert not wrong, f"{name}: the column {wrong[0]!r} has shape {shapes[wrong[0]]}, declared as {wanted[wrong[0]]}"
     unknown = set(refine.stage.rates) - set(begun) - set(RATES)
     assert not unknown, f"{name}: stage.rates names {', '.join(sorted(unknown))}, which its points do not have"
     assert after.activate(begun, after.sh_degree).sh.shape[1] == (after.sh_degree + 1) ** 2

@@ -24,7 +24,7 @@ from surfkit.core.codec import from_json
 from surfkit.core.codec import load as load_value
 from surfkit.core.files import sync_folder
 from surfkit.primitives.points import Points
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 from surfkit.train.views import Order
 
 FORMAT = "surfkit-stage-3"
@@ -170,6 +170,7 @@ def _write(part: Path, tensors: dict[str, Tensor], facts: str) -> None:
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
+    tensors = {name: value.cpu() for name, value in tensors.items()}
     metadata = {"format": FORMAT, "facts": facts, "digest": _digest(tensors, facts)}
     try:
         save_file(tensors, part, metadata=metadata)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from surfkit.losses.base import Regularizer, RegularizerInput
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Maps, Splats
 
@@ -29,6 +31,22 @@ def added(a: Maps, b: Maps) -> Maps:
     for name, value in b.present().items():
         sums[name] = sums[name] + value if name in sums else value
     return Maps(**sums)
+
+
+def regularizer_terms(
+    regularizers: Mapping[str, Regularizer], splats: Splats, given: RegularizerInput
+) -> dict[str, Tensor]:
+    """The weighted terms on the points that count in a step, by key, with their graph to the splats."""
+    weights = {name: term.weight_at(given.index, given.steps) for name, term in regularizers.items()}
+    return {name: weight * regularizers[name].in_step(splats, given) for name, weight in weights.items() if weight > 0}
+
+
+def as_numbers(values: Mapping[str, Tensor]) -> dict[str, float]:
+    """Scalars as Python numbers; the host waits for the device once."""
+    if not values:
+        return {}
+    together = torch.stack([value.detach().double().reshape(()) for value in values.values()])
+    return dict(zip(values, together.tolist(), strict=True))
 
 
 def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Tensor]) -> Columns:

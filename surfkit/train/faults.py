@@ -14,6 +14,7 @@ from surfkit.core.check import Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.memory import out_of_memory as say_out_of_memory
+from surfkit.train.cotangents import as_numbers
 
 MOST_HALVINGS = 2
 """Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""
@@ -76,7 +77,7 @@ def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) ->
 
 def require_finite_values(index: int, view: str, params: Mapping[str, Tensor]) -> None:
     """Diverged if a parameter is not finite after a step. A sum tells, in one pass and without a copy."""
-    for name, total in [(name, value.sum()) for name, value in params.items()]:
+    for name, total in as_numbers({name: value.sum() for name, value in params.items()}).items():
         if not math.isfinite(total) and not torch.isfinite(params[name]).all():
             raise Diverged(index, view, f"the {name} are not finite")
 

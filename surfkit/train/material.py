@@ -13,6 +13,7 @@ from surfkit.losses.base import Loss
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import Alignment, Priors, prior_bytes, read_priors
 from surfkit.readers.masks import mask_cache, mask_sizes
+from surfkit.scene.align import SCALE_BAND
 from surfkit.scene.cache import Cache, share
 from surfkit.scene.copies import Copies
 from surfkit.scene.memory import cache_bytes
@@ -97,6 +98,12 @@ def needs_priors(losses: Mapping[str, Loss]) -> bool:
 def needs_normals(losses: Mapping[str, Loss]) -> bool:
     """Whether any loss looks at the normals of depth priors."""
     return any(loss.needs_prior and loss.needs_normals for loss in losses.values())
+
+
+def scale_band(losses: Mapping[str, Loss]) -> tuple[float, float]:
+    """The widest band of the scales of depth priors that any loss accepts; see `Loss.scale_band`."""
+    bands = [loss.scale_band for loss in losses.values() if loss.needs_prior] or [SCALE_BAND]
+    return min(low for low, _ in bands), max(high for _, high in bands)
 
 
 def read_ahead(

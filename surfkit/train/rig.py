@@ -76,7 +76,7 @@ class Rig:
         """(3, P) places in the world on the surface that a camera sees."""
         height, width = depth.shape
         y, x = (((torch.arange(PLACES) + 0.5) * size / PLACES).long() for size in (height, width))
-        z = depth.detach()[y[:, None], x].flatten().float()
+        z = depth.detach()[y[:, None], x].flatten().float().cpu()
         rays = self.cameras[at].rays()[:, y[:, None], x].flatten(1)
         seen = (rays * z)[:, z > 0]
         return self.rotations[at].T @ (seen - self.shifts[at])

@@ -20,21 +20,23 @@ from surfkit.core.schedule import Interval, LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Neighbour, Regularizer, Target, ignoring
+from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by, refuse_wrong_maps
-from surfkit.primitives.edit import Edit, apply, merge, withheld
+from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, observe, withheld
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.cache import out_of_turn
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
-from surfkit.train.cotangents import added, gradient, pulled
+from surfkit.train.cotangents import added, as_numbers, gradient, pulled, regularizer_terms
 from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
+from surfkit.train.reads import maps_read
 from surfkit.train.rig import Rig
+from surfkit.train.state import StageState, uploaded
 from surfkit.train.views import Order, ViewContributions
 
 MOST_STEPS = 100_000_000
@@ -88,8 +90,7 @@ class Stage:
 
     def weights_at(self, index: int) -> dict[str, float]:
         """Weights of the losses that count in step `index` of 1..`steps`, by key."""
-        weights = {name: loss.weight_at(index, self.steps) for name, loss in self.losses.items()}
-        return {name: weight for name, weight in weights.items() if weight > 0}
+        return {name: weight for name, loss in self.losses.items() if (weight := loss.weight_at(index, self.steps)) > 0}
 
     def is_paired(self, index: int) -> bool:
         """Whether step `index` looks at a second view."""
@@ -104,40 +105,6 @@ class Stage:
         """Raw parameters of the points as they leave the stage, in the colours of the mean photograph."""
         params = state.points.all_params()
         return params if self.appearance is None else self.appearance.folded(state.looks["value"], params)
-
-
-@dataclass
-class StageState:
-    """What an interrupted stage needs to go on as if nothing had happened."""
-
-    points: Points
-    order: Order
-    generator: torch.Generator
-    index: int = 0
-    """Steps done."""
-    seconds: float = 0.0
-    """Wall time of the steps done."""
-    cpu_seconds: float = 0.0
-    """CPU time of the steps done, all threads, seconds."""
-    peak_memory_bytes: int = 0
-    """Most memory held so far; 0 where the system does not tell."""
-    looks: Columns = field(default_factory=dict)
-    """What is known of the look of each photograph (`train.look`)."""
-    reset_at: int = 0
-    """Step that last lowered the opacities; 0 if none has."""
-    sh_degree: int = 0
-    """Of the spherical harmonics so far. It never falls, also when the schedule becomes a longer one."""
-    halvings: int = 0
-    """How often the learning rates have been halved, after numbers that were not finite."""
-    skipped: list[int] = field(default_factory=list)
-    """Positions of photographs that turned out damaged, and are not shown any more."""
-    frozen: Columns = field(default_factory=dict)
-    """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
-
-    @property
-    def seed(self) -> int:
-        """Of what is drawn in the coming step beside the generator, in [0, 2^63)."""
-        return (self.generator.initial_seed() * 1_000_003 + self.index + 1) % 2**63
 
 
 @dataclass(frozen=True)
@@ -198,11 +165,16 @@ class Trainer:
         state = StageState(points, Order(len(self.views)), generator, frozen=frozen or {})
         if self.stage.appearance is not None:
             state.looks = fresh_looks(self.stage.appearance, len(self.views))
+        state.move(self.rasterizer.where())
         return state
 
     def run(self, state: StageState) -> Iterator[Done]:
-        """Take the steps that are left; after each one, `state` can be saved, and the caller may stop."""
+        """Take the steps that are left; after each one, `state` can be saved, and the caller may stop.
+
+        The points of `state` are moved to where the rasterizer draws.
+        """
         wall, cpu = time.perf_counter(), time.process_time()
+        state.move(self.rasterizer.where())
         self.foretell(state.order)
         while state.index < self.stage.steps:
             done = self.step(state)
@@ -220,6 +192,8 @@ class Trainer:
     def step(self, state: StageState) -> Done:
         """One optimisation step: render a view, compare it with its photograph, update the points, then edit them."""
         stage, index = self.stage, state.index + 1
+        if state.index % OBSERVED_EVERY == 0:
+            state.points = observe(self.primitive, state.points, self.views, stage.near)
         shown, target = self.target(state)
         active, reads = stage.weights_at(index), self.maps_read(index)
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.all_params().items()}
@@ -234,14 +208,17 @@ class Trainer:
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
         losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
-        terms = {n: w * r(shape) for n, r in stage.regularizers.items() if (w := r.weight_at(index, stage.steps)) > 0}
-        losses |= {name: float(term.detach()) for name, term in terms.items()}
+        seen = render.seen[: len(state.points)]
+        given = RegularizerInput(index, stage.steps, target, render.maps, seen, state.points.stat, leaves)
+        terms = regularizer_terms(stage.regularizers, shape, given)
+        losses |= as_numbers(terms)
         require_finite_losses(index, target.view.name, losses)
         gradients = render.backward(total, chosen, stage.signal.absolute, len(state.points))
         facts = self.facts(state, splats, target, render, gradients)
         edit = self.wanted(state.points, facts)
         adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
         require_finite_values(index, target.view.name, state.points.all_params())
+        state.points = fitted(self.primitive, state.points)
         if edit is not None:
             state.points = self.edited(state, edit, index)
         state.index = index
@@ -261,15 +238,12 @@ class Trainer:
         return drawn_by(self.primitive, self.rasterizer)
 
     def maps_read(self, index: int) -> dict[str, str]:
-        """By the name of a map that the losses of step `index` read, one of these losses."""
-        names = list(self.stage.weights_at(index))
+        """By the name of a map that the terms of step `index` read, the path of one of these terms."""
+        steps = [index]
         if index == 1 and self.draws is not self.rasterizer:
             # what a render of the primitive's own lacks for the last steps is told now, not after hours
-            names += [name for at in range(-99, 1) for name in self.stage.weights_at(max(1, self.stage.steps + at))]
-        losses = {name: self.stage.losses[name] for name in names}
-        # the neighbour of a pair is chosen by the median depth
-        pairs = ((*loss.reads, *["median"] * loss.needs_neighbour) for loss in losses.values())
-        return {read: name for name, reads in zip(losses, pairs, strict=True) for read in reads}
+            steps += [max(1, self.stage.steps + at) for at in range(-99, 1)]
+        return maps_read(self.stage.losses, self.stage.regularizers, steps, self.stage.steps)
 
     @cached_property
     def rates(self) -> dict[str, LearningRate]:
@@ -283,12 +257,10 @@ class Trainer:
                 state.order.shuffle(state.generator)
                 self.foretell(state.order)
             shown = state.order.next(state.generator)
-            if shown in state.skipped:
-                continue
-            photo = self.photo(state, shown)
-            if photo is None:
+            if shown in state.skipped or (photo := self.photo(state, shown)) is None:
                 continue
             prior, mask = (None if known is None else known[shown] for known in (self.priors, self.masks))
+            prior, mask = (None if known is None else uploaded(known, photo.device) for known in (prior, mask))
             return shown, Target(self.views[shown], photo, prior, mask, seed=state.seed)
         raise BadInput(f"none of the {len(self.views)} photographs can be read, {self.views[0].path} for one")
 
@@ -303,7 +275,7 @@ class Trainer:
             state.skipped.append(at)
             emit(PhotoSkipped(self.views[at].name, str(error)))
             return None
-        return photo.to(torch.float32).div_(255)
+        return uploaded(photo, state.points.params["means"].device).to(torch.float32).div_(255)
 
     @cached_property
     def rig(self) -> Rig:
@@ -325,6 +297,7 @@ class Trainer:
                 continue
             drawn = self.draws.render(splats, self.views[at].camera, self.stage.near, True, False).maps
             mask = None if self.masks is None else out_of_turn(self.masks, at)
+            mask = None if mask is None else uploaded(mask, photo.device)
             return Neighbour(self.views[at], photo, replace(drawn, color=None, distortion=None), mask)
         return None
 
@@ -338,7 +311,7 @@ class Trainer:
         compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
         compared, target = ignoring(compared, target)
         values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
-        numbers = {name: float(value.detach()) for name, value in values.items()}
+        numbers = as_numbers(values)
         if look is not None:
             look.learn(list(values.values()))
         if terms is None:
@@ -372,6 +345,8 @@ class Trainer:
             rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.rates.items()},
             seed=state.seed,
             owns=self.owns,
+            signed_norm=gradients.signal.norm(dim=-1),
+            derived=gradients.derived and gradients.derived.combined(self.stage.signal.combine),
         )
 
     def wanted(self, points: Points, step: Step) -> Edit | None:
@@ -386,10 +361,10 @@ class Trainer:
         points = apply(self.primitive, state.points, edit, state.generator)
         if len(points) == 0:
             raise BadInput(f"step {index} would drop every point; lower the culls of densify and the ratios of prune")
+        points = observe(self.primitive, points, self.views, self.stage.near)
         if edit.max_opacity is not None:
             state.reset_at = index
-        counts = [0 if mask is None else int(mask.sum()) for mask in (edit.drop, edit.clone, edit.split)]
-        if any(counts):
+        if any(counts := edit.counts):
             emit(PointsEdited(index, *counts, points=len(points)))
         return points
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from surfkit.primitives.points import Columns, Points
 from surfkit.train import checkpoint
 from surfkit.train.checkpoint import FORMAT
-from surfkit.train.stage import StageState
+from surfkit.train.state import StageState
 
 ROWS = 1 << 16
 """Points of a piece."""
@@ -47,12 +47,19 @@ class Stored:
     def pieces(self) -> Iterator[StageState]:
         """The state with some of its points each time, in their order, and without moments and statistics."""
         for start in range(0, len(self.state.points), ROWS):
-            with checkpoint.reading(self.path) as (file, _):
-                params = {
-                    name: file.get_slice(f"params.{name}")[start : start + ROWS].clone()
-                    for name in self.state.points.params
-                }
-            yield replace(self.state, points=Points(params, {}, {}, shared=self.state.points.shared))
+            yield self.rows(start, start + ROWS)
+
+    def rows(self, start: int, end: int) -> StageState:
+        """The state with the points from one row to before another, and without moments and statistics."""
+        names = self.state.points.params
+        with checkpoint.reading(self.path) as (file, _):
+            params = {name: file.get_slice(f"params.{name}")[start:end].clone() for name in names}
+        return replace(self.state, points=Points(params, {}, {}, shared=self.state.points.shared))
+
+    def column(self, name: str) -> Tensor:
+        """(N, ...) a column of statistics of all points."""
+        with checkpoint.reading(self.path) as (file, _):
+            return file.get_tensor(f"stats.{name}").clone()
 
 
 def open_last(path: Path) -> tuple[Stored, str | None] | None:

@@ -1,5 +1,7 @@
 """Parts that come, change or go by a word, on the real recipes."""
 
+from itertools import zip_longest
+
 import pytest
 
 from surfkit.appearance.base import Appearance
@@ -90,18 +92,23 @@ SLOTS = {
 
 @pytest.mark.parametrize("recipe", ["3dgs", "citygs2-coarse"])
 def test_every_component_can_be_put_into_a_recipe_by_a_word(recipe):
-    for base, slot in SLOTS.items():
-        assert components(base)
-        for name, cls in components(base).items():
-            at = len(recipes()[recipe].pretrain.densify.filters) if base is Filter else 0
-            word = f"{slot.format(at)}:{name}"
-            made = parse(Train, [f"recipe:{recipe}", word], "surfkit train").recipe
-            for step in slot.format(at).split("."):
-                made = (
-                    made[int(step)]
-                    if step.isdecimal()
-                    else made[step]
-                    if isinstance(made, dict)
-                    else getattr(made, step)
-                )
-            assert isinstance(made, cls), word
+    """One for each slot at a time; what is about `densify` itself apart, as its filters are its own."""
+    filters = len(recipes()[recipe].pretrain.densify.filters)
+    offered = {slot.format(filters if base is Filter else 0): components(base) for base, slot in SLOTS.items()}
+    assert all(offered.values())
+    densify = [{f"pretrain.densify:{name}": cls} for name, cls in offered.pop("pretrain.densify").items()]
+    rounds = zip_longest(*([(f"{slot}:{name}", cls) for name, cls in known.items()] for slot, known in offered.items()))
+    for words in [*densify, *(dict(filter(None, pairs)) for pairs in rounds)]:
+        made = parse(Train, [f"recipe:{recipe}", *words], "surfkit train").recipe
+        for word, cls in words.items():
+            assert isinstance(at(made, word.partition(":")[0]), cls), word
+
+
+def at(made, path):
+    """What stands at a dotted path."""
+    for step in path.split("."):
+        if isinstance(made, dict):
+            made = made[step]
+        else:
+            made = made[int(step)] if step.isdecimal() else getattr(made, step)
+    return made

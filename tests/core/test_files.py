@@ -1,5 +1,7 @@
 import os
 import stat
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,20 @@ def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
     with replacing(path) as file:
         file.write(b"new")
     assert path.read_bytes() == b"new" and order == ["fsync", "replace", "fsync"], "file, name, folder"
+
+
+def test_two_threads_write_the_same_file(tmp_path):
+    both = threading.Barrier(2)
+
+    def write(text):
+        with replacing(tmp_path / "a.txt") as file:
+            file.write(text)
+            both.wait(10)
+
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(write, [b"one", b"two"]))
+    assert (tmp_path / "a.txt").read_bytes() in (b"one", b"two")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_what_fails_leaves_the_old_and_nothing_else(tmp_path):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
+from surfkit.cli.recipes import recipes
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
 from surfkit.core.registry import components
@@ -15,6 +16,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.api import Splats
 from surfkit.scene.scene import Cloud
 from surfkit.testing import check_policy
+from surfkit.train.stage import Stage
 
 
 class Everything:
@@ -42,7 +44,7 @@ def step(index: int, **other) -> Step:
     splats = Splats("surfel", *[torch.zeros(N, k) for k in (3, 4)], SIZES[:, None].repeat(1, 2), OPACITIES, None)
     facts = dict(
         index=index, steps=30_000, seen=torch.ones(N, dtype=torch.bool), splats=splats,
-        grad_norm=torch.full((N,), 1e-3),
+        grad_norm=torch.full((N,), 1e-3), signed_norm=torch.full((N,), 1e-3),
         radii=torch.ones(N), image_px=100, views=Everything(), since_reset=1_000, rates={"means": 1e-4}, seed=index,
     )  # fmt: skip
     return Step(**(facts | other))
@@ -59,6 +61,10 @@ def watched(policy: ADC, points: Points, steps, **other):
 @pytest.mark.parametrize("name", components(Policy))
 def test_contract_of_every_policy(name):
     policy, points = components(Policy)[name](), scene()
+    try:
+        policy.watch(scene(), step(1))
+    except BadInput as refusal:
+        pytest.skip(f"{refusal} (its package checks it)")
     for index in (1, 599, 600, 3000, 3100, 29_999):
         check_policy(policy, points, step(index))
 
@@ -134,6 +140,33 @@ def test_huge_points_go_after_the_first_reset_unless_splitting_makes_them_fit():
     assert torch.equal(watched(policy, scene(), [3100], **quiet).drop, SIZES > 0.1)
     assert torch.equal(watched(policy, scene(), [3100]).drop, SIZES / 1.6 > 0.1)
     assert not watched(replace(policy, cull_scale=0), scene(), [3100], **quiet).drop.any()
+
+
+def test_a_split_threshold_clones_by_the_signed_gradient_and_splits_by_the_other():
+    policy = ADC(threshold=2e-4, split_threshold=4e-4, small=0.1)
+    small, every = SIZES <= 0.1, torch.arange(N)
+    signed = torch.where(every % 2 == 0, 2.1e-4, 1.9e-4)
+    absolute = torch.where(every % 3 == 0, 4.1e-4, 3.9e-4)
+    edit = watched(policy, scene(), range(501, 601), grad_norm=absolute, signed_norm=signed)
+    assert torch.equal(edit.clone, small & (every % 2 == 0)) and torch.equal(edit.split, ~small & (every % 3 == 0))
+    points = scene()
+    watched(policy, points, [600], signed_norm=torch.full((N,), 9.0))
+    again = watched(policy, points, range(601, 701), grad_norm=absolute, signed_norm=signed)
+    assert torch.equal(again.clone, edit.clone), "a new window"
+    grown = torch.where(every == 0, 9e-4, signed), torch.where(every == 57, 9e-4, absolute)
+    limited = policy.limited(N + 2)
+    assert limited.needs_absolute and not ADC().needs_absolute
+    room = watched(limited, scene(), [600], grad_norm=grown[1], signed_norm=grown[0])
+    assert (room.clone | room.split).nonzero().flatten().tolist() == [0, 57], "in multiples of each threshold"
+
+
+def test_a_split_threshold_needs_absolute_gradients():
+    recipe = replace(recipes()["3dgs"], pretrain=Stage(densify=ADC(split_threshold=4e-4)))
+    with pytest.raises(BadInput, match="pretrain.densify: adc needs absolute pixel gradients.*signal:abs-gradient"):
+        recipe.refuse_unfit()
+    recipes()["absgs"].refuse_unfit()
+    with pytest.raises(BadInput, match="densify.split_threshold is 0"):
+        ADC(split_threshold=0.0)
 
 
 def test_points_that_were_large_on_any_screen_since_the_last_edit_go():

@@ -11,6 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.schedule import rescale
 from surfkit.densify import ADC, Faint, Importance, Trim
 from surfkit.densify.base import Contribution
+from surfkit.densify.prune import significance
 from surfkit.densify.trim import lowest, released_score, summed
 from surfkit.raster.api import Splats
 from surfkit.raster.select import select
@@ -31,8 +32,8 @@ class Seven:
         return 7
 
     def each(self, alpha_power, transmittance_power):
-        assert (alpha_power, transmittance_power) == (1.0, 1.0)
-        yield from zip(AMOUNT * (COUNT > 0), COUNT, strict=True)
+        assert (alpha_power, transmittance_power) in ((1.0, 1.0), (0.0, 1.0))
+        yield from zip(AMOUNT * (COUNT > 0) * (2 - alpha_power), COUNT, strict=True)
 
     def contributions(self, alpha_power=0.5, transmittance_power=0.5):
         each = AMOUNT / COUNT.clamp_min(1) * (COUNT > 0)
@@ -80,6 +81,13 @@ def test_trims_end_epochs_and_leave_reset_points_alone(crowd):
     assert [i for i in range(2, 1_020) if dropped(every, crowd, i) is not None] == [1001, 1008, 1015]
     short = rescale(Trim(), 2_000 / 30_000)
     assert (short.start, short.until, short.every, short.recovery) == (800, 1_000, 500, 100)
+
+
+def test_trims_at_given_steps_whatever_an_epoch_is(crowd):
+    policy = Trim(start=1_000, until=3_000, every=500, whole_epochs=False, recovery=0)
+    assert [i for i in range(2, 5_000) if dropped(policy, crowd, i, since_reset=0) is not None] == [
+        1000, 1500, 2000, 2500, 3000,
+    ]  # fmt: skip
 
 
 def schedule(recipe_steps, epoch):
@@ -200,6 +208,38 @@ def test_importance_is_opacity_times_hits_times_a_power_of_the_area(crowd):
     assert set(drop.nonzero().flatten().tolist()) == set(np.argsort(score, kind="stable")[:60].tolist())
     assert Importance().edit(points, replace(step, index=15_001)) is None
     assert rescale(Importance(at=(9_000, 15_000)), 0.1).at == (900, 1_500)
+
+
+def test_significance_is_opacity_times_transmittance_times_a_power_of_the_clipped_area(crowd):
+    points, step = at(crowd, 15_000)
+    opacities, scales = step.splats.opacities.double().numpy(), step.splats.scales.double().numpy()
+    area = scales[:, 0] * scales[:, 1]
+    share = [min(a / np.sort(area)[180], 1.0) for a in area]
+    shown = (2 * AMOUNT * (COUNT > 0)).sum(0).double().numpy()
+    score = [shown[n] * opacities[n] * share[n] ** 0.1 for n in range(200)]
+    assert sum(value == 1 for value in share) == 20
+    drop = Importance(ratio=0.3, score="significance").edit(points, step).drop
+    assert set(drop.nonzero().flatten().tolist()) == set(np.argsort(score, kind="stable")[:60].tolist())
+    assert np.allclose(significance(step.views, step.splats, 0.1), score, rtol=1e-5)
+
+
+def test_significance_counts_a_pixel_by_what_the_points_before_it_let_through():
+    splats, cameras = discs()
+    rasterizer, _ = select("cpu")
+    views = ViewContributions([View("0", cameras[0], None)], rasterizer, splats, 0.01)
+
+    def alpha(first, last):
+        some = splats.take(torch.arange(first, last))
+        return rasterizer.render(some, cameras[0], 0.01, False).maps.alpha.double()
+
+    volume = splats.scales.prod(-1).double()
+    volume = (volume / volume.sort().values[16]).clamp_max(1)
+    veiled = 1 - alpha(12, 18)
+    found = significance(views, splats, 0.5)
+    for n in range(12):
+        shown = veiled[alpha(n, n + 1) > 0].sum()
+        wanted = float(shown * splats.opacities[n] * volume[n].sqrt())
+        assert float(found[n]) == pytest.approx(wanted, rel=1e-3), n
 
 
 def test_faint_points_go_every_so_often(crowd):

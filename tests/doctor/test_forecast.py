@@ -197,6 +197,8 @@ def test_the_second_view_of_a_step_is_drawn_too(farm, tmp_path, monkeypatch):
     rasterizer, drawn = select("cpu")[0], []
 
     class Counting:
+        where = rasterizer.where
+
         def render(self, *words):
             drawn.append(1)
             return rasterizer.render(*words)
@@ -227,7 +229,7 @@ def test_steps_with_a_second_view_count_by_how_many_there_are(farm, tmp_path, mo
     assert [one.seconds for one in taken] == pytest.approx(seconds)
 
 
-def test_a_probe_that_is_killed_says_so(farm, tmp_path):
+def test_a_probe_that_is_killed_says_so(farm, tmp_path, forked_probe):
     job = tiny(farm, tmp_path)
 
     def kill(done, total):

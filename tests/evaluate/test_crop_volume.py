@@ -178,6 +178,9 @@ def test_the_volume_ends_where_the_views_do():
     across, along = 2 * 10 * 160 / 200 - 4, 2 * 10 * 120 / 200  # what all five see
     assert crop.area == pytest.approx(across * along, rel=0.1)
     assert seen == pytest.approx(across * along / 0.25, rel=0.1)
+    flat = np.concatenate([ground, cellar]), views, Frame(np.zeros(3), 1.0), np.eye(4)
+    number, share = (visible_crop(*flat, CropSettings(least, "z", 2.0, 0.25))[1] for least in (3, 0.6))
+    assert number == share > seen  # three of five views
     assert (crop.low, crop.high) == (-0.25, 0.25)  # not down to the cellar
     shift = np.eye(4)
     shift[:3, :3] *= 2

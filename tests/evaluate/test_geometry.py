@@ -1,6 +1,7 @@
 """Whole comparisons with known answers, what they write, and inputs that do not belong together."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.evaluate.geometry.transform import apply, write_transform
 from surfkit.export.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop
+from surfkit.scene.scene import Frame
 from surfkit.testing.synthetic import Flight, photograph
 
 trimesh = needs("trimesh")
@@ -170,12 +172,25 @@ def test_half_of_all_far_off_is_another_frame():
         ({"draws": 0}, "--draws 0"),
         ({"samples": 3}, "--samples 3"),
         ({"visible": 0.0}, "--visible 0"),
+        ({"visible": 2.5}, "--visible 2.5"),
+        ({"preset": "gauu"}, "--preset gauu: choose one of gauu-residence, "),
         ({"far": float("nan")}, "--far nan"),
     ],
 )
 def test_bad_settings(options, message):
     with pytest.raises(BadInput, match=message):
         Comparison(**options)
+
+
+def test_a_preset_is_in_metres_and_gives_way_to_options():
+    hundred_metres, matrix = Frame(np.zeros(3), 1.0, metres=100.0), np.diag([2.0, 2, 2, 1])
+    found = Comparison(preset="gauu-residence").for_scene(hundred_metres, matrix)
+    assert found == Comparison(voxel=found.voxel, visible=95)
+    assert found.voxel == pytest.approx(0.007)  # two units of the truth are 100 m
+    own = Comparison(preset="matrixcity-street", voxel=0.1, visible=0.5, tau=0.4)
+    assert own.for_scene(None, matrix) == replace(own, preset=None)
+    with pytest.raises(BadInput, match="--preset gauu-modern: the truth is thinned to voxels of 0.35 m.*--metres-per"):
+        Comparison(preset="gauu-modern").for_scene(Frame(np.zeros(3), 1.0), matrix)
 
 
 def test_without_views_the_volume_must_be_given():

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
@@ -52,6 +53,22 @@ def test_pool_divides_the_processors(tmp_path):
     list(Pool(workers=1, threads=3).run([job(tmp_path, 0, say)]))
     list(Pool(workers=1000).run([job(tmp_path, 1, say)]))
     assert [(tmp_path / name / LOG).read_text() for name in ("00", "01")] == ["3\n", "1\n"]
+
+
+def test_pool_gives_each_process_a_gpu(tmp_path, monkeypatch):
+    """The last one gets the GPU of the process that has ended."""
+    say = "import os, time; print(os.environ['CUDA_VISIBLE_DEVICES']); time.sleep({})"
+    jobs = [job(tmp_path, at, say.format(wait), cost=9 - at) for at, wait in enumerate([3, 0, 0])]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,GPU-7,5")
+    list(Pool(workers=2, gpus=2).run(jobs))
+    assert [(tmp_path / name / LOG).read_text() for name in ("00", "01", "02")] == ["2\n", "GPU-7\n", "GPU-7\n"]
+
+
+def test_pool_wants_no_more_gpus_than_there_are(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    Pool(gpus=3).ready()
+    with pytest.raises(BadInput, match="pool.gpus is 4, and torch finds 3 GPUs here; give 0 to 3"):
+        Pool(gpus=4).ready()
 
 
 def test_the_largest_begin_first(tmp_path):

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 
 from surfkit.execute import remote
 from surfkit.execute.base import LOG, Job
-from surfkit.execute.remote import Outcome, run_remote_job
+from surfkit.execute.remote import Outcome, RemoteJob, run_remote_job
 from surfkit.execute.shared import MARK, mark_folder, remote_job
 
 HOST = socket.gethostname()
@@ -78,17 +79,16 @@ def test_agents_are_light(module):
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_an_agent_hears_ctrl_c_also_where_the_shell_ignores_it():
+def test_an_agent_hears_ctrl_c_also_where_the_shell_ignores_it(tmp_path):
     """As in all that a shell begins in the background: Ray's way to cancel would mean nothing to it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def interrupted():
-        with pytest.raises(KeyboardInterrupt):
-            _thread.interrupt_main()
-            time.sleep(1)
-        return "saved"
-
+    remote_job = RemoteJob(("-c", "import time; time.sleep(60)"), tmp_path / "log.txt")
+    asking = threading.Timer(0.5, _thread.interrupt_main)
     try:
-        assert run_remote_job(interrupted) == "saved"
+        asking.start()
+        with pytest.raises(KeyboardInterrupt):
+            run_remote_job(remote_job)
     finally:
+        asking.join()
         signal.signal(signal.SIGINT, before)
+    assert remote_job.process.poll() is not None

@@ -72,7 +72,7 @@ def test_damage_is_one_line(fuzzing, name, tmp_path):
             warnings.simplefilter("error")
             tracemalloc.start()
             try:
-                form.read(here / whole.name).refuse_unsound("")
+                form.read(here / whole.name).refuse_unsound(str(here / whole.name))
             except BadInput as error:
                 refused.append(str(error))
                 assert "\n" not in str(error) and str(here / whole.name) in str(error)

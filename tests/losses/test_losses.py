@@ -132,6 +132,22 @@ def test_distortion_is_in_units_of_the_extent():
     assert Distortion(unit=0.5)(maps, target()).item() == pytest.approx(0.25 * maps.distortion.mean().item(), rel=1e-6)
 
 
+def test_normalised_distortion_is_the_variance_of_the_depths_of_a_ray():
+    """Weights w: sum over pairs of w w (m - m)^2, over (sum w)^2, is their variance; also where little is drawn."""
+    draw = torch.Generator().manual_seed(0)
+    weights, inverse = (
+        0.1 * torch.rand(5, 8, 9, generator=draw, dtype=torch.float64),
+        torch.rand(5, 8, 9, generator=draw),
+    )
+    weights[:, :4] *= 0.2
+    spread = sum(weights[i] * weights[j] * (inverse[i] - inverse[j]) ** 2 for i in range(5) for j in range(i))
+    maps = Maps(alpha=weights.sum(0), distortion=spread)
+    mean = (weights * inverse).sum(0) / weights.sum(0)
+    variance = (weights * (inverse - mean) ** 2).sum(0) / weights.sum(0)
+    found = Distortion(unit=0.5, normalise=True)(maps, target()).item()
+    assert found == pytest.approx(0.25 * variance.mean().item(), rel=1e-4)
+
+
 def test_weights_begin_after_their_start():
     loss = NormalConsistency(weight=0.05, start=70)
     assert [loss.weight_at(index, 300) for index in (1, 70, 71, 300)] == [0, 0, 0.05, 0.05]

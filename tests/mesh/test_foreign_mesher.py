@@ -164,7 +164,7 @@ def test_a_row_of_an_ablation(finished, tmp_path, monkeypatch, capsys):
     base = evolve(recipes()["2dgs"], "primitive.sh_degree", 0)
     rows = (Row("odd facts", {"mesh": Plane()}),)
     monkeypatch.setitem(TABLES, "meshers", Table("meshers", "Meshers of a stranger.", base, rows))
-    data = ["--data", str(folder / "data"), "--steps", "10", "--out", str(tmp_path / "ablation")]
+    data = ["--data", str(folder / "data"), "--steps", "10", "--out", str(tmp_path / "ablation"), "--probe", "0"]
     assert main(["ablate", "table:meshers", *data, "--gt", str(folder / "run/mesh.ply"), "--tau", "0.1"]) == 0
     shown = capsys.readouterr().out
     assert "odd facts" in shown and "F1" in shown

@@ -8,7 +8,9 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.delaunay import crossing, split
+from surfkit.mesh.field import least_opacity
 from surfkit.mesh.tetra import Tetra, triangles, used
+from surfkit.raster.rays import ray_opacity_reference
 from surfkit.testing.inputs import BALL_RADIUS, mesh_input
 
 
@@ -124,3 +126,26 @@ def test_points_in_a_plane_enclose_nothing():
     points = np.random.default_rng(2).normal(size=(50, 3)) * [1, 1, 0]
     tets, doubtful = crossing(points, np.ones(50, bool), np.arange(50) % 2 == 0, 1 << 30)
     assert tets.shape == (0, 4) and doubtful == 0
+
+
+@pytest.mark.parametrize("enough", [None, 0.5])
+def test_the_least_opacity_is_that_of_the_view_that_sees_a_place_best(enough):
+    given = mesh_input("gaussian", count=600, views=10)
+    points = 1.4 * torch.rand(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.7
+    masked = torch.ones(given.views[0].camera.height, given.views[0].camera.width, dtype=torch.bool)
+    masked[:, : masked.shape[1] // 2] = False
+    given = replace(given, keep=lambda at: masked if at == 0 else None)
+    exact = given.splats.with_named({name: value.double() for name, value in given.splats.named().items()})
+    each = torch.stack([ray_opacity_reference(exact, v.camera, given.near, points).float() for v in given.views])
+    places = given.views[0].camera.project(points)
+    each[0][places[:, 0] < masked.shape[1] / 2 - 0.5] = torch.nan
+    sure = (places[:, 0] - masked.shape[1] / 2).abs() > 0.6  # the mask is looked up between its pixels
+    least, views = least_opacity(given, points, "looking", enough)
+    truth = each.nan_to_num(nan=1.0).amin(0)
+    assert 50 < int((truth < 0.5).sum()) < 450
+    if enough is None:
+        assert torch.allclose(least[sure], truth[sure], atol=1e-3)
+        assert torch.equal(views[sure], (~each.isnan()).sum(0, dtype=torch.int32)[sure])
+    else:
+        assert torch.equal((least > enough)[sure], (truth > enough)[sure]) and (least >= truth - 1e-3)[sure].all()
+        assert int(views.sum()) < 0.8 * int((~each.isnan()).sum()), "most of the work is saved"

@@ -322,13 +322,14 @@ def test_a_table_compares_methods_with_splats(data, tmp_path):
     )
     recipes = build(table)
     assert recipes["plane"].mesh is None and recipes["mean"].mesh == base.mesh and recipes["mean"].pretrain == stage
-    report = ablate(Plan(table, data, tmp_path, device="cpu"), _Silent())
-    splats, plane, mean = report["rows"]
-    assert not [row["failed"] for row in report["rows"] if row["failed"]]
-    assert set(plane["mean"]) == {"seconds", "cpu_seconds"} and set(mean["mean"]) == {*plane["mean"], "psnr", "ssim"}
+    report = ablate(Plan(table, (data,), tmp_path, device="cpu"), _Silent())
+    splats, plane, mean = rows = report["data_sets"][0]["rows"]
+    assert not [row["failed"] for row in rows if row["failed"]]
+    assert set(plane["mean"]) == {"seconds", "cpu_seconds", "peak_memory_bytes"}
+    assert set(mean["mean"]) == {*plane["mean"], "psnr", "ssim", "fps"}
     assert "points" in splats["mean"] and set(mean["difference"]) == set(mean["mean"])
     assert "| 2 | (plane) |" in (tmp_path / "ablation.md").read_text()
-    lengths = [trial.recipe.length for trial in trials(Plan(table, data, tmp_path, steps=6))]
+    lengths = [trial.recipe.length for trial in trials(Plan(table, (data,), tmp_path, steps=6))]
     assert lengths == [6, 4, None]
     wrong = replace(table, rows=(Row("both", {"method": Lower(), "pretrain.steps": 7}),))
     with pytest.raises(BadInput, match="row 'both': pretrain.steps: method:lower does not use it"):

@@ -17,6 +17,7 @@ from surfkit.partition import (
     Partition,
     PictureShare,
     QuantileGrid,
+    SquareGrid,
     SSIMDifference,
 )
 from surfkit.partition.base import Contraction, Ground
@@ -27,7 +28,7 @@ from surfkit.testing.inputs import above, coarse_model
 
 FLAT = Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
-WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), CameraGrid((3, 2)), Balanced(6)]
+WAYS = [ContractedGrid((3, 2)), QuantileGrid((3, 2)), CameraGrid((3, 2)), SquareGrid(across=3), Balanced(6)]
 
 
 @pytest.mark.parametrize("way", WAYS, ids=lambda way: type(way).__name__)
@@ -50,7 +51,7 @@ def test_every_place_is_owned_once(way):
         owners += ((flat >= low) & (flat < high)).all(1)
     assert (owners == 1).all()
     owner = cells.owner(points)
-    assert owner.min() == 0 and owner.max() == cells.count - 1 == 5
+    assert owner.min() == 0 and owner.max() == cells.count - 1 == (8 if isinstance(way, SquareGrid) else 5)
 
 
 def test_random_cells_tile_the_ground():
@@ -148,7 +149,7 @@ def test_both_ways_to_assign_mostly_agree():
     by_ssim = SSIMDifference().measure(sight, owner, 4)
     by_share = PictureShare().measure(sight, owner, 4)
     assert ((by_ssim > 0) <= (by_share > 0)).all(), "a block that shows nothing changes nothing"
-    assert ((by_ssim > SSIMDifference().least) == (by_share > PictureShare().least)).float().mean() > 0.95
+    assert ((by_ssim > SSIMDifference().threshold) == (by_share > PictureShare().threshold)).float().mean() > 0.95
     whole = torch.stack(
         [sight.rasterizer.render(sight.splats, v.camera, 0.01, False).maps.alpha.mean() for v in sight.views]
     )

@@ -1,8 +1,9 @@
 import pytest
 import torch
 
+from surfkit.core.check import BadInput
 from surfkit.primitives import Surfel2D
-from surfkit.primitives.edit import Edit, apply, merge, withheld
+from surfkit.primitives.edit import Edit, NewPoints, apply, merge, withheld
 from surfkit.primitives.points import Points
 
 
@@ -125,3 +126,54 @@ def test_shared_parameters_belong_to_no_point():
     for found, count in ((fewer, 1), (more, 5)):
         assert len(found) == count and found.exp_avg["means"].shape == (count, 3)
         assert torch.equal(found.shared["net"], params["net"]) and found.exp_avg["net"].tolist() == [[1, 1]] * 3
+
+
+def rows(table: Points, parent: list[int]) -> NewPoints:
+    """Points at the height of their parents' numbers, otherwise copies."""
+    params = table.take(torch.tensor(parent)).params
+    return NewPoints(
+        params | {"means": torch.tensor(parent).float()[:, None].expand(-1, 3).clone()}, torch.tensor(parent)
+    )
+
+
+def test_new_points_come_last_and_have_no_past():
+    table = points(4)
+    for group in (table.exp_avg, table.exp_avg_sq):
+        for value in group.values():
+            value.fill_(2.0)
+    table.stat("seen").fill_(5)
+    first = mask(0, count=4)
+    edit = merge([Edit(drop=first, new=rows(table, [0, 3])), Edit(clone=first.roll(1), new=rows(table, [2]))])
+    assert edit.counts == (1, 4, 0)
+    grown = apply(Surfel2D(), table, edit, torch.Generator())
+    assert len(grown) == 3 + 1 + 3
+    assert grown.params["means"][-3:, 0].tolist() == [0, 3, 2], "also of a dropped parent"
+    assert not grown.exp_avg["means"][-3:].any() and grown.stats["seen"].tolist() == [5, 5, 5, 0, 0, 0, 0]
+    assert (grown.exp_avg["means"][:3] == 2).all()
+    left = withheld(edit, torch.tensor([False, True, True, False]))
+    assert left.new.parent.tolist() == [2] and left.clone.tolist() == edit.clone.tolist()
+    alone = withheld(Edit(new=rows(table, [1, 2]), drop=first), torch.tensor([False, True, False, False]))
+    assert alone.new.parent.tolist() == [1] and alone.drop is first
+
+
+def test_values_take_the_place_of_parameters():
+    """Those of points and shared ones; copies are made afterwards, and the last of several counts."""
+    table = points(3)
+    table = Points(table.params, table.exp_avg, table.exp_avg_sq, shared={"net": torch.zeros(2)})
+    opacities = torch.tensor([1.0, 2.0, 3.0])
+    before = Edit(values={"opacities": torch.zeros(3), "net": torch.ones(2)})
+    edit = merge([before, Edit(values={"opacities": opacities}, clone=torch.tensor([False, False, True]))])
+    changed = apply(Surfel2D(), table, edit, torch.Generator())
+    assert changed.params["opacities"].tolist() == [1, 2, 3, 3] and changed.shared["net"].tolist() == [1, 1]
+    assert not table.shared["net"].any(), "the points before are as they were"
+    for wrong in ({"wings": opacities}, {"net": torch.ones(3)}):
+        with pytest.raises(BadInput, match="Edit.values: "):
+            apply(Surfel2D(), table, Edit(values=wrong), torch.Generator())
+
+
+def test_a_statistic_may_have_several_numbers_for_each_point():
+    table = points(3)
+    table.stat("each", 2)[1] = torch.tensor([4.0, 5.0])
+    assert table.stat("each", 2).shape == (3, 2)
+    assert table.take(torch.tensor([1])).stats["each"].tolist() == [[4, 5]]
+    assert table.append(table.params).stats["each"].shape == (6, 2)

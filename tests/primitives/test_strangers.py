@@ -14,6 +14,7 @@ from surfkit import Activation, Column, Edit, LearningRate, Primitive, hookimpl,
 from surfkit.cli import main
 from surfkit.core import registry
 from surfkit.core.check import BadInput
+from surfkit.densify.adc import ADC
 from surfkit.export.ply import read_splats
 from surfkit.losses.photometric import L1
 from surfkit.losses.reprojection import Reprojection
@@ -81,7 +82,7 @@ class Fog(Primitive):
 
 
 @dataclass(frozen=True)
-class Anchors(Primitive):
+class Pairs(Primitive):
     """Points that a network, common to all, moves and colours: two balls each. Drawn by the usual rasterizer."""
 
     in_ply: ClassVar[bool] = False
@@ -126,6 +127,42 @@ class Anchors(Primitive):
 
 
 @dataclass(frozen=True)
+class Rigid(Balls):
+    """Balls that move all together, as a shared column says."""
+
+    has_free_points: ClassVar[bool] = False
+
+    def columns(self):
+        known, fixed = Balls.columns(self), LearningRate(0.0)
+        return known | {
+            "means": replace(known["means"], rate=fixed),
+            "offsets": Column((3,), fixed),
+            "moves": Column((None, 3), LearningRate(1e-3), shared=True),
+        }
+
+    def init(self, cloud, generator):
+        begun = Balls.init(self, cloud, generator)
+        return begun | {"offsets": begun["means"].clone(), "moves": torch.zeros(2, 3)}
+
+    def dependent(self, params):
+        return {"means": params["offsets"].detach() + params["moves"].sum(0)}
+
+    def activate(self, params, degree):
+        return Balls.activate(self, params | self.dependent(params), degree)
+
+
+@dataclass(frozen=True)
+class Late(Rigid):
+    """Begins with other positions than it says."""
+
+    def dependent(self, params):
+        return {"means": params["offsets"] + 0.1}
+
+    def activate(self, params, degree):
+        return Balls().activate(params | {"means": params["offsets"]}, degree)
+
+
+@dataclass(frozen=True)
 class Drawn(Balls):
     """Balls that torch draws."""
 
@@ -166,7 +203,15 @@ class Bare(Balls):
 class Package:
     @hookimpl
     def surfkit_components(self):
-        return {"balls": Balls, "fog": Fog, "anchors": Anchors, "drawn": Drawn, "small": Small, "bare": Bare}
+        return {
+            "balls": Balls,
+            "fog": Fog,
+            "pairs": Pairs,
+            "drawn": Drawn,
+            "small": Small,
+            "bare": Bare,
+            "rigid": Rigid,
+        }
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -183,7 +228,9 @@ def source(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("primitive", [Balls(), Fog(), Anchors(), Drawn()], ids=["balls", "fog", "anchors", "drawn"])
+@pytest.mark.parametrize(
+    "primitive", [Balls(), Fog(), Pairs(), Drawn(), Rigid()], ids=["balls", "fog", "pairs", "drawn", "rigid"]
+)
 def test_they_keep_the_contract(primitive):
     check_primitive(primitive)
 
@@ -193,11 +240,32 @@ def test_they_keep_the_contract(primitive):
     [
         (Boasting(), "Boasting.render: set has_absolute_gradients to False: signal: absolute pixel gradients"),
         (Small(), "primitive small: its render gives color of shape"),
+        (Late(), "Late.init gives 'means' other values than dependent does"),
     ],
 )
 def test_a_render_that_is_not_as_declared_is_named(primitive, fault):
     with pytest.raises(AssertionError, match=fault):
         check_primitive(primitive)
+
+
+def test_columns_that_others_determine_follow_after_each_step(source, tmp_path, capsys):
+    assert train(source, tmp_path / "refused", "recipe:3dgs", "primitive:rigid") == 2
+    told = "pretrain.densify: the points of primitive rigid can be neither copied nor split; leave it out"
+    assert told in capsys.readouterr().err
+    words = ("train", "recipe:3dgs", "primitive:rigid", "mesh:none", "pretrain.densify:none", "--data", str(source))
+    assert main([*words, "--steps", "7", "--out", str(tmp_path / "run")]) == 0
+    params = load_run(tmp_path / "run")[1].points.all_params()
+    moved = params["moves"].sum(0)
+    assert moved.abs().min() > 1e-4 and torch.equal(params["means"], params["offsets"] + moved)
+
+
+def test_sizes_that_are_known_with_the_points_only_are_for_shared_columns():
+    shared = Column((None, 3), LearningRate(0.0), shared=True)
+    assert shared.fits((7, 3), 5) and shared.fits((0, 3), 5)
+    assert not shared.fits((7, 2), 5) and not shared.fits((3,), 5)
+    assert Column((3,), LearningRate(0.0)).fits((5, 3), 5) and not Column((3,), LearningRate(0.0)).fits((7, 3), 5)
+    with pytest.raises(BadInput, match="only that of a shared parameter may have None"):
+        Column((None, 3), LearningRate(0.0))
 
 
 def notes(out):
@@ -211,28 +279,28 @@ def train(source, out, *words):
     return main(["train", *words, "--data", str(source), "--out", str(out), "mesh:none", *SHORT])
 
 
-@pytest.mark.parametrize("name", ["balls", "fog", "anchors"])
+@pytest.mark.parametrize("name", ["balls", "fog", "pairs"])
 def test_one_word_swaps_the_primitive(source, tmp_path, name, capsys):
     """Trained, resumed after a stop in the middle to the same bits, and measured."""
     words = ["recipe:2dgs", f"primitive:{name}"] + ["--pretrain.losses.normal.weight", "0"] * (name != "fog")
     assert train(source, tmp_path / "whole", *words) == 0
     metrics = json.loads((tmp_path / "whole" / "metrics.json").read_text())
-    assert metrics["images"]["psnr"] > 8 and (tmp_path / "whole" / "point_cloud.ply").exists() == (name != "anchors")
+    assert metrics["images"]["psnr"] > 8 and (tmp_path / "whole" / "point_cloud.ply").exists() == (name != "pairs")
     _, state, _ = load_run(tmp_path / "whole")
     assert set(state.points.all_params()) == set(registry.components(Primitive)[name]().columns())
-    if name == "anchors":
+    if name == "pairs":
         assert state.points.shared["net"].abs().max() > 0.05, "the network learns"
-        assert "no point_cloud.ply: PLY files of splats have no place for anchors" in notes(tmp_path / "whole")
+        assert "no point_cloud.ply: PLY files of splats have no place for pairs" in notes(tmp_path / "whole")
 
 
 def test_a_network_goes_on_as_if_nothing_had_happened(source, tmp_path):
     """Half of the steps, saved and read again, then the rest: the same bits as all at once."""
     scene = read(Data(source))
-    trainer = Trainer(Stage(steps=12), Anchors(), scene.train, photo_cache(scene.train), select("cpu")[0])
+    trainer = Trainer(Stage(steps=12), Pairs(), scene.train, photo_cache(scene.train), select("cpu")[0])
 
     def begin():
         draw = torch.Generator().manual_seed(0)
-        return trainer.begin(Points.fresh(Anchors().init(scene.cloud, draw), ["net"]), draw)
+        return trainer.begin(Points.fresh(Pairs().init(scene.cloud, draw), ["net"]), draw)
 
     whole, half = begin(), begin()
     for _ in trainer.run(whole):
@@ -262,9 +330,7 @@ def test_the_opacity_drawn_is_the_opacity_written(tmp_path, source):
 
 
 def test_blocks_with_a_network_are_merged_by_the_stated_rule(source, tmp_path):
-    words = (
-        "recipe:citygs2 primitive:anchors --min-views 4 --partition.blocks 2 1 assign:picture-share --steps 8".split()
-    )
+    words = "recipe:citygs2 primitive:pairs --min-views 4 --partition.blocks 2 1 assign:picture-share --steps 8".split()
     words += ["pretrain.losses.normal:none", "tune.losses.normal:none", "mesh:none", "depth:none"]
     assert main(["train", *words, "--data", str(source), "--out", str(tmp_path)]) == 0
     _, merged, _ = load_run(tmp_path)
@@ -277,8 +343,8 @@ def test_blocks_with_a_network_are_merged_by_the_stated_rule(source, tmp_path):
 
 
 def test_what_does_not_fit_is_refused_before_anything_is_trained(source, tmp_path, capsys):
-    assert train(source, tmp_path / "a", "recipe:3dgs", "primitive:anchors", "refine.0:distil") == 2
-    assert "refine.0: distil cuts the column sh_rest, which primitive anchors does not have" in capsys.readouterr().err
+    assert train(source, tmp_path / "a", "recipe:3dgs", "primitive:pairs", "refine.0:distil") == 2
+    assert "refine.0: distil cuts the column sh_rest, which primitive pairs does not have" in capsys.readouterr().err
     assert not (tmp_path / "a" / "pretrain").exists()
     with pytest.raises(BadInput, match=r"pretrain.rates.wings: primitive surfel2d has no such column; it has means"):
         recipe = surfkit.Recipe(pretrain=surfkit.Stage(rates={"wings": LearningRate(1.0)}))
@@ -291,12 +357,15 @@ def test_absolute_gradients_that_torch_does_not_have_are_refused(source, tmp_pat
     assert "pretrain.signal: abs-gradient wants absolute pixel gradients, and primitive drawn draws itself" in told
     assert "choose pretrain.signal:loss-gradient" in told and not (tmp_path / "a" / "pretrain").exists()
     words = "recipe:absgs", "primitive:drawn", "pretrain.signal:loss-gradient"
+    assert train(source, tmp_path / "b", *words) == 2
+    assert "pretrain.densify: adc needs absolute pixel gradients, and signal loss-gradient" in capsys.readouterr().err
+    words = *words, "--pretrain.densify.split-threshold", "None"
     assert train(source, tmp_path / "b", *words, "--pretrain.steps", "2") == 0
 
 
 def test_unknown_kinds_are_refused_not_drawn_as_gaussians():
-    splats = Anchors().activate(
-        Anchors().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
+    splats = Pairs().activate(
+        Pairs().init(Cloud(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8)), torch.Generator().manual_seed(0)),
         0,
     )
     camera = Camera(torch.eye(4, dtype=torch.float64), 20.0, 20.0, 8.0, 8.0, 16, 16)
@@ -326,6 +395,36 @@ def test_a_view_that_torch_draws_has_the_gradients_of_the_reference():
     assert seen.any() and float(ratio.median()) == pytest.approx(1, abs=0.15), "the signal is that of the screen"
 
 
+def test_policies_are_told_what_was_drawn_in_place_of_the_points(source):
+    """The two balls of each anchor, their owners and their signals, whose sum is that of the anchor."""
+    told = []
+
+    class Watching(ADC):
+        def watch(self, points, step):
+            told.append(step)
+
+    scene = read(Data(source))
+    stage = Stage(steps=1, densify=Watching())
+    trainer = Trainer(stage, Pairs(), scene.train, photo_cache(scene.train), select("cpu")[0])
+    draw = torch.Generator().manual_seed(0)
+    params = Pairs().init(scene.cloud, draw)
+    far = {name: value if name == "net" else value[:7].clone() for name, value in params.items()}
+    del far["net"]
+    trainer.step(trainer.begin(Points.fresh(params, ["net"]), draw, far))
+    step, count = told[0], len(scene.cloud.xyz)
+    derived = step.derived
+    assert derived.owner.tolist() == list(range(count)) * 2, "none of frozen points"
+    assert derived.splats.kind == "gaussian" and len(derived.splats) == len(derived.seen) == 2 * count
+    assert torch.equal(derived.grad_norm, derived.signal.norm(dim=1)) and derived.grad_norm.any()
+    total = derived.signal[:count] + derived.signal[count:]
+    assert torch.allclose(total.norm(dim=1), step.grad_norm, rtol=1e-4, atol=1e-12)
+    assert torch.equal(derived.seen[:count] | derived.seen[count:], step.seen)
+    told.clear()
+    trainer = Trainer(stage, Balls(), scene.train, photo_cache(scene.train), select("cpu")[0])
+    trainer.step(trainer.begin(Points.fresh(Balls().init(scene.cloud, draw)), draw))
+    assert told[0].derived is None
+
+
 def begun(stage, primitive, scene):
     trainer = Trainer(stage, primitive, scene.train, photo_cache(scene.train), select("reference")[0])
     draw = torch.Generator().manual_seed(0)
@@ -343,11 +442,11 @@ def test_pictures_of_another_size_are_refused_in_one_line(source):
     [
         (("color",), L1(), "alpha, which every view needs"),
         (("alpha",), L1(), "color, which every view needs"),
-        (("color", "alpha", "depth", "median"), NormalConsistency(start=2), "normal, which loss late reads"),
+        (("color", "alpha", "depth", "median"), NormalConsistency(start=2), "normal, which losses.late reads"),
         (
             ("color", "alpha", "depth"),
             Reprojection(start=2),
-            "median, which loss late reads; leave .* losses.late",
+            "median, which losses.late reads; leave .* losses.late",
         ),
     ],
 )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class Seen:
     index: int
     opacity: float
     color: np.ndarray
-    normal: np.ndarray
+    normal: Callable[[float, float], np.ndarray]
     z: float
     shape: Callable[[float, float], tuple[float, float]]
 
@@ -63,6 +64,18 @@ def clamp(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
+def unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def constant(value: np.ndarray, x: float, y: float) -> np.ndarray:
+    return value
+
+
+def across(precision: np.ndarray, camera: Camera, x: float, y: float) -> np.ndarray:
+    return -unit(precision @ [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1])
+
+
 def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
     """The splats that are drawn, front to back."""
     means, quats, scales, opacities, sh = (t.detach().double().numpy() for t in splats.tensors().values())
@@ -80,12 +93,22 @@ def see(splats: Splats, camera: Camera, near: float) -> list[Seen]:
         if splats.kind == "surfel":
             made = surfel(centre, axes, scales[i], camera, near)
             opacity, normal = opacities[i], axes[:, 2]
+        elif splats.geometry == "ray":
+            made = ellipsoid(centre, axes, scales[i], camera, near)
+            opacity, normal = opacities[i], None
         else:
-            fade, made = gaussian(centre, axes, scales[i], camera, near, splats.antialias)
+            fade, made = gaussian(centre, axes, scales[i], camera, near, splats)
             opacity, normal = opacities[i] * fade, axes[:, np.argmin(scales[i])]
-        if made is not None:
+        if made is None:
+            continue
+        if splats.geometry == "axis":
             normal = -normal if normal @ centre > 0 else normal
-            found.append(Seen(i, opacity, color, normal, centre[2], made))
+            upright = partial(constant, normal)
+        else:  # of the ellipsoid at the point of the ray with the largest density, or of the centre's ray
+            precision = axes @ np.diag(scales[i] ** -2) @ axes.T
+            middle = partial(constant, -unit(precision @ centre))
+            upright = middle if splats.geometry == "plane" else partial(across, precision, camera)
+        found.append(Seen(i, opacity, color, upright, centre[2], made))
     return sorted(found, key=lambda s: s.z)
 
 
@@ -120,7 +143,7 @@ def surfel(centre, axes, scales, camera: Camera, near: float):
     return shape
 
 
-def gaussian(centre, axes, scales, camera: Camera, near: float, antialias: bool):
+def gaussian(centre, axes, scales, camera: Camera, near: float, splats: Splats):
     """Factor on the opacity and shape of an ellipsoid (EWA)."""
     z = centre[2]
     edge_x, edge_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
@@ -129,9 +152,9 @@ def gaussian(centre, axes, scales, camera: Camera, near: float, antialias: bool)
     jacobian = np.array([[camera.fx / z, 0, -camera.fx * tx / z**2], [0, camera.fy / z, -camera.fy * ty / z**2]])
     covariance = axes @ np.diag(scales**2) @ axes.T
     raw = jacobian @ covariance @ jacobian.T
-    (xx, xy), (_, yy) = footprint = raw + 0.3 * np.eye(2)
+    (xx, xy), (_, yy) = footprint = raw + splats.dilation * np.eye(2)
     det = xx * yy - xy * xy
-    fade = math.sqrt(max(2.5e-5, np.linalg.det(raw) / np.linalg.det(footprint))) if antialias else 1.0
+    fade = math.sqrt(max(2.5e-5, np.linalg.det(raw) / np.linalg.det(footprint))) if splats.antialias else 1.0
     mid_x, mid_y = camera.fx * centre[0] / z + camera.cx, camera.fy * centre[1] / z + camera.cy
     pull = np.linalg.inv(covariance) @ (centre / z)
     slope_x, slope_y = (-z * pull[:2] / (pull @ centre / z) / [camera.fx, camera.fy]).tolist()
@@ -144,6 +167,23 @@ def gaussian(centre, axes, scales, camera: Camera, near: float, antialias: bool)
         return rho, clamp(z + slope_x * dx + slope_y * dy, low, high)
 
     return fade, shape
+
+
+def ellipsoid(centre, axes, scales, camera: Camera, near: float):
+    """Shape of an ellipsoid along each ray, or None if it reaches the camera plane."""
+    if CUTOFF * np.linalg.norm(axes[2] * scales) >= centre[2]:
+        return None
+    into = np.diag(1 / scales) @ axes.T
+    origin = -into @ centre
+    reach = CUTOFF * scales.max()
+    low, high = max(centre[2] - reach, near), centre[2] + reach
+
+    def shape(x: float, y: float) -> tuple[float, float]:
+        ray = into @ [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1]
+        a, b, c = ray @ ray, 2 * ray @ origin, origin @ origin
+        return c - b * b / (4 * a), clamp(-b / (2 * a), low, high)
+
+    return shape
 
 
 def evaluate(splats: Splats, camera: Camera, near: float) -> Plain:
@@ -163,7 +203,7 @@ def evaluate(splats: Splats, camera: Camera, near: float) -> Plain:
                 break
             weight = alpha * open_
             maps["color"][:, i, j] += weight * s.color
-            maps["normal"][:, i, j] += weight * s.normal
+            maps["normal"][:, i, j] += weight * s.normal(j + 0.5, i + 0.5)
             maps["alpha"][i, j] += weight
             maps["depth"][i, j] += weight * z
             if open_ > 0.5:

@@ -178,28 +178,44 @@ def antialias(kind: str, degree: int, seed: int):
     return Splats(kind, *small.tensors().values(), antialias=True), view
 
 
+def undilated(kind: str, degree: int, seed: int):
+    """The same with hardly any dilation, as in Mip-Splatting."""
+    return replace(antialias(kind, degree, seed)[0], dilation=0.1), plain(kind, degree, seed, size=0.3)[1]
+
+
 SCENES: dict[str, Callable[[str, int, int], tuple[Splats, Camera]]] = {
-    maker.__name__: maker for maker in (plain, needle, huge, tiny, around, opaque, faint, grazing, edge_on, antialias)
+    maker.__name__: maker
+    for maker in (plain, needle, huge, tiny, around, opaque, faint, grazing, edge_on, antialias, undilated)
 }
-CASES = [(name, kind) for kind in KINDS for name in SCENES if (name, kind) != ("antialias", "surfel")]
-"""Scene and kind; `antialias` says nothing about surfels."""
+FOR_GAUSSIANS = ("antialias", "undilated")
+CASES = [
+    (name, kind)
+    for kind in (*KINDS, "plane", "ray")
+    for name in SCENES
+    if name not in FOR_GAUSSIANS or kind in ("gaussian", "plane")
+]
+"""Scene and kind, or geometry of gaussians; some say nothing about surfels and rays."""
 
 
 def make(name: str, kind: str, degree: int | None = None, seed: int = 3) -> tuple[Splats, Camera]:
-    """A scene by name; without a degree, one that differs from scene to scene."""
-    return SCENES[name](kind, list(SCENES).index(name) % 4 if degree is None else degree, seed)
+    """A scene by name, of a kind or of gaussians with a geometry; without a degree, one that differs by scene."""
+    degree = list(SCENES).index(name) % 4 if degree is None else degree
+    if kind in KINDS:
+        return SCENES[name](kind, degree, seed)
+    made, view = SCENES[name]("gaussian", degree, seed)
+    if (name, kind) == ("tiny", "ray"):  # nothing widens them: no pixel would see smaller ones
+        made = replace(made, scales=10 * made.scales)
+    return replace(made, geometry=kind), view
 
 
 def double(drawn: Splats) -> Splats:
     """The same splats in float64."""
-    return Splats(drawn.kind, *(t.detach().double() for t in drawn.tensors().values()), antialias=drawn.antialias)
+    return replace(drawn, **{name: t.detach().double() for name, t in drawn.tensors().items()})
 
 
 def leaves(drawn: Splats) -> Splats:
     """The same splats in float64, each tensor a leaf that wants a gradient."""
-    return Splats(
-        drawn.kind, *(t.detach().double().requires_grad_() for t in drawn.tensors().values()), antialias=drawn.antialias
-    )
+    return replace(drawn, **{name: t.detach().double().requires_grad_() for name, t in drawn.tensors().items()})
 
 
 def crop(view: Camera, width: int, height: int, left: int = 0, top: int = 0) -> Camera:
@@ -209,4 +225,4 @@ def crop(view: Camera, width: int, height: int, left: int = 0, top: int = 0) -> 
 
 def rows(drawn: Splats, which: slice | Tensor) -> Splats:
     """Some of the splats."""
-    return Splats(drawn.kind, *(t[which] for t in drawn.tensors().values()), antialias=drawn.antialias)
+    return drawn.take(which)

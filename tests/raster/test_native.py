@@ -1,6 +1,6 @@
 """The native rasterizer against the reference in float64, and against itself with other threads and kernels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -10,86 +10,22 @@ from torch import Tensor
 
 from surfkit import native
 from surfkit.core.check import BadInput
-from surfkit.raster.api import ALPHA_MIN, STANDARD, Gradients, Maps, Render, Splats
-from surfkit.raster.footprints import gaussians, surfels
+from surfkit.raster.api import ALPHA_MIN, MAPS, STANDARD, Gradients, Maps, Render, Splats
+from surfkit.raster.footprints import footprints
 from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference, draw
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera
 
+from .cases import FORWARD, Case, case, different_gradients, different_maps
 from .scenes import CASES, KINDS, NEAR, SCENES, Draw, camera, double, make, rows
 
 pytestmark = needs_native
 each_case = pytest.mark.parametrize(("name", "kind"), CASES)
-MAPS = ("color", "alpha", "depth", "median", "normal", "distortion")
-FORWARD, BACKWARD = 1e-5, 1e-4
-ZERO = 1e-9
-
-
-@dataclass(frozen=True)
-class Case:
-    """A scene, what the reference makes of it, and random cotangents that are 0 at pixels near a threshold."""
-
-    splats: Splats
-    view: Camera
-    clear: Tensor
-    true: Render
-    cotangents: dict[str, Tensor]
-
-
-@cache
-def case(name: str, kind: str, degree: int | None = None) -> Case:
-    shown, view = make(name, kind, degree)
-    exact = double(shown)
-    with torch.no_grad():
-        clear = ~draw(exact, view, NEAR).near_threshold
-    true = Reference().render(exact, view, NEAR)
-    draws = Draw(11)
-    maps = true.maps.present()
-    cotangents = {key: (draws.normal(*value.shape) * clear).float() for key, value in maps.items()}
-    return Case(shown, view, clear, true, cotangents)
 
 
 def rendered(c: Case) -> Render:
     return NativeRasterizer().render(c.splats, c.view, NEAR)
-
-
-def different_maps(found: Maps, true: Maps, clear: Tensor) -> dict[str, float]:
-    """Maps that differ by more than FORWARD and by how much; of the largest value where that is more than 1.
-
-    Depth has the unit of z and distortion that of 1 / z^2, here up to 400.
-    """
-    errors = {}
-    for key, value in true.present().items():
-        size = max(1.0, value.abs().max().item()) if key in ("depth", "distortion") else 1.0
-        error = ((getattr(found, key).double() - value.double()).abs() * clear).max().item() / size
-        if not error <= FORWARD:
-            errors[key] = error
-    return errors
-
-
-def different_gradients(found: Gradients, true: Gradients) -> dict[str, float]:
-    """Gradients that differ by more than BACKWARD in norm, and by how much.
-
-    A gradient may be 0 for every splat: a disc's scale does not move the plane that gives the median. There two sums
-    cancel that are as large as the gradient of the means, a length too, times the place on the disc in sigmas: it is
-    held against that gradient. The scales of a disc below a pixel act through perspective only, and nearly cancel
-    too, hence one more share.
-    """
-    errors = {}
-    means = true.means.norm().item()
-    parts = {"signal": true.signal, "chosen": true.chosen}
-    for key, value in {**true.tensors(), **parts}.items():
-        if value is None:
-            continue
-        size, made = value.norm().item(), getattr(found, key).double()
-        allowed = BACKWARD * means if key == "scales" and size < ZERO * means else BACKWARD * size
-        if key == "scales":
-            allowed += 1e-6 * means
-        error = (made - value.double()).norm().item()
-        if not error <= allowed:
-            errors[key] = error / max(size, 1e-30)
-    return errors
 
 
 @each_case
@@ -118,7 +54,8 @@ def test_gradients_equal_the_reference_for_each_map(name, kind):
     for key, value in c.cotangents.items():
         total = Maps(**{key: value})
         found = render.backward(total, total)
-        assert (found.chosen - found.signal).norm() <= 1e-6 * found.signal.norm(), key
+        # One is the sum of the pixels' shares, the other comes from moments; without dilation those may be steep.
+        assert (found.chosen - found.signal).norm() <= (1e-5 if kind == "ray" else 1e-6) * found.signal.norm(), key
         if errors := different_gradients(found, c.true.backward(total)):
             wrong[key] = errors
     assert not wrong
@@ -265,7 +202,7 @@ def crowd(kind: str) -> tuple[Splats, Camera]:
     """Splats of all scenes, several pieces of work for the threads, over several tiles."""
     parts = [make(name, kind, 1, seed)[0] for seed in range(3) for name in SCENES]
     joined = [torch.cat(tensors) for tensors in zip(*(part.tensors().values() for part in parts), strict=True)]
-    return Splats(kind, *joined), camera(Draw(2), 149, 97)
+    return replace(make("plain", kind)[0], **dict(zip(STANDARD, joined, strict=True))), camera(Draw(2), 149, 97)
 
 
 def everything(shown: Splats, view: Camera) -> dict[str, Tensor]:
@@ -291,7 +228,7 @@ def threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, "ray"))
 def test_the_number_of_threads_does_not_change_a_bit(kind, threads):
     shown, view = crowd(kind)
     made = {}
@@ -349,13 +286,13 @@ def test_compilations_agree_on_a_larger_view(kind, kernels):
             assert apart.double().mean() < 3e-3, key  # a few pixels sit on a threshold
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, "ray"))
 def test_culling_never_loses_a_pixel(kind):
     """One splat at a time, of every scene, against the alpha of the reference at every pixel."""
     for name in [name for name, k in CASES if k == kind]:
         shown, view = make(name, kind, 0, seed=21)
         exact = double(shown)
-        prints = (surfels if kind == "surfel" else gaussians)(exact, view, NEAR)
+        prints = footprints(exact, view, NEAR)
         rays = view.rays(torch.float64)
         x, y = (rays[0] * view.fx + view.cx).flatten(), (rays[1] * view.fy + view.cy).flatten()
         rho, _, opacity = prints.at(torch.arange(len(shown)), x, y, torch.zeros(2).double())
@@ -366,7 +303,7 @@ def test_culling_never_loses_a_pixel(kind):
             assert not lost.any(), f"{name}: splat {i} at {lost.nonzero()[:3, 0].tolist()}"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", (*KINDS, "ray"))
 def test_what_only_grazes_the_image_is_seen(kind):
     """Splats of every size around the rim: those that reach a pixel are drawn, most of the others are left out."""
     draws, count = Draw(5), 1_500
@@ -375,11 +312,12 @@ def test_what_only_grazes_the_image_is_seen(kind):
     x, y = (draws.uniform(-120, size + 120, count) for size in (view.width, view.height))
     local = torch.stack([(x - view.cx) / view.fx * z, (y - view.cy) / view.fy * z, z], -1)
     means = (local - view.world_to_camera[:3, 3]) @ view.world_to_camera[:3, :3]
-    columns = 3 if kind == "gaussian" else 2
+    columns = 2 if kind == "surfel" else 3
     scales = torch.exp(draws.uniform(-1.0, 3.7, count, columns)) * (z / view.fx)[:, None]
     given = (means, draws.normal(count, 4), scales, draws.uniform(0.05, 1.0, count), torch.zeros(count, 1, 3))
-    shown = Splats(kind, *(value.float() for value in given))
-    prints = (surfels if kind == "surfel" else gaussians)(double(shown), view, NEAR)
+    shown = Splats("surfel" if kind == "surfel" else "gaussian", *(value.float() for value in given))
+    shown = replace(shown, geometry="ray" if kind == "ray" else "axis")
+    prints = footprints(double(shown), view, NEAR)
     rays = view.rays(torch.float64)
     at = [(rays[k] * f + c).flatten() for k, f, c in ((0, view.fx, view.cx), (1, view.fy, view.cy))]
     rho, _, opacity = prints.at(torch.arange(count), *at, torch.zeros(2).double())

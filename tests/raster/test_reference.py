@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from surfkit.raster.api import Maps, Splats
-from surfkit.raster.footprints import colors, gaussians, sh_basis
+from surfkit.raster.footprints import colors, footprints, gaussians, sh_basis
 from surfkit.raster.reference import Reference, draw
 
 from .plain import evaluate, harmonics, rotation
@@ -53,8 +53,9 @@ def test_maps_equal_a_plain_loop(name, kind):
     assert len(looped(name, kind).blended) > 20
     for key, value in drawn.maps.present().items():
         error = (value - torch.from_numpy(expected[key])).abs() * ~drawn.near_threshold
-        # Where a ray nearly lies in the disc's plane, a rounding moves the hit by 1e7 times as much.
-        assert error.max() < (1e-7 if (name, kind) == ("edge_on", "surfel") else 1e-10), key
+        # Where a ray nearly lies in the disc's plane, a rounding moves the hit by 1e7 times as much. The loop takes
+        # B^2 / 4A from C as it stands in GOF's paper, and what is left is small against both.
+        assert error.max() < {("edge_on", "surfel"): 1e-7}.get((name, kind), 1e-8 if kind == "ray" else 1e-10), key
 
 
 @each_case
@@ -178,7 +179,7 @@ def test_spherical_harmonics_are_orthonormal():
     assert torch.allclose(basis.T @ (area[:, None] * basis), torch.eye(16).double(), atol=1e-12)
 
 
-def few(kind: str, degree: int, antialias: bool = False, pixels: float = 8.0):
+def few(kind: str, degree: int, antialias: bool = False, pixels: float = 8.0, geometry: str = "axis"):
     """Three splats of some pixels over 4 x 3 pixels, away from every threshold, the median inside."""
     draws = Draw(5)
     view = replace(crop(camera(draws), 4, 3), cx=1.7, cy=1.9, fx=26.0, fy=28.0)
@@ -193,19 +194,28 @@ def few(kind: str, degree: int, antialias: bool = False, pixels: float = 8.0):
     ))  # fmt: skip
     if kind == "gaussian":
         made.scales[:, 2] *= 0.3
-    return Splats(kind, *made.tensors().values(), antialias=antialias), view
+    return Splats(kind, *made.tensors().values(), antialias=antialias, geometry=geometry), view
 
 
-@pytest.mark.parametrize(("kind", "antialias"), [("surfel", False), ("gaussian", False), ("gaussian", True)])
-def test_gradcheck_of_every_map_for_every_parameter(kind, antialias):
-    shown, view = few(kind, 1, antialias)
+@pytest.mark.parametrize(
+    ("kind", "antialias", "geometry"),
+    [
+        ("surfel", False, "axis"),
+        ("gaussian", False, "axis"),
+        ("gaussian", True, "axis"),
+        ("gaussian", False, "plane"),
+        ("gaussian", False, "ray"),
+    ],
+)
+def test_gradcheck_of_every_map_for_every_parameter(kind, antialias, geometry):
+    shown, view = few(kind, 1, antialias, geometry=geometry)
     drawn = draw(shown, view, NEAR)
     assert not drawn.near_threshold.any()
     assert all(value.abs().max() > 1e-3 for value in drawn.maps.present().values())
     assert drawn.seen.all()
 
     def maps(*tensors):
-        return tuple(draw(Splats(kind, *tensors, antialias), view, NEAR).maps.present().values())
+        return tuple(draw(Splats(kind, *tensors, antialias, geometry=geometry), view, NEAR).maps.present().values())
 
     assert torch.autograd.gradcheck(maps, tuple(leaves(shown).tensors().values()), atol=1e-7, rtol=1e-5)
 
@@ -264,6 +274,58 @@ def test_depth_of_a_gaussian_is_where_its_density_on_the_ray_is_largest():
         assert errors[2] < 0.3 * errors[1] + 1e-7 and errors[1] < 2e-3
 
 
+@pytest.mark.parametrize("geometry", ["plane", "ray"])
+def test_the_normal_of_an_ellipsoid_is_that_of_the_plane_of_largest_densities_on_parallel_rays(geometry):
+    """Rays along a pixel's one, or along that through the centre; the largest density is searched numerically."""
+    from scipy.optimize import minimize_scalar
+
+    shown, view = few("gaussian", 0, geometry=geometry)
+    prints, pose = footprints(shown, view, NEAR), view.world_to_camera
+    for i in range(len(shown)):
+        axes = (pose[:3, :3] @ turned(shown.quats[i])).numpy()
+        centre, scales = (pose[:3, :3] @ shown.means[i] + pose[:3, 3]).numpy(), shown.scales[i].numpy()
+        x, y = (prints.screen[i] + (geometry == "ray") * torch.tensor([1.6, -1.2]).double()).tolist()
+        ray, met = np.array([(x - view.cx) / view.fx, (y - view.cy) / view.fy, 1.0]), []
+        for start in np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]):
+
+            def rho(z, start=start, ray=ray, axes=axes, centre=centre, scales=scales):
+                return (((start + z * ray - centre) @ axes / scales) ** 2).sum()
+
+            found = minimize_scalar(rho, bounds=(0.1, 3.0), method="bounded", options={"xatol": 1e-12})
+            met.append(start + found.x * ray)
+            if geometry == "ray" and not start.any():
+                at, here = torch.tensor([[x], [y]], dtype=torch.float64), torch.tensor([i])
+                made_rho, depth, _ = prints.at(here, *at, torch.zeros(2).double())
+                assert made_rho.item() == pytest.approx(found.fun, rel=1e-9)
+                assert depth.item() == pytest.approx(found.x, abs=1e-6)
+        wanted = np.cross(met[1] - met[0], met[2] - met[0])
+        wanted *= -np.sign(wanted @ ray) / np.linalg.norm(wanted)
+        assert abs((met[0] - centre) @ wanted) < 1e-6  # the plane goes through the centre
+        made = prints.normals(here, *at)[0, 0] if geometry == "ray" else prints.normal[i]
+        assert np.abs(made.detach().numpy() - wanted).max() < 1e-5
+
+
+def test_along_rays_a_small_ellipsoid_far_away_looks_as_its_projection():
+    """EWA is the limit: without dilation and with the axis' footprint, the farther the nearer."""
+    errors = []
+    for far in (1.0, 4.0):
+        shown, view = few("gaussian", 0, geometry="ray")
+        shown = replace(shown, means=view.centre + far * (shown.means - view.centre))
+        prints, pose = footprints(shown, view, NEAR), view.world_to_camera
+        local = shown.means @ pose[:3, :3].T + pose[:3, 3]
+        screen = prints.screen[:, None] + 0.5 / far * torch.tensor([[1.0, 2.0], [-2.0, 1.0]]).double()
+        for i in range(len(shown)):
+            x, y, z = local[i].tolist()
+            turn = pose[:3, :3] @ turned(shown.quats[i])
+            lens = torch.tensor([[view.fx / z, 0, -view.fx * x / z**2], [0, view.fy / z, -view.fy * y / z**2]])
+            half = lens.double() @ turn * shown.scales[i]
+            offset = screen[i] - prints.screen[i]
+            flat = torch.einsum("pi,ij,pj->p", offset, torch.linalg.inv(half @ half.T), offset)
+            exact = prints.at(torch.tensor([i]), *screen[i].T, torch.zeros(2).double())[0][0]
+            errors.append(((exact - flat).abs() / flat).max().item())
+    assert max(errors[3:]) < 0.3 * max(errors[:3]) < 0.3
+
+
 def turned(quat):
     return torch.from_numpy(rotation(quat.numpy()))
 
@@ -277,10 +339,16 @@ def cotangents(view, seed: int = 7) -> dict:
     return {key: draws.normal(*((3, *size) if key in ("color", "normal") else size)) for key in MAPS}
 
 
-def test_the_signal_of_gaussians_is_the_slope_of_a_shift_on_the_screen():
-    """Moving the principal point moves every splat on the screen and changes nothing else."""
-    shown, view = few("gaussian", 2)
+@pytest.mark.parametrize("geometry", ["axis", "plane", "ray"])
+def test_the_signal_of_gaussians_is_the_slope_of_a_shift_on_the_screen(geometry):
+    """Moving the principal point moves every splat on the screen and changes nothing else.
+
+    But for the normals along rays, which hang on the pixel and not on where the splat lies: they say nothing of it.
+    """
+    shown, view = few("gaussian", 2, geometry=geometry)
     by = cotangents(view)
+    if geometry == "ray":
+        by["normal"] = torch.zeros_like(by["normal"])
     for which in (slice(0, 1), slice(1, 2), slice(2, 3), slice(0, 3)):
         some = rows(shown, which)
         gradients = Reference().render(some, view, NEAR).backward(Maps(**by), Maps(color=by["color"]))

@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import dataclass
 from typing import ClassVar
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -11,6 +12,8 @@ from needs import needs_native
 from surfkit import hookimpl, native
 from surfkit.core import registry
 from surfkit.core.check import BadInput
+from surfkit.raster.cuda import gpu
+from surfkit.raster.cuda.gpu import CudaRasterizer
 from surfkit.raster.native import NativeRasterizer
 from surfkit.raster.reference import Reference
 from surfkit.raster.select import select, torch_device
@@ -81,3 +84,62 @@ def test_torch_computes_where_the_rasterizer_draws(monkeypatch, on_cuda, device,
 def test_a_device_that_nobody_knows_is_refused_also_where_only_torch_computes():
     with pytest.raises(BadInput, match="nativ.* native"):
         torch_device("nativ")
+
+
+def test_a_gpu_by_its_number(monkeypatch, on_cuda):
+    taken = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+    monkeypatch.setattr(CudaRasterizer, "missing", lambda self: None)
+    monkeypatch.setattr(CudaRasterizer, "title", lambda self: "cuda:1 GPU")
+    assert select("cuda:1") == (CudaRasterizer(), "cuda:1 GPU") and torch_device("cuda:1") == torch.device("cuda")
+    assert taken == [1, 1]
+    for ask in (select, torch_device):
+        with pytest.raises(BadInput, match="--device cuda:2: torch finds 2 of them here; the last is cuda:1"):
+            ask("cuda:2")
+        with pytest.raises(BadInput, match="'cuda:x'"):
+            ask("cuda:x")
+
+
+def test_auto_takes_the_gpu_that_is_there_and_no_cpu_in_its_place(monkeypatch):
+    monkeypatch.setattr(CudaRasterizer, "title", lambda self: "cuda:0 GPU")
+    assert select("auto")[0].device == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(CudaRasterizer, "missing", lambda self: None)
+    assert select("auto") == select("cuda") == (CudaRasterizer(), "cuda:0 GPU")
+    monkeypatch.setattr(CudaRasterizer, "missing", lambda self: "the driver is too old; update it, or use --device cpu")
+    for device in ("auto", "cuda", "nvidia"):
+        with pytest.raises(BadInput, match=f"--device {device}: the driver is too old; update it"):
+            select(device)
+    assert select("cpu")[0].device == "cpu"
+
+
+def test_what_a_gpu_lacks(monkeypatch):
+    """One thing after the other is put right."""
+    rasterizer = CudaRasterizer()
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert "one without CUDA" in rasterizer.missing()
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "no NVIDIA GPU or driver" in rasterizer.missing()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "GPU")
+    monkeypatch.setattr(gpu, "driver", Mock(side_effect=BadInput("no driver; install one")))
+    assert rasterizer.missing() == "no driver; install one"
+    monkeypatch.setattr(gpu, "driver", Mock())
+    monkeypatch.setattr(gpu, "nvrtc", Mock())
+    for capability, built, lacks in [
+        ((9, 0), ["sm_80", "sm_90"], False),
+        ((8, 9), ["sm_75", "sm_86"], False),
+        ((12, 0), ["sm_80", "sm_90"], True),
+        ((12, 0), ["sm_80", "compute_90"], False),
+        ((7, 5), ["sm_80", "compute_80"], True),
+        ((9, 0), ["sm_80", "sm_90a"], False),
+    ]:
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device, capability=capability: capability)
+        monkeypatch.setattr(torch.cuda, "get_arch_list", lambda built=built: built)
+        said = rasterizer.missing()
+        assert (said is not None) == lacks, (capability, built, said)
+        assert not lacks or f"no kernels for GPU (sm_{capability[0]}{capability[1]}; it has {', '.join(built)})" in said

@@ -67,3 +67,20 @@ def test_scales_fit_the_kind():
     validate(shown)
     with pytest.raises(BadInput, match=r"splats\.scales: shape \(70, 2\); a gaussian needs \(70, 3\)"):
         validate(replace(shown, scales=shown.scales[:, :2]))
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "words"),
+    [
+        (
+            "gaussian",
+            {"geometry": "disc"},
+            "splats.geometry: 'disc' of kind 'gaussian'; gaussians have axis, plane, ray",
+        ),
+        ("surfel", {"geometry": "ray"}, "surfels only axis"),
+        ("gaussian", {"geometry": "ray", "antialias": True}, "splats.antialias: gaussians of geometry 'ray'"),
+    ],
+)
+def test_a_geometry_that_a_kind_does_not_have_is_refused(kind, change, words):
+    with pytest.raises(BadInput, match=words):
+        validate(replace(make("plain", kind)[0], **change))

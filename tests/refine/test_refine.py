@@ -10,6 +10,7 @@ import torch
 from surfkit import pipeline
 from surfkit.appearance import Exposure
 from surfkit.blocks.schedule import Compute
+from surfkit.cli.result import result_rows
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import components
@@ -88,6 +89,9 @@ def test_what_is_left(finished):
     assert (told.state, told.stage, told.step, told.steps, told.points) == ("finished", "refine1", 6, 6, 100)
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["points"] == 100
+    assert {name: one["points"] for name, one in metrics["before"].items()} == {"refine0": 200, "refine1": 100}
+    shown = dict(result_rows(metrics))
+    assert shown["before refine0"] != shown["before refine1"] and "200 points" in shown["before refine0"]
     spent = [state_of(finished, part).cpu_seconds for part in ("tune", "refine0", "refine1")]
     assert 0 < spent[0] < spent[1] < spent[2] == metrics["cpu_seconds"], "all stages count"
 
@@ -232,7 +236,7 @@ def test_colours_are_corrected_where_photographs_differed(data, tmp_path, monkey
     stage = Stage(steps=2, sh_every=1)
     refine = (DistilSH if taught else PruneAndRecover)(stage=stage)
     run(Recipe(pretrain=replace(stage, appearance=Exposure()), refine=(refine,)), data, tmp_path, Compute("cpu"), EVERY)
-    assert found == [corrected]
+    assert found == [True, corrected], "before and after"
 
 
 def test_depth_priors_teach_nothing_where_the_model_does():

@@ -7,16 +7,23 @@ import pytest
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load
+from surfkit.core.registry import hookimpl, plugins, reload
 from surfkit.core.tree import evolve
 from surfkit.densify.filters import Elongation
+from surfkit.densify.prune import Importance
 from surfkit.densify.signal import LossGradient
+from surfkit.densify.trim import Trim
 from surfkit.losses.depth import DepthRegression
+from surfkit.partition.grid import ContractedGrid
 from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe, without_unused
-from surfkit.recipes import surface
-from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, MODEL, SURFACE, TABLES
+from surfkit.recipes import city, surface
+from surfkit.recipes.ablations import COARSE_BASELINE, GRADIENT, METHODS, MODEL, PARTITION, SURFACE, TABLES, TRIM
 from surfkit.recipes.surface import STEREO
-from surfkit.report.ablation import Row, Table, build, built_on, limit_points, pick, scaled
+from surfkit.report import ablation
+from surfkit.report.ablation import Row, Table, build, built_on, limit_points, offered_tables, pick, scaled
+from surfkit.report.columns import COLUMNS
+from surfkit.report.compare import compare
 
 ROWS = [(name, row.label) for name, table in TABLES.items() for row in table.rows]
 FALLBACKS = Table(
@@ -38,10 +45,12 @@ def test_every_row_is_a_recipe(name, label):
     assert load(Recipe, json.loads(json.dumps(dump(recipe), allow_nan=False))) == recipe
     if recipe.length is None:
         return
-    short = with_steps(recipe, 600)
-    assert short.pretrain.steps == 600
-    if table is not SURFACE:
+    assert with_steps(recipe, 600).length == 600
+    short = scaled(recipe, table, 600)
+    assert short.length == round(600 * recipe.length / (table.base.length or 1))
+    if table in (MODEL, GRADIENT) and label != "CityGaussian":
         assert short.pretrain.densify.until == 300 and short.pretrain.losses["normal"].start == 140
+        assert short.tune.steps == 600, "also where pretraining is shorter"
     assert label in recipe.about and name in recipe.about
 
 
@@ -50,12 +59,15 @@ def test_every_row_changes_what_it_is_built_on(name, label):
     table = TABLES[name]
     row = next(row for row in table.rows if row.label == label)
     below = built_on(table)[label]
-    before = build(table)[below] if below else table.base
+    assert row.on in (None, below)
+    before = row.recipe or (build(table)[below] if below else table.base)
     after = build(table)[label]
     for path, value in row.change.items():
         before = evolve(before, path, value)
     assert without_unused(before) == replace(after, about=before.about)
-    if table is SURFACE:
+    if table is METHODS:
+        assert (row.recipe is None) == (below is None), "the first row is the base, the others are recipes"
+    elif table in (SURFACE, TRIM, PARTITION):
         assert (before == (build(table)[below] if below else table.base)) == (below is None), "a row changes something"
     else:
         assert after.pretrain.policies, "these tables are about how points multiply"
@@ -74,10 +86,31 @@ def test_the_last_kept_row_of_the_table_of_surfaces_is_the_recipe_and_each_row_w
 
 @pytest.mark.parametrize("name", ["model", "gradient"])
 def test_every_row_has_its_published_figures(name):
+    known = set(COLUMNS) - {"cpu_seconds"} - ({"bytes", "peak_memory_bytes", "fps"} if name == "gradient" else set())
     for row in TABLES[name].rows:
-        assert row.paper.keys() == {"psnr", "ssim", "f1", "points"}
-        assert row.paper["psnr"] > 20 > row.paper["ssim"] and row.paper["points"] > 9e6
+        if row.label.startswith("control"):
+            assert not row.paper, "the control is not in print"
+            continue
+        assert row.paper.keys() == known
+        assert (
+            1 > row.paper["ssim"] > row.paper["f1"] > 0.39 > row.paper["recall"] - 0.05 and 21 < row.paper["psnr"] < 24
+        )
+        assert 0.2 < row.paper["lpips"] < 0.41
+        precision, recall = row.paper["precision"], row.paper["recall"]
+        assert row.paper["f1"] == pytest.approx(2 * precision * recall / (precision + recall), abs=0.003)
+        assert row.paper["points"] > 4e6 and row.paper["seconds"] > 4_000
     assert TABLES[name].name == name
+
+
+def test_published_differences_are_those_that_the_paper_writes_about():
+    rows = {row["label"]: row["paper_difference"] for row in compare(MODEL, {})}
+    dgd = rows["+ DGD"]
+    assert (dgd["psnr"], dgd["ssim"], dgd["f1"]) == (1.06, 0.038, 0.018), "1.0 PSNR, 0.04 SSIM, and almost 0.02 F1"
+    assert rows["+ SH degree 2"]["fps"] == pytest.approx(3.2) and "fps" not in rows["control: one block"]
+    assert rows["+ prune (LightGaussian)"]["psnr"] == -0.04, "it excludes trim, which stands above it"
+    papers = {row.label: row.paper for row in MODEL.rows}
+    assert papers["+ trim (Ours-b)"]["bytes"] / papers["+ parallel tuning"]["bytes"] == pytest.approx(0.42, abs=0.01)
+    assert papers["+ VQ (Ours-s)"]["bytes"] / papers["+ SH degree 2"]["bytes"] == pytest.approx(0.34, abs=0.01)
 
 
 def test_rows_build_on_the_last_kept_one():
@@ -86,15 +119,42 @@ def test_rows_build_on_the_last_kept_one():
     assert [recipe.seed for recipe in recipes.values()] == [1, 2, 1]
     assert [recipe.pretrain.sh_every for recipe in recipes.values()] == [1_000, 7, 1_000]
     assert [recipe.primitive.sh_degree for recipe in recipes.values()] == [3, 3, 0]
+    on = replace(FALLBACKS, rows=(*FALLBACKS.rows, Row("aside", {"seed": 9}, on="given up")))
+    assert build(on)["aside"].pretrain.sh_every == 7 and built_on(on)["aside"] == "given up"
+    with pytest.raises(BadInput, match="row 'early': no row above named 'late'; known: $|known: none"):
+        replace(FALLBACKS, rows=(Row("early", on="late"), Row("late")))
+    with pytest.raises(BadInput, match="row 'x', paper: no column named 'PSNR'; did you mean 'ssim'|no column named"):
+        Row("x", paper={"PSNR": 20.0})
     assert built_on(FALLBACKS) == {"start": None, "given up": "start", "end": "start"}
 
 
 def test_the_model_table_adds_up():
-    stages = [recipe.pretrain for recipe in build(MODEL).values()]
+    recipes = build(MODEL)
+    stages = [recipe.pretrain for recipe in recipes.values()][:4]
     assert [bool(stage.densify.filters) for stage in stages] == [False, True, True, True]
     dgd = LossGradient(terms=("ssim",), boost=0.9)
     assert [stage.signal for stage in stages] == [LossGradient(), LossGradient(), dgd, dgd]
     assert [stage.losses.get("depth") for stage in stages] == [None] * 3 + [DepthRegression(start=0.5, end=0.0025)]
+
+    def same(label: str, recipe: Recipe, **others: object) -> bool:
+        found = recipes[label]
+        return replace(found, about="", mesh=None, **others) == replace(recipe, about="", mesh=None, **others)
+
+    assert same("+ depth regression", city.COARSE)
+    tenth = (Trim(ratio=0.1),)
+    assert same("+ trim (Ours-b)", replace(city.CITY, tune=replace(city.CITY.tune, prune=tenth)))
+    assert same("+ VQ (Ours-s)", replace(city.SMALL, tune=replace(city.SMALL.tune, prune=tenth)))
+    assert same("+ 7k pretrain (Ours-t)", replace(city.TINY, tune=replace(city.TINY.tune, prune=tenth)))
+    assert same("+ parallel tuning", replace(city.CITY, tune=replace(city.CITY.tune, prune=())))
+    assert same("control: one block", replace(recipes["+ parallel tuning"], partition=ContractedGrid(blocks=(1, 1))))
+    assert same("CityGaussian", city.FIRST)
+    pruned = recipes["+ prune (LightGaussian)"].tune.prune
+    assert [type(part) for part in pruned] == [Importance], "without trim: the two exclude each other"
+    assert built_on(MODEL)["+ prune (LightGaussian)"] == "+ parallel tuning" == built_on(MODEL)["+ trim (Ours-b)"]
+    planned = recipes["+ partition of 2DGS"].partition_pretrain
+    assert planned.steps == 7_000 and planned.signal.terms is None and "depth" not in planned.losses
+    assert planned.densify == COARSE_BASELINE.pretrain.densify and planned.losses == COARSE_BASELINE.pretrain.losses
+    assert same("+ partition of 2DGS", recipes["+ 7k pretrain (Ours-t)"], partition_pretrain=None)
 
 
 def test_the_gradient_table_changes_the_signal_and_then_the_loss():
@@ -139,3 +199,32 @@ def test_rows_are_picked_by_number_or_label():
     for wrong in ("0", "4", "strt"):
         with pytest.raises(BadInput, match=f"no row named '{wrong}'.*known: start, given up, end; .* 1 to 3"):
             pick(FALLBACKS, [wrong])
+
+
+def test_a_row_may_be_a_recipe_of_its_own():
+    other = replace(COARSE_BASELINE, seed=5)
+    rows = (Row("base", {"seed": 1}), Row("other", {"primitive.sh_degree": 0}, recipe=other), Row("next", {"seed": 7}))
+    built = build(Table("mixed", "Rows of two kinds.", COARSE_BASELINE, rows))
+    assert replace(built["other"], about=other.about) == evolve(other, "primitive.sh_degree", 0)
+    assert replace(built["next"], about=other.about) == evolve(evolve(other, "primitive.sh_degree", 0), "seed", 7)
+
+
+def test_packages_add_rows_to_tables_of_others(monkeypatch):
+    class Plugin:
+        @hookimpl
+        def surfkit_rows(self):
+            return {"methods": (Row("ours", {"seed": 3}),), "lost": (Row("nowhere"),)}
+
+    told = []
+    monkeypatch.setattr(ablation, "emit", told.append)
+    plugins().register(Plugin(), "stand-in")
+    try:
+        tables = offered_tables()
+    finally:
+        reload()
+    rows = tables["methods"].rows
+    assert rows[: len(METHODS.rows)] == METHODS.rows and rows[-1] == Row("ours", {"seed": 3})
+    assert "lost" not in tables
+    assert [event.text for event in told] == [
+        "plugin stand-in adds rows to table:lost, which no package offers; they are left out"
+    ]

@@ -1,5 +1,6 @@
 import pytest
 
+from surfkit.core.check import BadInput
 from surfkit.recipes.ablations import COARSE_BASELINE
 from surfkit.report.ablation import Row, Table
 from surfkit.report.compare import compare, deviation, difference, figures
@@ -57,12 +58,29 @@ def test_rows_are_compared_with_the_kept_one():
 
 def test_figures_are_found_in_the_metrics():
     metrics = {"images": {"psnr": 1.0, "ssim": 0.2, "per_image": {}}, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0}
-    assert figures(metrics | {"fps": 6.0}) == {
-        "psnr": 1.0,
-        "ssim": 0.2,
-        "points": 3,
-        "seconds": 4.0,
-        "cpu_seconds": 5.0,
-    }
-    more = figures(metrics | {"prepare_cpu_seconds": 2.0, "geometry": {"f1": 0.5, "precision": 0.4}})
-    assert more == figures(metrics) | {"f1": 0.5, "cpu_seconds": 7.0}
+    plain = {"psnr": 1.0, "ssim": 0.2, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0}
+    assert figures(metrics) == plain
+    sizes = {"fps": 6.0, "bytes": 70, "peak_memory_bytes": 80}
+    assert figures(metrics | sizes | {"memory_bytes": {}}) == plain | sizes
+    geometry = {"f1": 0.5, "precision": 0.4, "recall": 0.6, "points": {"truth": 9}, "tau": 1.0}
+    more = figures(metrics | {"prepare_cpu_seconds": 2.0, "geometry": geometry})
+    assert more == plain | {"f1": 0.5, "precision": 0.4, "recall": 0.6, "cpu_seconds": 7.0}
+    images = metrics["images"] | {"lpips_alex": 0.3, "lpips_vgg": 0.9}
+    assert figures(metrics | {"images": images}) == plain | {"lpips": 0.3}
+    with pytest.raises(BadInput, match="seconds"):
+        figures({name: value for name, value in metrics.items() if name != "seconds"})
+
+
+def test_of_a_compressed_model_its_own_quality_size_and_speed_count():
+    metrics = {"images": {"psnr": 1.0, "ssim": 0.2}, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0}
+    metrics |= {"fps": 6.0, "bytes": 70, "geometry": {"f1": 0.5, "precision": 0.4, "recall": 0.6}}
+    small = {"images": {"psnr": 0.9, "ssim": 0.1}, "bytes": 7, "fps_before_and_after": [6.0, 8.0]}
+    found = figures(metrics | {"compressed": small}, compressed=True)
+    assert found == {
+        "psnr": 0.9, "ssim": 0.1, "points": 3, "seconds": 4.0, "cpu_seconds": 5.0, "bytes": 7, "fps": 8.0,
+    }, "its F1 is not that of the model before"  # fmt: skip
+    geometry = {"f1": 0.3, "precision": 0.2, "recall": 0.4}
+    assert figures(metrics | {"compressed": small | {"geometry": geometry}}, compressed=True) == found | geometry
+    assert figures(metrics | {"compressed": small})["bytes"] == 70, "a recipe without compression"
+    with pytest.raises(BadInput, match="no compressed model, which the recipe wants"):
+        figures(metrics, compressed=True)

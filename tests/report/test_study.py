@@ -12,11 +12,12 @@ from surfkit.core.codec import write_json
 from surfkit.densify import CountCap, Elongation
 from surfkit.readers.data import Data
 from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
-from surfkit.report import study
+from surfkit.report import rows
 from surfkit.report.ablation import Row, Table
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
 from surfkit.report.table import lines, markdown
+from surfkit.run import shared
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
 
@@ -30,6 +31,11 @@ TABLE = Table(
         Row("less | more", {"primitive.sh_degree": 1}, paper={"psnr": 22.24, "points": 9_510_000}),
     ),
 )
+
+
+def rows_in(report):
+    """The rows on the first data set."""
+    return report["data_sets"][0]["rows"]
 
 
 class Silent:
@@ -52,7 +58,7 @@ class Runs:
         self.calls = []
         self.raises = {}
 
-    def __call__(self, recipe, data, out, device):
+    def __call__(self, recipe, data, out, device, **rest):
         key = (recipe.primitive.sh_degree, recipe.seed)
         self.calls.append(key)
         if key in self.raises:
@@ -73,16 +79,16 @@ def data(tmp_path_factory) -> Data:
 @pytest.fixture
 def runs(monkeypatch):
     stand_in = Runs()
-    monkeypatch.setattr(study.pipeline, "run", stand_in)
+    monkeypatch.setattr(rows.pipeline, "run", stand_in)
     return stand_in
 
 
 def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
     watch = Silent()
-    report = ablate(Plan(TABLE, data, tmp_path, steps=300, seeds=2), watch)
+    report = ablate(Plan(TABLE, (data,), tmp_path, steps=300, seeds=2), watch)
     assert runs.calls == [(3, 0), (1, 0), (3, 1), (1, 1)]
     assert watch.begun == [("base", 0, 1, 4), ("less | more", 0, 2, 4), ("base", 1, 3, 4), ("less | more", 1, 4, 4)]
-    base, same, less = report["rows"]
+    base, same, less = rows_in(report)
     assert base["runs"] == same["runs"] and base["runs"] != less["runs"]
     assert same["difference"]["psnr"]["mean"] == 0
     assert less["difference"]["psnr"] == {"mean": 3.0, "standard_error": 0.0, "seeds": 2, "base": 20.5}
@@ -93,7 +99,7 @@ def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
 
 
 def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
-    plan = Plan(MODEL, data, tmp_path, max_points=500)
+    plan = Plan(MODEL, (data,), tmp_path, max_points=500)
     recipes = [trial.recipe for trial in trials(plan)]
     assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * len(MODEL.rows)
     assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
@@ -105,80 +111,83 @@ def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
 
 
 def test_what_is_saved(data, runs, tmp_path):
-    report = ablate(Plan(TABLE, data, tmp_path, steps=300, seeds=2), Silent())
+    report = ablate(Plan(TABLE, (data,), tmp_path, steps=300, seeds=2), Silent())
     assert json.loads((tmp_path / "ablation.json").read_text()) == report
     assert (report["table"], report["steps"], report["seeds"]) == ("twins", 300, 2)
-    assert report["data"]["path"] == str(data.path) and report["versions"].keys() >= {"surfkit", "torch", "python"}
-    assert report["rows"][2]["change"] == {"primitive.sh_degree": 1} and report["rows"][1]["kept"] is False
+    assert report["data_sets"][0]["data"]["path"] == str(data.path)
+    assert report["versions"].keys() >= {"surfkit", "torch", "python"}
+    assert rows_in(report)[2]["change"] == {"primitive.sh_degree": 1} and rows_in(report)[1]["kept"] is False
     page = (tmp_path / "ablation.md").read_text()
-    own = "| 3 | less \\| more | 2/2 | 23.50 ± 0.71 | +3.00 ± 0.00 | 0.500 ± 0.000 | +0.000 ± 0.000 | 100 ± 0 | "
-    assert own + "-66.7 ± 0.0 % |  |  | 1.5 | 1.7 | 22.24 | +1.12 |  |  | 9.51 M | -0.3 % |  |  |" in page
-    assert "| 2 | (same) |" in page and page.startswith("# table:twins\n")
+    own = "| 3 | less \\| more | 1 | 2/2 | 0.500 ± 0.000 (+0.000 ± 0.000) | **23.50 ± 0.71** (+3.00 ± 0.00) | "
+    assert own + "**100 ± 0** (-66.7 ± 0.0 %) | 1.5 ± 0.0 (+0.0 ± 0.0 %) | 1.7 ± 0.0 (+0.0 ± 0.0 %) |" in page
+    assert "| 22.24 (+1.12) | 9.51 M (-0.3 %) |\n" in page
+    assert "| 2 | (same) | 1 |" in page and page.startswith("# table:twins\n")
     widths = {line.replace("\\|", "").count("|") for line in page.splitlines() if line.startswith("|")}
-    assert widths == {22}
+    assert widths == {13}
+    assert {path.suffix for path in tmp_path.glob("ablation.*")} == {".json", ".md", ".tex", ".csv"}
 
 
 def test_an_interrupted_table_goes_on(data, runs, tmp_path):
-    whole = ablate(Plan(TABLE, data, tmp_path / "whole", seeds=2), Silent())
+    whole = ablate(Plan(TABLE, (data,), tmp_path / "whole", seeds=2), Silent())
     runs.raises = {(3, 1): KeyboardInterrupt()}
-    plan = Plan(TABLE, data, tmp_path / "broken", seeds=2)
+    plan = Plan(TABLE, (data,), tmp_path / "broken", seeds=2)
     with pytest.raises(KeyboardInterrupt):
         ablate(plan, Silent())
     half = json.loads((plan.out / "ablation.json").read_text())
-    assert [len(row["runs"]) for row in half["rows"]] == [1, 1, 1] and not any(row["failed"] for row in half["rows"])
+    assert [len(row["runs"]) for row in rows_in(half)] == [1, 1, 1] and not any(row["failed"] for row in rows_in(half))
     runs.raises, runs.calls = {}, []
     assert ablate(plan, Silent()) == whole
     assert runs.calls == [(3, 1), (1, 1)]
 
 
 def test_a_finished_table_needs_nothing(data, runs, tmp_path):
-    plan = Plan(TABLE, data, tmp_path)
+    plan = Plan(TABLE, (data,), tmp_path)
     first = ablate(plan, Silent())
     runs.calls = []
     assert ablate(plan, Silent()) == first and runs.calls == []
     more = ablate(replace(plan, seeds=2), Silent())
-    assert runs.calls == [(3, 1), (1, 1)] and more["rows"][0]["runs"][0] == first["rows"][0]["runs"][0]
+    assert runs.calls == [(3, 1), (1, 1)] and rows_in(more)[0]["runs"][0] == rows_in(first)[0]["runs"][0]
     runs.calls = []
     ablate(replace(plan, steps=20), Silent())
     assert len(runs.calls) == 2, "other steps are other runs"
 
 
 def test_some_rows_now_and_the_others_later(data, runs, tmp_path):
-    report = ablate(Plan(TABLE, data, tmp_path, rows=("3",)), Silent())
-    assert runs.calls == [(1, 0)] and report["rows"][0]["runs"] == [] and report["rows"][2]["difference"] == {}
-    report = ablate(Plan(TABLE, data, tmp_path, rows=("same",)), Silent())
-    assert runs.calls == [(1, 0), (3, 0)] and report["rows"][2]["difference"]["psnr"]["mean"] == 3
+    report = ablate(Plan(TABLE, (data,), tmp_path, rows=("3",)), Silent())
+    assert runs.calls == [(1, 0)] and rows_in(report)[0]["runs"] == [] and rows_in(report)[2]["difference"] == {}
+    report = ablate(Plan(TABLE, (data,), tmp_path, rows=("same",)), Silent())
+    assert runs.calls == [(1, 0), (3, 0)] and rows_in(report)[2]["difference"]["psnr"]["mean"] == 3
 
 
 def test_a_row_that_fails_does_not_stop_the_others(data, runs, tmp_path):
     runs.raises = {(3, 0): RuntimeError("step 7:\n  the losses are nan")}
-    plan = Plan(TABLE, data, tmp_path, seeds=2)
+    plan = Plan(TABLE, (data,), tmp_path, seeds=2)
     report = ablate(plan, Silent())
     assert runs.calls == [(3, 0), (1, 0), (1, 1)], "a failed row is not tried with other seeds"
-    base, same, less = report["rows"]
+    base, same, less = rows_in(report)
     assert base["failed"].startswith("seed 0: RuntimeError: step 7: the losses are nan; see ")
     assert base["failed"] == same["failed"] and base["runs"] == [] and base["mean"] == {}
     assert less["failed"] is None and less["mean"]["psnr"] == 23.5 and less["difference"] == {}
     (trace,) = tmp_path.rglob("failed.txt")
     assert "in __call__" in trace.read_text()
     assert "- base: failed: seed 0: RuntimeError" in (tmp_path / "ablation.md").read_text()
-    assert [row[2] for row in lines(report)[1]] == ["failed", "failed", "2/2"]
+    assert [row[3] for row in lines(report)[1]] == ["failed", "failed", "2/2"]
     runs.raises = {}
     again = ablate(plan, Silent())
-    assert not any(row["failed"] for row in again["rows"]) and not list(tmp_path.rglob("failed.txt"))
+    assert not any(row["failed"] for row in rows_in(again)) and not list(tmp_path.rglob("failed.txt"))
 
 
 def test_input_that_a_single_run_refuses_fails_its_row(data, runs, tmp_path):
     runs.raises = {(1, 0): BadInput("no depth\nprior")}
-    report = ablate(Plan(TABLE, data, tmp_path), Silent())
-    assert report["rows"][2]["failed"] == "seed 0: no depth prior" and not list(tmp_path.rglob("failed.txt"))
+    report = ablate(Plan(TABLE, (data,), tmp_path), Silent())
+    assert rows_in(report)[2]["failed"] == "seed 0: no depth prior" and not list(tmp_path.rglob("failed.txt"))
 
 
 def test_what_no_row_could_use_is_refused_before_anything_is_written(data, runs, tmp_path):
-    plan = Plan(TABLE, data, tmp_path / "out")
+    plan = Plan(TABLE, (data,), tmp_path / "out")
     for wrong, message in (
-        (replace(plan, data=Data(tmp_path / "nowhere")), "no such folder"),
-        (replace(plan, data=replace(data, test_every=0)), "no photograph is kept from training"),
+        (replace(plan, data=(Data(tmp_path / "nowhere"),)), "no such folder"),
+        (replace(plan, data=(replace(data, test_every=0),)), "no photograph is kept from training"),
         (replace(plan, steps=0), "--steps 0"),
         (replace(plan, rows=("4",)), "no row named '4'"),
         (replace(plan, device="cuda"), "--device cuda"),
@@ -200,6 +209,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
 
     class Opened:
         def __init__(self, folder):
+            self.recipe, self.out = COARSE_BASELINE, folder
             self.data, self.mesh, self.mesh_record, self.metrics = (
                 data,
                 folder / "mesh.ply",
@@ -220,20 +230,20 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
     vertices = "".join(f"{x} {y} 0\n" for x in range(20) for y in range(20))
     head = "ply\nformat ascii 1.0\nelement vertex 400\nproperty float x\nproperty float y\nproperty float z\n"
     gt.write_text(f"{head}end_header\n{vertices}")
-    plan = Plan(TABLE, data, tmp_path / "out", truth=truth.Truth(gt, 0.5))
+    plan = Plan(TABLE, (data,), tmp_path / "out", truth=(truth.Truth(gt, 0.5),))
     assert all(trial.recipe.mesh is not None for trial in trials(plan)), "rows without a mesh get one"
     report = ablate(plan, Silent())
-    assert [row["mean"]["f1"] for row in report["rows"]] == [0.25, 0.25, 0.5]
-    assert report["rows"][2]["difference"]["f1"]["mean"] == 0.25
-    assert calls == ["auto", str(plan.truth.crop(plan.out))], "the second row is measured in the volume of the first"
-    assert "| 0.500 | +0.250 | 1.5 | 1.7 |" in (plan.out / "ablation.md").read_text()
+    assert [row["mean"]["f1"] for row in rows_in(report)] == [0.25, 0.25, 0.5]
+    assert rows_in(report)[2]["difference"]["f1"]["mean"] == 0.25
+    assert calls == ["auto", str(plan.truth[0].crop(plan.out))], "the second row is measured in the volume of the first"
+    assert "| **0.500** (+0.250) | **100** (-66.7 %) | 1.5 (+0.0 %) |" in (plan.out / "ablation.md").read_text()
     assert ablate(plan, Silent()) == report and len(calls) == 2 and len(runs.calls) == 2
     calls.append("bad")
-    other = ablate(replace(plan, truth=truth.Truth(gt, 0.25)), Silent())
-    assert len(runs.calls) == 2 and other["rows"][0]["failed"] == "seed 0: nowhere near", "nothing is trained again"
-    assert other["rows"][0]["mean"]["psnr"] == 20 and "f1" not in other["rows"][0]["mean"]
+    other = ablate(replace(plan, truth=(truth.Truth(gt, 0.25),)), Silent())
+    assert len(runs.calls) == 2 and rows_in(other)[0]["failed"] == "seed 0: nowhere near", "nothing is trained again"
+    assert rows_in(other)[0]["mean"]["psnr"] == 20 and "f1" not in rows_in(other)[0]["mean"]
     with pytest.raises(BadInput, match="gone.ply"):
-        ablate(replace(plan, out=tmp_path / "new", truth=truth.Truth(tmp_path / "gone.ply")), Silent())
+        ablate(replace(plan, out=tmp_path / "new", truth=(truth.Truth(tmp_path / "gone.ply"),)), Silent())
     assert not (tmp_path / "new").exists()
 
 
@@ -246,8 +256,8 @@ def test_a_fingerprint_tells_what_a_run_is_made_from(data, monkeypatch):
         fingerprint(recipe, replace(data, scale=2.0)),
         fingerprint(recipe, Data(data.path.parent)),
     ]
-    newer = [replace(plugin, version="99") for plugin in study.records()]
-    monkeypatch.setattr(study, "records", lambda: newer)
+    newer = [replace(plugin, version="99") for plugin in shared.records()]
+    monkeypatch.setattr(shared, "records", lambda: newer)
     others.append(fingerprint(recipe, data))
     assert len({first, *others}) == 5
 
@@ -257,17 +267,17 @@ def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
     console = Console(file=out, width=120, force_terminal=True)
 
     class Training(Runs):
-        def __call__(self, recipe, data, out, device):
+        def __call__(self, recipe, data, out, device, **rest):
             with Display("pretrain", 1, console) as display:
                 assert display.bar is None, "no second live display"
                 display.outer("pretrain", 1, 1, "step 1/1")
-            return super().__call__(recipe, data, out, device)
+            return super().__call__(recipe, data, out, device, **rest)
 
     training = Training()
     training.raises = {(1, 0): RuntimeError("too bad")}
-    monkeypatch.setattr(study.pipeline, "run", training)
+    monkeypatch.setattr(rows.pipeline, "run", training)
     with Screen(console) as screen:
-        ablate(Plan(TABLE, data, tmp_path), screen)
+        ablate(Plan(TABLE, (data,), tmp_path), screen)
     text = out.getvalue()
     assert "run 1 of 2: base, seed 0" in text and "step 1/1" in text and "━" in text
     assert "21.12" in text and "run 2 of 2: less | more, seed 0: failed: RuntimeError: too bad" in text
@@ -276,7 +286,7 @@ def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):
 
 def test_without_a_terminal_each_run_is_two_lines(data, runs, tmp_path, capsys):
     with Screen(Console(file=io.StringIO())) as screen:
-        ablate(Plan(TABLE, data, tmp_path), screen)
+        ablate(Plan(TABLE, (data,), tmp_path), screen)
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 4 and said[0].startswith("run 1 of 2: base, seed 0, in ")
     assert said[3] == "run 2 of 2: less | more, seed 0: PSNR 23.00 dB, SSIM 0.500, 100 points, 1.5 minutes"

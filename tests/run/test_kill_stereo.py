@@ -3,10 +3,10 @@
 import json
 import os
 import signal
-import subprocess
-import sys
+from functools import partial
 
 import pytest
+from forks import started
 from needs import needs_native
 
 from surfkit.cli import main
@@ -14,26 +14,21 @@ from surfkit.readers.made_maps import read_made
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
-DEADLY = """
-import os, signal, sys
-
-left, replace = int(sys.argv.pop(1)), os.replace
 
 
-def replaced(unfinished, path):
-    global left
-    left -= str(path).endswith(".npy")
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    replace(unfinished, path)
+def die_at(array):
+    """This process ends when so many arrays are written, but for the name of the last."""
+    left, replace = [array], os.replace
+
+    def replaced(unfinished, path):
+        left[0] -= str(path).endswith(".npy")
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(unfinished, path)
+
+    os.replace = replaced
 
 
-os.replace = replaced
-from surfkit.cli import main
-
-sys.exit(main())
-"""
-"""The command line, in a process that dies when so many arrays are written, but for the name of the last."""
 SETTINGS = "recipe:surface mesh:none --steps 4 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
 
 
@@ -52,10 +47,11 @@ def words(data, folder):
 
 def killed(data, folder, at):
     """A run in a folder, whose maps are kept there too, in a process that dies at an array; never if that is -1."""
-    given = os.environ | {"SURFKIT_CACHE": str(folder / "cache"), "OMP_NUM_THREADS": "1"}
-    line = [sys.executable, "-c", DEADLY, str(at), *words(data, folder)]
-    done = subprocess.run(line, env=given, capture_output=True, check=False)
-    assert done.returncode == (0 if at == -1 else -signal.SIGKILL), done.stderr.decode()
+    folder.mkdir(exist_ok=True)
+    log = folder / "log"
+    process = started(words(data, folder), log, folder / "cache", partial(die_at, at))
+    process.join()
+    assert process.exitcode == (0 if at == -1 else -signal.SIGKILL), log.read_text()
 
 
 def arrays(folder):

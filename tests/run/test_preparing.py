@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forks import started
 
 from surfkit.blocks.schedule import Compute
 from surfkit.cli import main
@@ -337,11 +336,12 @@ def test_two_processes_make_the_maps_once(farm, recipe, tmp_path, own_cache):
     from surfkit.core.codec import write_json
 
     write_json(tmp_path / "recipe.json", recipe)
-    words = [sys.executable, "-m", "surfkit.cli", "train", f"recipe:{tmp_path / 'recipe.json'}"]
-    words += ["--data", str(farm.path), "--pictures-every", "0", "--out"]
-    both = [subprocess.Popen([*words, str(tmp_path / name)], stderr=subprocess.PIPE, text=True) for name in "ab"]
-    told = [process.communicate(timeout=200)[1] for process in both]
-    assert [process.returncode for process in both] == [0, 0], told
+    words = ["train", f"recipe:{tmp_path / 'recipe.json'}", "--data", str(farm.path), "--pictures-every", "0", "--out"]
+    both = [started([*words, str(tmp_path / name)], tmp_path / f"{name}.log") for name in "ab"]
+    for process in both:
+        process.join(200)
+    told = [(tmp_path / f"{name}.log").read_text() for name in "ab"]
+    assert [process.exitcode for process in both] == [0, 0], told
     assert len(list((own_cache / "depth").iterdir())) == 1
     costs = [record(tmp_path / name)["prepare_cpu_seconds"] for name in "ab"]
     assert costs[0] == costs[1]

@@ -11,14 +11,16 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.losses import L1, DepthRegression, NormalPrior
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
-from surfkit.readers.depth_prior import read_priors, resized
+from surfkit.readers.depth_prior import alignment, read_priors, resized
 from surfkit.readers.read import observations, read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.align import align, sample
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
+from surfkit.train.material import scale_band
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +217,9 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
         f"1 of 5 photographs train without a depth prior: its scale is far from that of the other images: {view.name}"
     ]
     assert sum(prior is None for prior in priors) == 1
+    losses = {"depth": DepthRegression(scale_band=(0.15, 50.0)), "prior": NormalPrior()}
+    assert scale_band(losses) == (0.15, 50.0) and scale_band({"l1": L1()}) == (0.2, 5.0)
+    assert len(alignment(data, scene, band=scale_band(losses)).fits) == 5
 
 
 def test_without_any_map_the_warning_says_what_to_run(farm):

@@ -51,7 +51,7 @@ def metres(farm, local):
 
 def test_registered_names():
     known = {"sparse": SparseStart, "stereo": StereoStart, "random": RandomStart, "splats": SplatStart}
-    assert components(Start) == known
+    assert known.items() <= components(Start).items(), "packages may offer more"
 
 
 def test_sparse_is_the_cloud_of_the_scene(farm):

@@ -1,6 +1,7 @@
 """Losses, regularizers, appearance models and estimators of depth that break their contract are named."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import pytest
 import torch
@@ -113,6 +114,42 @@ class Grows(Faint):
         return index / (index - 500) if index != 500 else float("inf")
 
 
+class Seen(Faint):
+    only_seen = True
+
+
+class Remembers(Faint):
+    seen: ClassVar[list] = []
+
+    def in_step(self, splats, given):
+        self.seen.append(given.index)
+        return len(self.seen) * self(splats)
+
+
+class Blind(Faint):
+    def in_step(self, splats, given):
+        return splats.opacities[given.seen].mean()
+
+
+class Writes(Faint):
+    def in_step(self, splats, given):
+        given.maps.color.mul_(2.0)
+        return self(splats)
+
+
+@pytest.mark.parametrize(
+    ("regularizer", "message"),
+    [
+        (Remembers(), "Remembers of surfels in a step: a resumed run differs; .* keep in `stat`"),
+        (Blind(), "Blind of surfels of a view that shows none is nan"),
+        (Writes(), "Writes of surfels in a step.in_step changed its input maps.color"),
+    ],
+)
+def test_terms_that_are_wrong_in_a_step(regularizer, message):
+    with pytest.raises(AssertionError, match=message):
+        check_regularizer(regularizer)
+
+
 @pytest.mark.parametrize(
     ("regularizer", "message"),
     [
@@ -120,6 +157,7 @@ class Grows(Faint):
         (Logarithm(), "Logarithm of surfels is nan"),
         (Cuts(), "Cuts of surfels does not depend on means, quats, scales, opacities, sh"),
         (Thick(), "Thick of surfels: the gradient of 'scales' is not finite"),
+        (Seen(), "Seen of no surfel is nan; a view may show none"),
         (Grows(), "Grows: the weight at step 1 of 1000 is -0.002"),
     ],
 )

@@ -147,44 +147,48 @@ class Share(Assign):
 
     threshold: float = 0.05
 
-    @property
-    def least(self):
-        return self.threshold
+    def joins(self, sight, cells):
+        owner = cells.owner(sight.splats.means)
+        return self.spoilt(PictureShare().measure(sight, owner, cells.count) > self.threshold)
 
-    def measure(self, sight, owner, count):
-        return self.spoilt(PictureShare().measure(sight, owner, count))
-
-    def spoilt(self, share):
-        return share
+    def spoilt(self, joins):
+        return joins
 
 
 class Across(Share):
-    def spoilt(self, share):
-        return share.T
+    def spoilt(self, joins):
+        return joins.T
 
 
 class All(Share):
-    def spoilt(self, share):
-        return share + 1
+    def spoilt(self, joins):
+        return joins | True
 
 
-class Relative(Share):
-    def spoilt(self, share):
-        return share / share.amax(0)
+class Floats(Share):
+    def spoilt(self, joins):
+        return joins.float()
 
 
-class Below(Share):
-    def spoilt(self, share):
-        return share - 1
+class Chance(Share):
+    def spoilt(self, joins):
+        return joins & (torch.rand(joins.shape) < 0.5)
+
+
+class Nobody(Share):
+    @property
+    def most_views(self):
+        return 0
 
 
 @pytest.mark.parametrize(
     ("assign", "message"),
     [
-        (Across(), r"Across.measure has shape \(3, 30\), not \(30, 3\)"),
+        (Across(), r"Across.joins has shape \(3, 30\), not \(30, 3\)"),
         (All(), "All: a view joins a block without points"),
-        (Relative(), "Relative.measure is not finite"),
-        (Below(), "Below.measure is below 0 for some view"),
+        (Floats(), "Floats.joins is torch.float32, not bool"),
+        (Chance(), "Chance.joins"),
+        (Nobody(), "Nobody.most_views is 0"),
         (Share(threshold=0.999), "Share: no view joins block 0"),
     ],
 )
@@ -225,8 +229,8 @@ class Few(Same):
 @pytest.mark.parametrize(
     ("refine", "message"),
     [
-        (Whitens(), r"Whitens.params changed its input params\['sh0'\]; work on a copy"),
-        (Narrows(), "Narrows: its points have the columns .* and what they are then has"),
+        (Whitens(), r"Whitens.begin changed its input params\['sh0'\]; work on a copy"),
+        (Narrows(), "Narrows: the column 'sh_rest' has shape .*, declared as"),
         (Some(), "Some: its views are not the same again; draw them from the seed"),
         (Few(), "Few has photographs of the training views only"),
     ],

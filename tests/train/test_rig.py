@@ -73,6 +73,9 @@ class Counting:
     def __init__(self, inner):
         self.inner, self.cameras = inner, []
 
+    def where(self):
+        return self.inner.where()
+
     def render(self, splats, camera, near, geometry=True, distortion=True):
         self.cameras.append(camera)
         return self.inner.render(splats, camera, near, geometry, distortion)

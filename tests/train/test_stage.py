@@ -9,6 +9,7 @@ from surfkit.core.events import PhotoSkipped
 from surfkit.core.schedule import LearningRate
 from surfkit.densify import ADC, AbsGradient, LossGradient, Trim
 from surfkit.densify.base import Prune
+from surfkit.losses.base import Regularizer
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.regularizers import MeanOpacity, MeanScale
 from surfkit.losses.surface import NormalConsistency
@@ -72,6 +73,7 @@ class Recording:
 
     def __init__(self, inner):
         self.inner, self.geometry, self.backwards, self.absolute = inner, [], [], []
+        self.where = inner.where
 
     def render(self, splats, camera, near, geometry=True, distortion=True):
         self.geometry.append(geometry)
@@ -155,6 +157,66 @@ def test_regularizers_add_their_gradient_to_that_of_the_losses(begin):
     found = {name: state.points.exp_avg[name] * 10 for name in ("opacities", "scales")}
     assert torch.allclose(found["opacities"], 0.3 * opacity * (1 - opacity) / len(opacity), rtol=1e-3, atol=1e-7)
     assert torch.allclose(found["scales"], 0.2 * scales / scales.numel(), rtol=1e-3, atol=1e-7)
+
+
+@dataclass(frozen=True)
+class SeenOpacity(MeanOpacity):
+    only_seen = True
+
+    def __call__(self, splats):
+        return splats.opacities.sum() / 7
+
+
+def test_a_regularizer_may_ask_for_the_points_of_the_view_alone(begin):
+    stage = replace(QUIET, steps=1, losses={"l1": L1(weight=0.0), "ssim": SSIM(weight=1e-9)})
+    trainer, state = begin(replace(stage, regularizers={"opacity": SeenOpacity(weight=0.3)}))
+    state.points.params["means"][::3, 2] = -5.0  # behind every camera
+    before = {name: value.clone() for name, value in state.points.params.items()}
+    done = trainer.step(state)
+    camera = done.target.view.camera
+    seen = trainer.rasterizer.render(trainer.primitive.activate(before, 0), camera, stage.near, False).seen
+    assert 0 < seen.sum() < len(seen)
+    opacity = before["opacities"].sigmoid()
+    assert done.losses["opacity"] == pytest.approx(0.3 * float(opacity[seen].sum()) / 7)
+    found = state.points.exp_avg["opacities"] * 10
+    assert torch.allclose(found, 0.3 * opacity * (1 - opacity) * seen / 7, rtol=1e-3, atol=1e-7)
+
+
+@dataclass(frozen=True)
+class Diary(Regularizer):
+    """Writes down what it is told, and counts the steps in a column of its own."""
+
+    @property
+    def reads(self):
+        return ("median",)
+
+    def weight_at(self, index, steps):
+        return 1.0 if index > 2 else 0.0
+
+    def __call__(self, splats):
+        raise AssertionError("a stage asks for the term in a step")
+
+    def in_step(self, splats, given):
+        count = given.stat("diary/steps")
+        count += 1
+        assert len(given.seen) == len(splats) and given.seen.any() and not given.maps.median.requires_grad
+        DIARY.append((given.index, given.steps, given.target.view.name, given.target.seed, float(count.max())))
+        return (count * splats.opacities).mean()
+
+
+DIARY: list[tuple] = []
+
+
+def test_regularizers_are_told_of_the_step_and_keep_columns(begin):
+    DIARY.clear()
+    trainer, state = begin(replace(QUIET, steps=5, regularizers={"diary": Diary()}, prune=(Notebook(),)))
+    done = list(trainer.run(state))
+    assert [entry[0] for entry in DIARY] == [3, 4, 5] and {entry[1] for entry in DIARY} == {5}
+    assert [entry[2] for entry in DIARY] == [each.target.view.name for each in done[2:]]
+    assert [entry[3] for entry in DIARY] == [each.target.seed for each in done[2:]]
+    assert [entry[4] for entry in DIARY] == [1, 2, 3] and set(state.points.stat("diary/steps").tolist()) == {3.0}
+    assert [each.maps.median is None for each in done] == [True, True, False, False, False], "drawn when it is read"
+    assert ["diary" in each.losses for each in done] == [False, False, True, True, True]
 
 
 def test_chosen_losses_that_are_not_yet_active_give_no_signal(begin):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.evaluate.geometry.presets import PRESETS, PresetName
 from surfkit.evaluate.geometry.repetition import LEAST, Draw, Measurement, Side, cloud_side, mesh_side, refuse_few
 from surfkit.evaluate.geometry.scores import spacing, tree
 from surfkit.evaluate.geometry.surface import Surface
@@ -23,6 +24,8 @@ AUTO_TAU = 1.5
 """Of the mean distance between neighbours in the truth (CityGaussianV2)."""
 OFF, FAR_OFF = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
+SHARE = 0.05
+"""Of the training views, that must see a point of the truth by default."""
 RESIZED = 0.02
 """Change of scale by ICP above which a warning is printed."""
 SHORTEST, FURTHEST = 1e-7, 1e4
@@ -37,6 +40,11 @@ WAYS: tuple[Align, ...] = ("none", "rigid", "similarity")
 @dataclass(frozen=True)
 class Comparison:
     """How a reconstruction is compared with ground truth."""
+
+    preset: PresetName | None = None
+    """Settings of the paper of CityGaussianV2 for a scene of its data sets: --voxel of 0.35 m, and the number of views
+    for --visible; --tau follows from the truth. Options that are given take precedence. The photographs must be all of
+    the scene, and the length of their unit must be known."""
 
     transform: Path | None = None
     """File with the 4 x 4 matrix from the reconstruction's frame to the frame of the ground truth: four rows of text as
@@ -65,8 +73,9 @@ class Comparison:
     """What ICP may change for the reported values: rotation, translation and scale (similarity), rotation and
     translation (rigid), or nothing (none). metrics.json has the values of all three."""
 
-    visible: float = 0.05
-    """Share of the training views, 0 to 1, that must see a point for it to be in the volume of `--crop auto`."""
+    visible: float | None = None
+    """Training views that must see a point for it to be in the volume of `--crop auto`: a share of all up to 1, or a
+    number from 2 on. Default: a share of 0.05."""
 
     radius: float | None = None
     """Radius of the alpha shape around the visible ground, in units of the ground truth. Default: 2 % of the
@@ -97,8 +106,34 @@ class Comparison:
             raise BadInput(f"--draws {self.draws}: give 1 to {MOST_DRAWS}")
         if self.samples is not None and self.samples < LEAST:
             raise BadInput(f"--samples {self.samples}: give {LEAST} or more points")
-        if not 0 < self.visible <= 1:
-            raise BadInput(f"--visible {self.visible:g}: it is a share of the views: more than 0, at most 1")
+        if self.visible is not None and not (0 < self.visible <= 1 or (self.visible > 1 and self.visible % 1 == 0)):
+            raise BadInput(
+                f"--visible {self.visible:g}: give a share of the views, more than 0 and at most 1, or a number of them"
+            )
+        if self.preset is not None and self.preset not in PRESETS:
+            raise BadInput(f"--preset {self.preset}: choose one of {', '.join(PRESETS)}")
+
+    def for_scene(self, frame: Frame | None, matrix: np.ndarray) -> Comparison:
+        """The same with what the preset says of settings that are not given, and without a preset.
+
+        Args:
+            frame: Of the photographs, which knows the length of their unit; None where there are none.
+            matrix: (4, 4) from that frame to the frame of the truth.
+
+        Raises:
+            BadInput: The preset has a length in metres, and nobody knows how long a unit is.
+        """
+        if self.preset is None:
+            return self
+        preset, voxel = PRESETS[self.preset], self.voxel
+        if voxel is None:
+            if frame is None or frame.metres is None:
+                raise BadInput(
+                    f"--preset {self.preset}: the truth is thinned to voxels of {preset.voxel_m:g} m, and nobody says "
+                    "how long its unit is: train with --metres-per-unit, or give --voxel in units of the truth"
+                )
+            voxel = preset.voxel_m * scale_of(matrix) / frame.metres
+        return replace(self, preset=None, voxel=voxel, visible=self.visible or preset.visible)
 
 
 @dataclass(frozen=True)
@@ -147,6 +182,7 @@ def compare(
         BadInput: The two do not lie in one frame, too few points, no volume to compare in.
     """
     matrix = np.eye(4) if settings.transform is None else read_transform(settings.transform)
+    settings = settings.for_scene(frame, matrix)
     refuse_sizes(settings, truth)
     theirs, tau = truth_side(truth, settings)
     ours = make_side(reconstruction, None, settings.samples, tau / scale_of(matrix))
@@ -229,7 +265,7 @@ def volume(
             "--crop auto needs the photographs: name a run folder, give --views with a run folder or a data set, or "
             "give --crop a file of Tanks and Temples, or --crop none"
         )
-    wanted = CropSettings(settings.visible, settings.up or "z", settings.radius, tau)
+    wanted = CropSettings(settings.visible or SHARE, settings.up or "z", settings.radius, tau)
     return visible_crop(truth, views, frame, matrix, wanted)
 
 

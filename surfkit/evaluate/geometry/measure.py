@@ -87,6 +87,7 @@ def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
     return {
         **means,
         **spread,
+        "preset": settings.preset,
         "tau": tau,
         "tau_from": "given" if settings.tau else "spacing of the truth",
         "align": settings.align,

@@ -26,13 +26,13 @@ class CropSettings:
     """What a point must be seen by to count, and what the volume around such points is.
 
     Attributes:
-        share: Of the views.
+        visible: Views: a share of all up to 1, or their number.
         axis: That stands on the ground.
         radius: Of the alpha shape, units of the truth; a share of the diagonal if None.
         margin: Added below and above, so that noise on the lowest ground is not cut off.
     """
 
-    share: float
+    visible: float
     axis: Axis
     radius: float | None
     margin: float
@@ -53,7 +53,7 @@ def visible_crop(
     here = apply(np.linalg.inv(matrix), truth)
     gap = surface_gap(tree(truth), truth[:: max(1, len(truth) // 100_000)]) / scale_of(matrix)
     counts = visible_counts(here, views, frame, gap)
-    least = max(1, math.ceil(settings.share * len(views)))
+    least = max(1, math.ceil(settings.visible * (len(views) if settings.visible <= 1 else 1)))
     kept = truth[counts >= least]
     if len(kept) < 3:
         raise BadInput(

@@ -10,6 +10,7 @@
 #include <string>
 
 #include "pass.h"
+#include "rays.h"
 #include "../../native/pool.h"
 
 namespace nb = nanobind;
@@ -81,13 +82,15 @@ void add_raster(nb::module_& m) {
 
     nb::class_<Pass>(m, "Pass")
         .def("__init__",
-             [](Pass* self, bool surfel, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens,
-                int width, int height, double near, bool antialias, double rim, Flags seen, Array radii, int threads) {
+             [](Pass* self, bool surfel, int geometry, std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens,
+                int width, int height, double near, double dilation, bool antialias, double rim, Flags seen, Array radii,
+                int threads) {
                  const auto s = arrays(splats);
                  const auto c = camera(pose, lens, width, height, near);
                  nb::gil_scoped_release free;
-                 new (self)
-                     Pass(surfel ? kSurfel : kGaussian, s, c, antialias, rim, threads, seen.data(), radii.data());
+                 const splat::GaussianForm form{dilation, antialias, (splat::Geometry)geometry};
+                 const Kind kind = surfel ? kSurfel : form.geometry == splat::kRay ? kGaussianRay : kGaussian;
+                 new (self) Pass(kind, s, c, form, rim, threads, seen.data(), radii.data());
              })
         .def_ro("first_invalid", &Pass::first_invalid)
         .def_prop_ro("pairs", &Pass::pairs)
@@ -134,6 +137,14 @@ void add_raster(nb::module_& m) {
         for (const Kernels* k : runnable_kernels())
             if (name == k->name) return use_kernels(*k);
         throw nb::value_error(("no kernels named " + name).c_str());
+    });
+    m.def("ray_opacity", [](std::vector<Array> splats, std::vector<double> pose, std::vector<double> lens, int width,
+                            int height, double near, Points points, Array opacity, int threads) {
+        const SplatArrays s{(int64_t)splats.at(0).shape(0), 0,       splats[0].data(), splats.at(1).data(),
+                            splats.at(2).data(),            splats.at(3).data(), nullptr};
+        const auto c = camera(pose, lens, width, height, near);
+        nb::gil_scoped_release free;
+        ray_opacity(s, c, points.data(), (int64_t)points.shape(0), opacity.data(), threads);
     });
     m.def(
         "ssim",

@@ -3,33 +3,13 @@
 
 #include <cstdint>
 
-namespace surfkit {
+#include "../records.h"
 
-constexpr int kTile = 16;  // pixels
+namespace surfkit {
 
 // A tile's entry: which record it draws, and which slot its gradient goes to.
 struct Entry {
     uint32_t record, slot;
-};
-
-// What blending needs of a surfel; lengths in pixels about the anchor (ax, ay), which is a pixel centre.
-struct alignas(64) SurfelRecord {
-    double a[3], b[3], c[3];  // double so that the origin moves to each tile without loss
-    float det, z_low, z_high;
-    float opacity, color[3], normal[3];
-    float ax, ay;
-    // the bound about the anchor, for rows: x = mx + tilt dy +- sqrt(wide (1 - dy^2 flat)); the disc is the low-pass
-    // filter's
-    float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
-    float signal_x[6], signal_y[3];  // of the SignalRow: x, and the entries 1, 3 and 4 of y; the others follow from x
-};
-
-struct alignas(64) GaussianRecord {
-    float x, y, l00, l01, l11;
-    float z, slope_x, slope_y, z_low, z_high;
-    float opacity, color[3], normal[3];
-    float ax, ay;
-    float mx, my, tilt, wide, flat, disc_x, disc_y, disc_r2;
 };
 
 // Images, row by row; null where not wanted. Planes of colour and normal follow one another.
@@ -55,16 +35,6 @@ struct Job {
     int64_t rows;            // splats from this one on get no gradient
 };
 
-enum Kind { kSurfel = 0, kGaussian = 1 };
-// Which maps a pass has to do with.
-enum Level { kColor = 0, kGeometry = 1, kDistortion = 2 };
-// What is said of the chosen losses: nothing, cotangents of colour, cotangents of every map; and of every map where the
-// shares of the pixels are summed without their signs.
-enum Chosen { kNone = 0, kChosenColor = 1, kChosenAll = 2, kChosenAbsolute = 3 };
-
-constexpr int kSurfelSums = 20, kSurfelSumsChosen = 24;
-constexpr int kGaussianSums = 16, kGaussianSumsChosen = 20;
-
 // Normals of the splats against those of a depth map: inputs, and where the gradients go. Planes of width x height; the
 // gradient by the depths is left as what each pixel sends to its four neighbours.
 struct NormalJob {
@@ -83,6 +53,13 @@ struct Probes {
     float* open;
 };
 
+// An ellipsoid for rays that are evaluated in space, in units of its axes: the direction of the ray through the pixel
+// position (x, y), with z = 1, is x r[0] + y r[1] + r[2], and `o` is the camera, from the centre.
+struct RaySplat {
+    double r[3][3], o[3];
+    float opacity, z_low;  // nearer than z_low it hides nothing
+};
+
 struct Kernels {
     const char* name;
     void (*forward)(Kind, Level, const Job&, int64_t tile, const Planes& out, const Saved&);
@@ -94,6 +71,9 @@ struct Kernels {
                          uint8_t* touched);
     // What is left open of the rays to points in a tile.
     void (*probe)(Kind, const Job&, int64_t tile, const Probes&);
+    // The same of `count` ellipsoids that are evaluated in space; (ox, oy): the tile's centre.
+    void (*ray_probe)(const RaySplat* splats, const uint32_t* rows, int64_t count, double ox, double oy, float near,
+                      const Probes&);
     // Rows [y0, y1) of one plane: SSIM summed, and its three partial-derivative planes.
     double (*ssim_rows)(const float* x, const float* y, int width, int height, int y0, int y1, float* d_mean,
                         float* d_square, float* d_cross);

@@ -12,222 +12,7 @@ namespace {
 
 constexpr int64_t kChunk = 512;  // splats projected as one piece of work
 
-using splat::Bound;
-using splat::CameraModel;
-using splat::Gaussian;
-using splat::Posed;
-using splat::SplatGrad;
-using splat::SplatIn;
-using splat::Surfel;
-using splat::Vec;
-
 int64_t chunks_of(int64_t count, int64_t size) { return (count + size - 1) / size; }
-
-int scale_columns(Kind kind) { return kind == kSurfel ? 2 : 3; }
-
-SplatIn<double> read_splat(const SplatArrays& s, int64_t i, int columns) {
-    SplatIn<double> o{};
-    o.mean = {s.means[3 * i], s.means[3 * i + 1], s.means[3 * i + 2]};
-    for (int k = 0; k < 4; k++) o.quat[k] = s.quats[4 * i + k];
-    for (int k = 0; k < columns; k++) o.scale[k] = s.scales[columns * i + k];
-    o.opacity = s.opacities[i];
-    return o;
-}
-
-bool valid(const SplatIn<double>& s, int columns) {
-    double sum = s.mean.x + s.mean.y + s.mean.z + s.opacity, turn = 0;
-    bool positive = true;
-    for (double q : s.quat) turn += q * q;
-    for (int k = 0; k < columns; k++) {
-        sum += s.scale[k];
-        positive = positive && s.scale[k] > 0;
-    }
-    return std::isfinite(sum) && std::isfinite(turn) && turn > 0 && positive;
-}
-
-// Colour of a splat seen from the camera, and what its gradient needs.
-struct Shade {
-    Vec<double> direction;
-    double length, basis[16], rgb[3];
-};
-Shade shade(const SplatArrays& s, int64_t i, const SplatIn<double>& in, const CameraModel<double>& cam) {
-    Shade o;
-    const Vec<double> d = in.mean - cam.centre;
-    o.length = std::sqrt(splat::dot(d, d));
-    o.direction = (1 / std::max(o.length, 1e-300)) * d;
-    splat::sh_basis(o.direction, s.coefficients, o.basis);
-    const float* sh = s.sh + 3 * s.coefficients * i;
-    for (int c = 0; c < 3; c++) {
-        o.rgb[c] = 0.5;
-        for (int k = 0; k < s.coefficients; k++) o.rgb[c] += o.basis[k] * sh[3 * k + c];
-    }
-    return o;
-}
-void shade_backward(const SplatArrays& s, int64_t i, const Shade& o, const double rgb[3], SplatGrad<double>& out,
-                    float* sh_out) {
-    double g[3], weight[16] = {};
-    for (int c = 0; c < 3; c++) g[c] = o.rgb[c] > 0 ? rgb[c] : 0;
-    const float* sh = s.sh + 3 * s.coefficients * i;
-    for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) {
-            sh_out[3 * k + c] = (float)(g[c] * o.basis[k]);
-            weight[k] += g[c] * sh[3 * k + c];
-        }
-    if (s.coefficients == 1 || !(o.length > 0)) return;
-    const Vec<double> d = splat::sh_backward(o.direction, s.coefficients, weight);
-    out.mean = out.mean + (1 / o.length) * (d - splat::dot(d, o.direction) * o.direction);
-}
-
-// A little larger than exact, so that the float32 row test never loses a pixel.
-Bound<double> widened(Bound<double> b) {
-    const double more = 1.0001, pad = 1e-3;
-    b.hxx = b.hxx * more + pad;
-    b.hxy *= more;
-    b.hyy = b.hyy * more + pad;
-    if (b.r2 > 0) {
-        b.r2 = b.r2 * more + pad;
-        // A disc inside the ellipse says nothing new.
-        const double half = (b.hxx + b.hyy) / 2,
-                     spread = std::sqrt((b.hxx - b.hyy) * (b.hxx - b.hyy) / 4 + b.hxy * b.hxy);
-        if (half > spread && std::sqrt(half - spread) > std::sqrt(b.r2) + std::sqrt((b.dx - b.mx) * (b.dx - b.mx) +
-                                                                                    (b.dy - b.my) * (b.dy - b.my)))
-            b.r2 = -1;
-    }
-    return b;
-}
-
-template <class Record>
-void fill_bound(Record& r, const Bound<double>& b) {
-    const double tilt = b.hxy / b.hyy, ax = r.ax, ay = r.ay;
-    r.mx = (float)(b.mx - ax);
-    r.my = (float)(b.my - ay);
-    r.tilt = (float)tilt;
-    r.wide = (float)std::max(b.hxx - b.hxy * tilt, 0.0);
-    r.flat = (float)(1 / b.hyy);
-    r.disc_x = (float)(b.dx - ax);
-    r.disc_y = (float)(b.dy - ay);
-    r.disc_r2 = (float)b.r2;
-}
-template <class Record>
-void fill_look(Record& r, double opacity, const Shade& look, Vec<double> normal) {
-    r.opacity = (float)opacity;
-    for (int c = 0; c < 3; c++) r.color[c] = (float)std::max(look.rgb[c], 0.0);
-    r.normal[0] = (float)normal.x;
-    r.normal[1] = (float)normal.y;
-    r.normal[2] = (float)normal.z;
-}
-
-double whole(double x) { return std::floor(x); }
-
-bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool, SurfelRecord& r,
-                 Bound<double>& bound) {
-    const Posed<double> p = splat::pose(in, cam);
-    Surfel<double> s;
-    if (!splat::surfel_project(in, p, cam, whole, s)) return false;
-    bound = s.bound;
-    r.ax = (float)s.ax;
-    r.ay = (float)s.ay;
-    const Vec<double> m[3] = {s.a, s.b, s.c};
-    double* to[3] = {r.a, r.b, r.c};
-    for (int k = 0; k < 3; k++) {
-        to[k][0] = m[k].x;
-        to[k][1] = m[k].y;
-        to[k][2] = m[k].z;
-    }
-    r.det = (float)s.det;
-    r.z_low = (float)s.z_low;
-    r.z_high = (float)s.z_high;
-    fill_look(r, in.opacity, Shade{}, s.flip * p.axes.c2);
-    const splat::SignalRow<double> row = splat::surfel_signal(cam, s);
-    for (int k = 0; k < 6; k++) r.signal_x[k] = (float)row.x[k];
-    for (int k = 0; k < 3; k++) r.signal_y[k] = (float)row.y[k == 2 ? 4 : 2 * k + 1];
-    return true;
-}
-bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, bool antialias, GaussianRecord& r,
-                 Bound<double>& bound) {
-    const Posed<double> p = splat::pose(in, cam);
-    Gaussian<double> g;
-    if (!splat::gaussian_project(in, p, cam, antialias, g)) return false;
-    bound = g.bound;
-    const double limit = 1 << 22, ax = whole(std::clamp(g.x, -limit, limit)) + 0.5,
-                 ay = whole(std::clamp(g.y, -limit, limit)) + 0.5;
-    r.x = (float)(g.x - ax);
-    r.y = (float)(g.y - ay);
-    r.l00 = (float)g.l00;
-    r.l01 = (float)g.l01;
-    r.l11 = (float)g.l11;
-    r.z = (float)g.z;
-    r.slope_x = (float)g.slope_x;
-    r.slope_y = (float)g.slope_y;
-    r.z_low = (float)g.z_low;
-    r.z_high = (float)g.z_high;
-    r.ax = (float)ax;
-    r.ay = (float)ay;
-    fill_look(r, in.opacity * g.compensation, Shade{}, g.normal);
-    return true;
-}
-
-// What a camera sees, for leaving out early what lies well outside: in a large scene that is nearly everything.
-struct Outlook {
-    static constexpr double kMargin = 3;  // pixels; the low-pass filter of a surfel reaches 2.36
-    const CameraModel<double>& cam;
-    Vec<double> side[4];  // unit normals of the planes through the camera and the sides of the image, pointing away
-
-    explicit Outlook(const CameraModel<double>& camera) : cam(camera) {
-        const double left = -kMargin - cam.cx, right = cam.width + kMargin - cam.cx, top = -kMargin - cam.cy,
-                     bottom = cam.height + kMargin - cam.cy;
-        const Vec<double> away[4] = {{-cam.fx, 0, left}, {cam.fx, 0, -right}, {0, -cam.fy, top}, {0, cam.fy, -bottom}};
-        for (int k = 0; k < 4; k++) side[k] = (1 / std::sqrt(splat::dot(away[k], away[k]))) * away[k];
-    }
-
-    // Whether a splat with its centre at c in the camera frame surely touches no pixel.
-    bool misses(Kind kind, const SplatIn<double>& in, Vec<double> c) const {
-        if (!(c.z > cam.near)) return true;
-        const double reach =
-            std::max({in.scale[0], in.scale[1], in.scale[2]}) * std::sqrt(splat::kCutoffSquared) * 1.0001;
-        if (kind == kGaussian) return misses_blurred(reach, c);
-        for (const Vec<double>& away : side)
-            if (splat::dot(away, c) > reach) return true;
-        return false;
-    }
-
-  private:
-    // The footprint of a gaussian is affine in its covariance, at a slope that is held near the image.
-    bool misses_blurred(double reach, Vec<double> c) const {
-        const auto apart = [&](double slope, double f, double principal, int pixels) {
-            const double more = 0.15 * pixels / f,
-                         held = std::clamp(slope, -principal / f - more, (pixels - principal) / f + more);
-            const double half = f / c.z * reach * std::sqrt(1 + held * held) + 2 + kMargin, at = f * slope + principal;
-            return at + half < 0 || at - half > pixels;
-        };
-        return apart(c.x / c.z, cam.fx, cam.cx, cam.width) || apart(c.y / c.z, cam.fy, cam.cy, cam.height);
-    }
-};
-
-// Calls f(tile) for the tiles that a bound touches. Tile t holds the pixel centres 16 t + rim ... 16 t + 16 - rim with
-// a rim of 0.5; with none, what lies between them too.
-template <class F>
-void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double rim, F f) {
-    const auto first = [&](double low, int tiles) {
-        return (int)std::clamp(std::ceil((low + rim) / kTile - 1), 0.0, (double)tiles);
-    };
-    const auto end = [&](double high, int tiles) {
-        return (int)std::clamp(std::floor((high - rim) / kTile) + 1, 0.0, (double)tiles);
-    };
-    const splat::Outline<double> o = splat::outline(b);
-    const double disc = b.r2 > 0 ? std::sqrt(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
-    const int y0 = first(std::min(b.my - o.hy, dy - disc), tiles_y),
-              y1 = end(std::max(b.my + o.hy, dy + disc), tiles_y);
-    const int left = first(std::min(b.mx - o.hx, dx - disc), tiles_x),
-              right = end(std::max(b.mx + o.hx, dx + disc), tiles_x);
-    if (left >= right) return;
-    for (int y = y0; y < y1; y++) {
-        double low, high;
-        if (!splat::bound_span(b, o, y * kTile + rim, (y + 1) * kTile - rim, low, high)) continue;
-        const int x1 = end(high, tiles_x);
-        for (int x = first(low, tiles_x); x < x1; x++) f((uint32_t)(y * tiles_x + x));
-    }
-}
 
 // Stable order of `keys` (non-negative floats), as positions; least significant digit first.
 std::vector<uint32_t> order_of(const std::vector<float>& keys) {
@@ -259,17 +44,18 @@ void Pass::each_seen(int threads, F f) const {
     });
 }
 
-Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, bool antialias, double rim,
-           int threads, bool* seen, float* radii)
+Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& camera, const splat::GaussianForm& form,
+           double rim, int threads, bool* seen, float* radii)
     : kind_(kind),
       camera_(camera),
-      antialias_(antialias),
+      form_(form),
       rim_(rim),
       count_(splats.count),
       tiles_x_((camera.width + kTile - 1) / kTile),
       tiles_y_((camera.height + kTile - 1) / kTile) {
-    kind == kSurfel ? project<SurfelRecord>(splats, threads, seen, radii)
-                    : project<GaussianRecord>(splats, threads, seen, radii);
+    if (kind == kSurfel) project<SurfelRecord>(splats, threads, seen, radii);
+    if (kind == kGaussian) project<GaussianRecord>(splats, threads, seen, radii);
+    if (kind == kGaussianRay) project<RayRecord>(splats, threads, seen, radii);
     if (first_invalid < 0) bin(threads);
 }
 
@@ -302,7 +88,7 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             if (outlook.misses(kind_, in, centre)) continue;
             Record r;
             Bound<double> b;
-            if (!project_one(in, camera_, antialias_, r, b)) continue;
+            if (!project_one(in, camera_, form_, r, b)) continue;
             const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
             b = widened(b);
             fill_bound(r, b);
@@ -412,12 +198,19 @@ void Pass::forward(Level level, const Planes& out, int threads) {
 
 namespace {
 
-splat::SurfelSums<double> surfel_sums(const double* s) {
-    return {
-        {s[0], s[1], s[2]}, {s[3], s[4], s[5]}, {s[6], s[7], s[8]}, s[9], {s[10], s[11]}, {s[12], s[13], s[14]}, s[15]};
-}
-splat::GaussianSums<double> gaussian_sums(const double* s) {
-    return {s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], {s[8], s[9], s[10]}, s[11]};
+// Floats per row of sums by kind, without and with the chosen signal, and where in them colour and that signal are.
+struct Layout {
+    int width, width_chosen, color_at, chosen_at;
+};
+Layout layout(Kind kind) {
+    switch (kind) {
+        case kSurfel:
+            return {kSurfelSums, kSurfelSumsChosen, 16, 20};
+        case kGaussian:
+            return {kGaussianSums, kGaussianSumsChosen, 12, 16};
+        default:
+            return {kRaySums, kRaySumsChosen, 20, 24};
+    }
 }
 
 }  // namespace
@@ -435,9 +228,8 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         what = part.alpha || part.depth || part.median || part.normal || part.distortion ? kChosenAll : kChosenColor;
         if (absolute) what = kChosenAbsolute;
     }
-    const int width =
-        kind_ == kSurfel ? (chosen ? kSurfelSumsChosen : kSurfelSums) : (chosen ? kGaussianSumsChosen : kGaussianSums);
-    const int color_at = kind_ == kSurfel ? 16 : 12, chosen_at = kind_ == kSurfel ? 20 : 16;
+    const Layout at = layout(kind_);
+    const int width = chosen ? at.width_chosen : at.width, color_at = at.color_at, chosen_at = at.chosen_at;
     const Buffer<float> sums = buffer<float>(pairs_ * width);
     std::vector<uint8_t> touched(pairs(), 0);
     const Saved kept = saved();
@@ -449,7 +241,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
     });
     const int columns = scale_columns(kind_);
     each_seen(threads, [&](int64_t r) {
-        double s[kSurfelSumsChosen] = {};
+        double s[kRaySumsChosen] = {};
         bool hit = false;
         for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) {
             if (!touched[slot]) continue;
@@ -460,18 +252,8 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         if (!hit) return;
         const int64_t i = index_[r];
         const SplatIn<double> in = read_splat(splats, i, columns);
-        const Posed<double> p = splat::pose(in, camera_);
-        SplatGrad<double> g;
-        if (kind_ == kSurfel) {
-            Surfel<double> o;
-            splat::surfel_project(in, p, camera_, whole, o);
-            splat::surfel_backward(in, p, camera_, o, surfel_sums(s), g);
-        } else {
-            Gaussian<double> o;
-            splat::gaussian_project(in, p, camera_, antialias_, o);
-            splat::gaussian_backward(in, p, camera_, antialias_, o, gaussian_sums(s), g);
-        }
-        shade_backward(splats, i, shade(splats, i, in, camera_), s + color_at, g, out.sh + 3 * splats.coefficients * i);
+        SplatGrad<double> g = splat_backward(kind_, in, camera_, form_, s);
+        shade_backward(splats, i, shade(splats, i, in, camera_), s + color_at, g, out.sh);
         out.means[3 * i] = (float)g.mean.x;
         out.means[3 * i + 1] = (float)g.mean.y;
         out.means[3 * i + 2] = (float)g.mean.z;

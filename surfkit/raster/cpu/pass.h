@@ -7,7 +7,8 @@
 
 static inline double square_root(double x) { return std::sqrt(x); }
 static inline double natural_log(double x) { return std::log(x); }
-#include "../splat_math.h"
+static inline double round_down(double x) { return std::floor(x); }
+#include "../project.h"
 #include "../../native/buffer.h"
 #include "kernels.h"
 
@@ -28,8 +29,8 @@ class Pass {
   public:
     // Projects and bins. `seen` and `radii` are written for every splat. `rim`: 0.5 if pixel centres are to be drawn, 0
     // if anything between them.
-    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, bool antialias, double rim,
-         int threads, bool* seen, float* radii);
+    Pass(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, const splat::GaussianForm& form,
+         double rim, int threads, bool* seen, float* radii);
 
     void forward(Level level, const Planes& out, int threads);
     // `absolute`: the pixels' shares of the chosen signal are summed without their signs. `out` has `rows` rows: those
@@ -55,7 +56,7 @@ class Pass {
 
     Kind kind_;
     splat::CameraModel<double> camera_;
-    bool antialias_;
+    splat::GaussianForm form_;
     double rim_;
     int64_t count_;
     int tiles_x_, tiles_y_;

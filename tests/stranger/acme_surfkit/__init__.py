@@ -1,5 +1,6 @@
 """Parts of a package that surfkit knows nothing of: it imports `surfkit`, torch and numpy, and nothing else."""
 
+from acme_surfkit.balls import Balls
 from acme_surfkit.cards import Cards
 from acme_surfkit.charbonnier import Charbonnier
 from acme_surfkit.far import Far
@@ -10,7 +11,13 @@ from surfkit import Recipe, Row, Stage, Table, hookimpl
 @hookimpl
 def surfkit_components():
     """The parts, by the names that users type."""
-    return {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards}
+    return {"far": Far, "charbonnier": Charbonnier, "top-share": TopShare, "cards": Cards, "balls": Balls}
+
+
+@hookimpl
+def surfkit_recipes():
+    """Balls that stay near the cameras."""
+    return {"acme": Recipe("Balls near the cameras", primitive=Balls(), pretrain=Stage(steps=6, prune=(Far(),)))}
 
 
 @hookimpl
@@ -22,5 +29,6 @@ def surfkit_tables():
         Row("+ top share", {"pretrain.densify": TopShare()}),
         Row("+ far points dropped", {"pretrain.prune": (Far(),)}),
         Row("+ cards", {"mesh": Cards()}),
+        Row("recipe of Acme", recipe=surfkit_recipes()["acme"]),
     )
     return {"acme": Table("acme", "What each part of Acme brings.", Recipe(pretrain=Stage(steps=6)), rows)}

@@ -1,0 +1,64 @@
+"""The optimisation of the fields, from where an interrupted one has stopped."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from surfkit import Fault, MethodInput, StageBegan, StepDone, emit, graceful
+from surfkit.core.memory import peak_memory_bytes
+from surfkit_neus.batches import Batches
+from surfkit_neus.box import SceneBox
+from surfkit_neus.render import draw_rays
+from surfkit_neus.state import State
+
+if TYPE_CHECKING:
+    from surfkit_neus.method import NeuralSurface
+
+CHECKPOINT = "state.safetensors"
+
+
+def train(method: NeuralSurface, given: MethodInput, box: SceneBox) -> State:
+    """The fields after the last step; no step is made where the folder has them.
+
+    Raises:
+        BadInput: The checkpoint in the folder cannot be used, or a photograph.
+        Fault: The losses are NaN or Inf.
+        KeyboardInterrupt: The run was asked to stop; the state is saved.
+    """
+    path = given.folder / CHECKPOINT
+    state = method.begin(box, given.seed, given.device)
+    if path.exists():
+        state.read(path)
+    if state.index >= method.steps:
+        return state
+    batches = Batches(given, box, method.rays, method.photos)
+    emit(StageBegan("field", method.steps, 0, first=state.index + 1))
+    with graceful() as request:
+        while state.index < method.steps:
+            losses = make_step(method, state, batches)
+            last = state.index == method.steps or request.asked
+            if last or (given.checkpoint_every and state.index % given.checkpoint_every == 0):
+                state.write(path)
+            emit(StepDone(state.index, method.steps, losses, 0, peak_memory_bytes()))
+            if request.asked:
+                raise KeyboardInterrupt
+    return state
+
+
+def make_step(method: NeuralSurface, state: State, batches: Batches) -> dict[str, float]:
+    """Make one optimisation step, and return its weighted losses."""
+    index = state.index + 1
+    draw = batches.draw(index)
+    batch = batches(draw)
+    drawn = draw_rays(state.field, state.background, batch.rays, method.samples, method.look(index), draw)
+    losses = method.losses(state.field, drawn, batch, index)
+    told = {name: float(value.detach()) for name, value in losses.items()}
+    if not math.isfinite(sum(told.values())):
+        raise Fault(
+            f"step {index}: the losses are NaN or Inf ({told}); the last checkpoint is kept. Lower method.rate and "
+            "method.grid-rate, and train in a new folder"
+        )
+    sum(losses.values()).backward()
+    state.descend(method.rates(index, list(state.moments)), method.decay)
+    return told

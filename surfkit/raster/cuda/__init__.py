@@ -1,0 +1,1 @@
+"""CUDA kernels of this folder, and how they are called."""

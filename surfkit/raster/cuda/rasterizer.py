@@ -1,0 +1,292 @@
+"""The CUDA rasterizer: the kernels of this folder behind the contract of `raster.api`.
+
+Per view: `measure` finds which tiles each splat touches, `record` writes what blending needs of those that are seen, in
+the order of their depths, a stable sort by tile makes the lists, `forward` blends, `backward` and `gather` go back.
+Sums are taken in a fixed order, so that the same splats give the same bits each time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from surfkit.core.check import BadInput
+from surfkit.cuda.modules import Kernels
+from surfkit.cuda.source import Source
+from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.validate import validate
+from surfkit.scene.camera import Camera
+
+HERE = Path(__file__).parent
+TILE, WARPS = 16, 8
+SURFEL, GAUSSIAN, RAY = 0, 1, 2
+RECORD_BYTES = {SURFEL: 192, GAUSSIAN: 128, RAY: 192}
+SUMS = {SURFEL: 20, GAUSSIAN: 16, RAY: 24}
+"""Sums over the pixels that each splat gets on the way back; with chosen losses 4 more, of which 2 are used."""
+COLOR, GEOMETRY, DISTORTION = 0, 1, 2
+NOTHING, CHOSEN_COLOR, CHOSEN_ALL, CHOSEN_ABSOLUTE = 0, 1, 2, 3
+UPLOADED = WeakTensorKeyDictionary()
+"""Of a tensor on the CPU: a device, the version that was copied there, and the copy."""
+NEVER = torch.iinfo(torch.int64).max
+
+
+class View(ctypes.Structure):
+    """`View` of view.h."""
+
+    _fields_ = (
+        ("pose", ctypes.c_double * 15),  # rotation by columns, translation, and the camera's position
+        ("lens", ctypes.c_double * 5),  # fx, fy, cx, cy, near
+        ("size", ctypes.c_int * 2),
+        ("dilation", ctypes.c_double),
+        ("is_compensated", ctypes.c_bool),
+        ("geometry", ctypes.c_int),
+        ("rim", ctypes.c_double),
+        ("tiles", ctypes.c_int * 2),
+    )
+
+
+def _view(splats: Splats, camera: Camera, near: float, rim: float) -> View:
+    pose = camera.world_to_camera.double().cpu()
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    numbers = [*turn.T.flatten().tolist(), *shift.tolist(), *(-turn.T @ shift).tolist()]
+    width, height = camera.width, camera.height
+    return View(
+        (ctypes.c_double * 15)(*numbers),
+        (ctypes.c_double * 5)(camera.fx, camera.fy, camera.cx, camera.cy, near),
+        (ctypes.c_int * 2)(width, height),
+        splats.dilation,
+        splats.antialias,
+        GEOMETRIES.index(splats.geometry),
+        rim,
+        (ctypes.c_int * 2)(-(-width // TILE), -(-height // TILE)),
+    )
+
+
+def blocks(count: int) -> int:
+    """Blocks of 128 threads for so many."""
+    return -(-count // 128)
+
+
+class Pass:
+    """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn.
+
+    Attributes:
+        arrays: The five tensors of the splats.
+        seen, radii: As in `Render`.
+        index: (M,) int64, the splat of each record: those seen, by depth.
+        first: (M + 1,) int64, the first slot of each record; a slot is a pair of a splat and a tile.
+        entries: (slots, 2) int32, record and slot, by tile and depth; those of tile t are offsets[t] to offsets[t + 1].
+    """
+
+    def __init__(
+        self,
+        program: Callable[..., Kernels],
+        device: torch.device,
+        splats: Splats,
+        camera: Camera,
+        near: float,
+        rim: float,
+    ) -> None:
+        validate(splats, values=False)
+        self.kind = SURFEL if splats.kind == "surfel" else RAY if splats.geometry == "ray" else GAUSSIAN
+        self.program = lambda name, **defines: program(name, KIND=self.kind, **defines)
+        self.device, self.home, self.view = device, splats.means.device, _view(splats, camera, near, rim)
+        self.arrays = [_upload(t, device) for t in splats.tensors().values()]
+        count, shape = len(splats), self.arrays[0].new_empty(0)
+        tiles, self.radii = shape.new_empty(count, dtype=torch.int32), shape.new_empty(count)
+        depth, invalid = shape.new_empty(count), shape.new_full((1,), NEVER, dtype=torch.int64)
+        self.coefficients = self.arrays[4].shape[1]
+        project = self.program("project", LEVEL=COLOR, CHOSEN=NOTHING, COEFFICIENTS=self.coefficients)
+        project.launch("measure", blocks(count), 128, *self.arrays[:4], self.view, tiles, depth, self.radii, invalid)
+        self.seen = tiles > 0
+        seen, slots, wrong = torch.stack([self.seen.sum(), tiles.sum(), invalid[0]]).tolist()  # waits for the device
+        if wrong != NEVER:
+            validate(splats)
+            raise BadInput(f"splats: row {wrong} is out of the range of float32")
+        if slots >= 2**31:
+            raise BadInput(
+                f"{slots:,} pairs of a splat and a tile in one view, at most 2^31 can be drawn; lower the "
+                "number of splats or the size of the photographs"
+            )
+        self.index = self.seen.nonzero()[:, 0]
+        self.index = self.index[depth[self.index].argsort(stable=True)]
+        self.first = torch.zeros(seen + 1, dtype=torch.int64, device=device)
+        torch.cumsum(tiles[self.index], 0, out=self.first[1:])
+        self.records = shape.new_empty(seen * RECORD_BYTES[self.kind], dtype=torch.uint8)
+        tile_of, record_of = shape.new_empty(2, slots, dtype=torch.int32).unbind()
+        given = *self.arrays, self.view, self.index, self.first
+        project.launch("record", blocks(seen), 128, *given, self.records, tile_of, record_of)
+        tile_of, slot = tile_of.sort(stable=True)
+        self.entries = torch.stack([record_of[slot], slot.int()], 1)
+        self.tiles = self.view.tiles[0] * self.view.tiles[1]
+        self.offsets = torch.searchsorted(tile_of, torch.arange(self.tiles + 1, device=device, dtype=torch.int32))
+
+    @property
+    def lists(self) -> tuple[object, ...]:
+        """What kernels that go through the tiles' lists take first."""
+        return self.view, self.records, self.entries, self.offsets
+
+    def words(self) -> int:
+        """Words of 32 bits that `forward` notes in which splats are blended where."""
+        return (len(self.entries) // 32 + self.tiles + 1) * WARPS
+
+
+class CudaRender(Render):
+    """A view drawn by the CUDA kernels, when its maps are first asked for; keeps what the backward needs."""
+
+    def __init__(self, drawn: Pass, made: tuple[str, ...]) -> None:
+        self._pass, self._made = drawn, made
+        self._level = {2: COLOR, 5: GEOMETRY, 6: DISTORTION}[len(made)]
+        self._size = drawn.view.size[1], drawn.view.size[0]
+        self.seen, self.radii = drawn.seen.to(drawn.home), drawn.radii.to(drawn.home)
+
+    @cached_property
+    def maps(self) -> Maps:
+        """See `Render`."""
+        return Maps(**{name: value.to(self._pass.home) for name, value in self._drawn.items()})
+
+    @cached_property
+    def _drawn(self) -> dict[str, Tensor]:
+        """The maps by name, where they were drawn."""
+        one, shapes = self._pass.arrays[0], {"color": (3, *self._size), "normal": (3, *self._size)}
+        maps = {name: one.new_empty(shapes.get(name, self._size)) for name in self._made}
+        none = one.new_empty(0)
+
+        def plane(level: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return one.new_empty(self._size if self._level >= level else 0, dtype=dtype)
+
+        self._saved = (
+            plane(COLOR),
+            plane(COLOR, torch.int32),
+            plane(GEOMETRY, torch.int32),
+            *(plane(DISTORTION) for _ in range(3)),
+            one.new_zeros(self._pass.words(), dtype=torch.int32),
+        )
+        outputs = (maps.get(name, none) for name in MAPS)
+        forward = self._pass.program("forward", LEVEL=self._level, CHOSEN=NOTHING)
+        forward.launch("forward", self._pass.tiles, TILE * TILE, *self._pass.lists, *outputs, *self._saved)
+        return maps
+
+    def backward(
+        self, total: Maps, chosen: Maps | None = None, absolute: bool = False, rows: int | None = None
+    ) -> Gradients:
+        drawn, arrays = self._pass, self._pass.arrays
+        rows = len(arrays[0]) if rows is None else rows
+        cotangents = [*self._cotangents(total), *self._cotangents(chosen or Maps())]
+        level, what = self._levels(total, chosen, absolute)
+        width = SUMS[drawn.kind] + 4 * (chosen is not None)
+        slots = len(drawn.entries)
+        sums, touched = arrays[0].new_empty(slots, width), arrays[0].new_zeros(slots, dtype=torch.uint8)
+        backward = drawn.program("backward", LEVEL=level, CHOSEN=what, WIDTH=width)
+        given = *drawn.lists, drawn.index, rows, *cotangents, *self._saved
+        backward.launch("backward", drawn.tiles, TILE * TILE, *given, sums, touched)
+        grads = [torch.zeros_like(each[:rows]) for each in arrays]
+        signal = arrays[0].new_zeros(rows, 2)
+        part = arrays[0].new_zeros(rows if chosen is not None else 0, 2)
+        program = {"CHOSEN": int(chosen is not None), "WIDTH": width, "COEFFICIENTS": drawn.coefficients}
+        gather = drawn.program("gather", LEVEL=COLOR, **program)
+        given = *arrays, drawn.view, drawn.index, drawn.first, sums, touched, rows
+        gather.launch("gather", blocks(len(drawn.index)), 128, *given, *grads, signal, part)
+        home = drawn.home
+        return Gradients(*(g.to(home) for g in grads), signal.to(home), None if chosen is None else part.to(home))
+
+    def _levels(self, total: Maps, chosen: Maps | None, absolute: bool) -> tuple[int, int]:
+        """Only what has a cotangent costs time."""
+        part = (chosen or Maps()).present()
+        names, level = {*total.present(), *part}, COLOR
+        if names & {"depth", "median", "normal"}:
+            level = GEOMETRY
+        if "distortion" in names:
+            level = DISTORTION
+        if chosen is None:
+            return level, NOTHING
+        what = CHOSEN_ALL if {*part} - {"color"} else CHOSEN_COLOR
+        return level, CHOSEN_ABSOLUTE if absolute else what
+
+    def _cotangents(self, maps: Maps) -> list[Tensor]:
+        given, drawn = maps.present(), self._drawn
+        for name, value in given.items():
+            made = drawn.get(name)
+            if made is None or made.shape != value.shape:
+                raise BadInput(f"cotangent of {name}: shape {tuple(value.shape)} does not fit the maps rendered")
+        none = self._pass.arrays[0].new_empty(0)
+        return [given[name].to(none).contiguous() if name in given else none for name in MAPS]
+
+
+class TileRasterizer(Rasterizer):
+    """What draws with the kernels of this folder; a subclass says on which device, and how they are compiled."""
+
+    def program(self, name: str, **defines: int) -> Kernels:
+        """The kernels of NAME.cu for these defines, compiled once; `source` has what to compile."""
+        raise NotImplementedError  # not abstract: an abstract class would be a kind of component (`kind_of`)
+
+    def title(self) -> str:
+        """See `Rasterizer.title`."""
+        return f"{self.where()}"
+
+    def render(
+        self, splats: Splats, camera: Camera, near: float, geometry: bool = True, distortion: bool = True
+    ) -> Render:
+        return CudaRender(self._pass(splats, camera, near), MAPS[: 2 + 3 * geometry + (geometry and distortion)])
+
+    def contribution(
+        self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
+    ) -> tuple[Tensor, Tensor]:
+        drawn = self._pass(_grey(splats), camera, near)
+        one, slots = drawn.arrays[0], len(drawn.entries)
+        sums, counts = one.new_zeros(slots), one.new_zeros(slots, dtype=torch.int32)
+        total, count = one.new_zeros(len(splats)), one.new_zeros(len(splats), dtype=torch.int64)
+        program = drawn.program("contribution", LEVEL=COLOR, CHOSEN=NOTHING)
+        given = *drawn.lists, float(alpha_power), float(transmittance_power)
+        program.launch("contribution", drawn.tiles, TILE * TILE, *given, sums, counts)
+        program.launch("total", blocks(len(drawn.index)), 128, drawn.index, drawn.first, sums, counts, total, count)
+        return total.to(drawn.home), count.to(drawn.home)
+
+    def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+        drawn = self._pass(_grey(splats), camera, near, rim=0.0)
+        at = camera.project(points.to(drawn.device)).contiguous()
+        x, y, z = at.unbind(1)
+        inside = (z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+        order = inside.nonzero()[:, 0]
+        tile = (y[order].long() // TILE) * drawn.view.tiles[0] + x[order].long() // TILE
+        order = order[tile.argsort(stable=True)]  # threads of a warp read the same list
+        opacity = drawn.arrays[0].new_full((len(points),), torch.nan)
+        program = drawn.program("contribution", LEVEL=GEOMETRY, CHOSEN=NOTHING)
+        program.launch("probe", blocks(len(order)), 128, *drawn.lists, at, order, opacity)
+        return opacity.to(points.device)
+
+    def _pass(self, splats: Splats, camera: Camera, near: float, rim: float = 0.5) -> Pass:
+        return Pass(self.program, self.where(), splats, camera, near, rim)
+
+
+def _upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """float32 values on a device. Those of the CPU are kept there for as long as they are here, unchanged: many views
+    are drawn of the same splats."""
+    if tensor.device == device:
+        return tensor.detach().to(torch.float32).contiguous()
+    known = UPLOADED.get(tensor)
+    if known is None or known[:2] != (device, tensor._version):
+        there = tensor.detach().to(device, torch.float32).contiguous()
+        UPLOADED[tensor] = known = device, tensor._version, there
+    return known[2]
+
+
+def _grey(splats: Splats) -> Splats:
+    """The same without colours, which cost a third of the projection."""
+    return replace(splats, sh=splats.sh.new_zeros(len(splats), 1, 3))
+
+
+def source(name: str, **defines: int) -> Source:
+    """The source of NAME.cu for one kind of splats."""
+    record = type(
+        "SplatRecord", (ctypes.Structure,), {"_fields_": (("raw", ctypes.c_ubyte * RECORD_BYTES[defines["KIND"]]),)}
+    )
+    entry = type("Entry", (ctypes.Structure,), {"_fields_": (("record", ctypes.c_int), ("slot", ctypes.c_int))})
+    return Source(HERE / f"{name}.cu", defines, {"SplatRecord": record, "Entry": entry, "View": View})

@@ -1,0 +1,83 @@
+"""Ellipsoids evaluated in space, along rays (Yu et al. 2024, GOF), instead of by footprints on the image plane."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from surfkit import native
+from surfkit.core.check import BadInput
+from surfkit.raster.api import ALPHA_MAX, ALPHA_MIN, CUTOFF, Splats
+from surfkit.raster.footprints import rotations
+from surfkit.raster.validate import validate
+from surfkit.scene.camera import Camera
+
+PIECE = 1 << 22
+"""Pairs of a point and a splat that the reference evaluates at once."""
+
+
+def ray_opacity(splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+    """What ellipsoids hide of points from a camera: the opacity field of one view (GOF, section 4.2).
+
+    That is 1 - product of (1 - alpha), where alpha is the opacity times the largest density on the ray between `near`
+    and the point: one that the point lies in hides it in part. Compiled, on `torch.get_num_threads()` threads, with the
+    same bits on any number of them.
+
+    Args:
+        splats: N ellipsoids; as where rays are drawn (`Splats.geometry`), those do not count whose centre has z <= near
+            or whose contour at CUTOFF reaches the camera plane.
+        camera: World is the splats' frame.
+        near: Local units.
+        points: (P, 3) world.
+
+    Returns:
+        (P,) in [0, 1]; NaN where the point is outside the image or not beyond `near`.
+
+    Raises:
+        BadInput: The splats are not ellipsoids, or a value is not finite.
+    """
+    validate(splats)
+    if splats.scales.shape[1] != 3:
+        raise BadInput(f"rays meet ellipsoids, which have three scales; {splats.kind} splats have two")
+    if native.module() is None:
+        return ray_opacity_reference(splats, camera, near, points)
+    arrays = (splats.means, splats.quats, splats.scales, splats.opacities)
+    opacity = torch.empty(len(points), dtype=torch.float32)
+    native.module().ray_opacity(
+        [value.detach().to("cpu", torch.float32).contiguous() for value in arrays],
+        camera.world_to_camera.double().flatten().tolist(),
+        [camera.fx, camera.fy, camera.cx, camera.cy],
+        camera.width,
+        camera.height,
+        near,
+        camera.project(points.cpu()).contiguous(),
+        opacity,
+        torch.get_num_threads(),
+    )
+    return opacity.to(points.device)
+
+
+def ray_opacity_reference(splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
+    """The same in plain torch, in the precision of the splats, every pair of a point and a splat."""
+    to_camera = camera.world_to_camera.to(splats.means)
+    centre = splats.means @ to_camera[:3, :3].T + to_camera[:3, 3]
+    axes = to_camera[:3, :3] @ rotations(splats.quats)
+    units = axes.transpose(1, 2) / splats.scales[:, :, None]
+    origin = -torch.einsum("nij,nj->ni", units, centre)
+    x, y, z = camera.project(points).to(splats.means).unbind(1)
+    found = torch.full_like(z, torch.nan)
+    inside = ((z > near) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)).nonzero()[:, 0]
+    deep = (axes[:, 2] * splats.scales).square().sum(1) * CUTOFF**2
+    there = (centre[:, 2] > near) & (deep < centre[:, 2] ** 2)
+    for rows in inside.split(max(1, PIECE // max(1, len(splats)))):
+        ray = torch.stack(
+            [(x[rows] - camera.cx) / camera.fx, (y[rows] - camera.cy) / camera.fy, torch.ones_like(z[rows])], 1
+        )
+        direction = torch.einsum("nij,pj->pni", units, ray)
+        a, b = direction.square().sum(2), 2 * (direction * origin).sum(2)
+        c = origin.square().sum(1)
+        t = torch.minimum(-b / (2 * a), z[rows][:, None]).clamp_min(near)
+        alpha = splats.opacities * torch.exp(-(a * t**2 + b * t + c) / 2)
+        alpha = torch.where((alpha >= ALPHA_MIN) & there, alpha.clamp_max(ALPHA_MAX), 0.0)
+        found[rows] = 1 - (1 - alpha).prod(1)
+    return found

@@ -1,0 +1,100 @@
+"""The columns of an ablation table: what is measured of a run, and how its numbers are written."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from surfkit.core.check import BadInput
+from surfkit.core.registry import unknown
+
+THOUSANDS = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+"""Factors of units, from the largest."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One measurement.
+
+    Attributes:
+        head: Its name for people.
+        digits: After the point.
+        better: Whether a higher or a lower number is the better one.
+        factor: From the stored number to the one that is written.
+        unit: Of the number; "B" and "" of `scaled` ones get a prefix.
+        scaled: Write large numbers as thousands, millions or billions.
+        in_percent: Write differences as a share of the number that they are to.
+        by_default: Show it without being asked where it was measured.
+    """
+
+    head: str
+    digits: int
+    better: Literal["higher", "lower"]
+    factor: float = 1.0
+    unit: str = ""
+    scaled: bool = False
+    in_percent: bool = False
+    by_default: bool = True
+
+    def text(self, value: float, spread: float | None = None) -> str:
+        """A number with its standard deviation, such as "23.50 ± 0.71" or "9.54 M"."""
+        factor, unit, digits = self._scale(value)
+        tail = "" if spread is None else f" ± {spread * factor:,.{digits}f}"
+        return f"{value * factor:,.{digits}f}{tail}{unit and ' ' + unit}"
+
+    def difference(self, value: float, base: float, error: float | None = None) -> str:
+        """A difference with its standard error; in percent of `base` where that is how the column is compared."""
+        if self.in_percent and base == 0:
+            return ""
+        factor, digits, unit = (100 / abs(base), 1, " %") if self.in_percent else (self.factor, self.digits, "")
+        tail = "" if error is None else f" ± {error * factor:.{digits}f}"
+        return f"{value * factor:+.{digits}f}{tail}{unit}"
+
+    def _scale(self, value: float) -> tuple[float, str, int]:
+        """Factor, unit and digits to write a number with."""
+        if not self.scaled:
+            return self.factor, self.unit, self.digits
+        for size, prefix in THOUSANDS:
+            if value >= size and (prefix != "k" or self.unit):  # a count below a million is written in full
+                return 1 / size, prefix + self.unit, self.digits
+        return 1.0, self.unit, 0
+
+
+COLUMNS = {
+    "ssim": Column("SSIM", 3, "higher"),
+    "psnr": Column("PSNR", 2, "higher"),
+    "lpips": Column("LPIPS", 3, "lower", by_default=False),
+    "precision": Column("P", 3, "higher"),
+    "recall": Column("R", 3, "higher"),
+    "f1": Column("F1", 3, "higher"),
+    "points": Column("points", 2, "lower", scaled=True, in_percent=True),
+    "seconds": Column("minutes", 1, "lower", factor=1 / 60, in_percent=True),
+    "cpu_seconds": Column("CPU min", 1, "lower", factor=1 / 60, in_percent=True),
+    "bytes": Column("size", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "peak_memory_bytes": Column("memory", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "fps": Column("FPS", 1, "higher", in_percent=True),
+}
+"""Every column by its name in ablation.json and on the command line, in the order of the paper's tables."""
+
+
+def refuse_unknown_columns(names: Sequence[str]) -> None:
+    """BadInput for a name that no column has, or that stands twice."""
+    for at, name in enumerate(names):
+        if name not in COLUMNS:
+            raise BadInput(f"--columns: {unknown('column', name, COLUMNS)}")
+        if name in names[:at]:
+            raise BadInput(f"--columns: {name} is there twice; name each column once")
+
+
+def shown_columns(asked: Sequence[str], measured: Collection[str]) -> list[str]:
+    """Names of the columns of a table: those that the user asked for, or else those that were measured.
+
+    Args:
+        asked: By the user; none for the default.
+        measured: Names of the numbers that at least one row has.
+    """
+    if asked:
+        return list(asked)
+    found = [name for name, column in COLUMNS.items() if column.by_default and name in measured]
+    return found or ["ssim", "psnr", "points"]

@@ -1,0 +1,29 @@
+"""Which maps the terms of a stage look at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from surfkit.losses.base import Loss, Regularizer
+
+
+def maps_read(
+    losses: Mapping[str, Loss], regularizers: Mapping[str, Regularizer], indices: Iterable[int], steps: int
+) -> dict[str, str]:
+    """By the name of a map that is read in one of some steps, the path of a term that reads it.
+
+    Args:
+        losses: By key.
+        regularizers: By key.
+        indices: Steps, 1 to `steps`.
+        steps: Of the stage.
+    """
+    found = {}
+    for index in indices:
+        for group, terms in {"losses": losses, "regularizers": regularizers}.items():
+            for name, term in terms.items():
+                if term.weight_at(index, steps) > 0:
+                    # the neighbour of a pair is chosen by the median depth
+                    paired = isinstance(term, Loss) and term.needs_neighbour
+                    found |= dict.fromkeys((*term.reads, *["median"] * paired), f"{group}.{name}")
+    return found

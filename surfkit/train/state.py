@@ -1,0 +1,65 @@
+"""What a stage changes step by step, and where it lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from surfkit.primitives.points import Columns, Points
+from surfkit.readers.depth_prior import DepthPrior
+from surfkit.train.views import Order
+
+Known = TypeVar("Known", Tensor, DepthPrior)
+
+
+@dataclass
+class StageState:
+    """What an interrupted stage needs to go on as if nothing had happened."""
+
+    points: Points
+    order: Order
+    generator: torch.Generator
+    index: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Wall time of the steps done."""
+    cpu_seconds: float = 0.0
+    """CPU time of the steps done, all threads, seconds."""
+    peak_memory_bytes: int = 0
+    """Most memory held so far; 0 where the system does not tell."""
+    looks: Columns = field(default_factory=dict)
+    """What is known of the look of each photograph (`train.look`)."""
+    reset_at: int = 0
+    """Step that last lowered the opacities; 0 if none has."""
+    sh_degree: int = 0
+    """Of the spherical harmonics so far. It never falls, also when the schedule becomes a longer one."""
+    halvings: int = 0
+    """How often the learning rates have been halved, after numbers that were not finite."""
+    skipped: list[int] = field(default_factory=list)
+    """Positions of photographs that turned out damaged, and are not shown any more."""
+    frozen: Columns = field(default_factory=dict)
+    """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
+
+    def move(self, device: torch.device) -> None:
+        """Put what is optimised, and what is drawn with it, on a device; counts stay where the host reads them."""
+        self.points = self.points.to(device)
+        self.frozen = {name: value.to(device) for name, value in self.frozen.items()}
+        self.looks = {n: v.to(device) if v.is_floating_point() else v for n, v in self.looks.items()}
+
+    @property
+    def seed(self) -> int:
+        """Of what is drawn in the coming step beside the generator, in [0, 2^63)."""
+        return (self.generator.initial_seed() * 1_000_003 + self.index + 1) % 2**63
+
+
+def uploaded(known: Known, device: torch.device) -> Known:
+    """A photograph, mask or depth prior on a device; to a GPU it travels while the host goes on."""
+    if isinstance(known, DepthPrior):
+        there = {name: uploaded(v, device) for name, v in vars(known).items() if isinstance(v, Tensor)}
+        return replace(known, **there)
+    if device == known.device:
+        return known
+    return (known.pin_memory() if torch.cuda.is_available() else known).to(device, non_blocking=True)

@@ -1,0 +1,46 @@
+"""Sources of kernels for the tests: the small ones here, and every one of surfkit with its limits."""
+
+import ctypes
+from pathlib import Path
+
+from surfkit.cuda.source import Source
+from surfkit.raster.cuda import rasterizer, ssim
+from surfkit.train import adam
+
+KERNELS = Path(__file__).parent / "kernels"
+
+
+class Affine(ctypes.Structure):
+    _fields_ = (("scale", ctypes.c_float * 2), ("shift", ctypes.c_int))
+
+
+BASIC = Source(KERNELS / "basic.cu", structures={"Affine": Affine})
+
+
+def changed(source: Source, old: str, new: str, skip: int = 0) -> Source:
+    """A source with one mistake: `new` in place of the occurrence of `old` after the first `skip`."""
+    parts = source.text.split(old)
+    assert len(parts) > skip + 1, f"{source.path.name} has no {old}"
+    other = Source(source.path, source.defines, source.structures)
+    other.__dict__["text"] = old.join(parts[: skip + 1]) + new + old.join(parts[skip + 1 :])
+    return other
+
+
+def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
+    """Kernels of the rasterizer as most training steps use them: all maps, and a signal of the colours alone."""
+    on_the_way_back = name in ("backward", "gather")
+    width = {"WIDTH": rasterizer.SUMS[kind] + 4} if on_the_way_back else {}
+    width |= {"COEFFICIENTS": 16} if name in ("project", "gather") else {}
+    return rasterizer.source(name, KIND=kind, LEVEL=rasterizer.DISTORTION, CHOSEN=int(on_the_way_back), **width)
+
+
+SHIPPED: tuple[tuple[Source, dict[str, tuple[int, int]]], ...] = (
+    (adam.SOURCE, {"adam": (40, 0)}),
+    (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
+    (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
+    (raster("forward"), {"forward": (85, 18_000)}),
+    (raster("backward"), {"backward": (128, 31_000)}),
+    (raster("gather"), {"gather": (168, 0)}),
+    (raster("contribution"), {"contribution": (80, 7_000), "total": (56, 0), "probe": (56, 0)}),
+)
+"""Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have."""

@@ -1,0 +1,36 @@
+"""The kernel of Adam against the update on the CPU."""
+
+import pytest
+import torch
+
+from surfkit.primitives.points import Points
+from surfkit.train import adam
+from surfkit.train.adam import SOURCE, adam_step, launch_update, update
+
+
+@pytest.mark.parametrize("shape", [(1,), (1023, 1), (1024,), (1025,), (700, 3), (65, 16, 3), (0, 3)])
+def test_agrees_with_the_cpu(load, shape):
+    on = load(SOURCE)
+    draw = torch.Generator().manual_seed(len(shape))
+    value = torch.randn(shape, generator=draw)
+    theirs = [value.clone(), torch.zeros(shape), torch.zeros(shape)]
+    ours = [tensor.clone().to(on.device) for tensor in theirs]
+    for index in range(1, 6):
+        grad = torch.randn(shape, generator=draw) * 10.0 ** torch.randint(-8, 3, shape, generator=draw)
+        launch_update(on, ours[0], grad.to(on.device), *ours[1:], 0.01, index)
+        update(theirs[0], grad, *theirs[1:], 0.01, index)
+    for our, their in zip(ours, theirs, strict=True):
+        assert torch.allclose(our.cpu(), their, rtol=1e-5, atol=1e-7)
+    if value.numel():
+        assert not torch.equal(ours[0].cpu(), value)
+
+
+def test_columns_without_gradient_stay(monkeypatch):
+    """`adam_step` takes the kernel for tensors of a GPU: here for all."""
+    launched = []
+    monkeypatch.setattr(adam, "_is_gpu", lambda tensor: launched.append(tensor) is None)
+    params = {"means": torch.rand(5, 3), "opacities": torch.rand(5)}
+    points = Points.fresh({name: value.clone() for name, value in params.items()})
+    adam_step(points, {"means": torch.ones(5, 3)}, {"means": 0.1}, 1)
+    assert launched and torch.allclose(points.params["means"], params["means"] - 0.1)
+    assert torch.equal(points.params["opacities"], params["opacities"])

@@ -1,0 +1,60 @@
+"""Every row of every table that comes with surfkit trains two steps, and is measured."""
+
+import pytest
+import torch
+
+from surfkit.readers.data import Data
+from surfkit.recipes.ablations import TABLES
+from surfkit.report.study import Plan, ablate
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+
+pytestmark = pytest.mark.usefixtures("small_pictures")
+
+
+class Silent:
+    def begin(self, *_):
+        pass
+
+    def end(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    """A data set with tracks, for which depth maps can be made."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("data") / "farm"
+    write_colmap(folder, photograph(Flight(kind="grid", views=9, width=48, height=36, points=300)), tracks=True)
+    return Data(folder)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    """One folder for all tables, as they have rows in common."""
+    return tmp_path_factory.mktemp("tables")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SURFKIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_row_trains(farm, out, name):
+    report = ablate(Plan(TABLES[name], (farm,), out, steps=2, device="cpu"), Silent())
+    (found,) = report["data_sets"]
+    for row in found["rows"]:
+        assert row["failed"] is None, row
+        known = {"seconds", "cpu_seconds", "peak_memory_bytes"}
+        if not row["label"].startswith("stereo alone"):
+            known |= {"psnr", "ssim", "points", "bytes", "fps"}
+        assert row["mean"].keys() == known, row["label"]
+    if name == "model":
+        rows = {row["label"]: row["mean"] for row in found["rows"]}
+        assert rows["+ VQ (Ours-s)"]["bytes"] < 0.6 * rows["+ SH degree 2"]["bytes"], "that of the compressed file"
+        assert rows["+ SH degree 2"]["bytes"] < rows["+ trim (Ours-b)"]["bytes"]
+        assert rows["+ prune (LightGaussian)"]["points"] < rows["+ parallel tuning"]["points"]
+        folders = [run["folder"] for row in found["rows"] for run in row["runs"]]
+        assert len(set(folders)) == len(folders) == 13
