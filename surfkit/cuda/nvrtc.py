@@ -115,7 +115,8 @@ def nvrtc() -> Nvrtc:
 def image(source: Source, architecture: str, driver_version: int = 0) -> bytes:
     """What `Nvrtc.compile` gives, from the user's cache if it was compiled before."""
     compiler = nvrtc()
-    key = (source.text, _options(source), compiler.version, architecture, architecture.startswith("compute") and driver_version)
+    made_by = compiler.version, architecture, architecture.startswith("compute") and driver_version
+    key = (source.text, _options(source), *made_by)
     name = f"{source.path.stem}-{architecture}-{sha256(repr(key).encode()).hexdigest()[:24]}"
     path = cache_root() / "cuda" / name
     if path.exists():

@@ -1,9 +1,9 @@
 """The search of the nearest code, and the sums of k-means, on a GPU: the bits of the CPU.
 
-Every vector is compared with every code in float32, through shared memory: 400,000 vectors of 45 numbers and 8,192 codes
-are 3e11 operations, some 10 ms. `torch.mm` and `argmin` would take as long and hold or write 13 GB of distances, and their
-rounding errors grow with the distance from the origin. Those of differences are a share of the distance; only where
-another code is within them, a warp takes the distances to all codes in float64.
+Every vector is compared with every code in float32, through shared memory: 400,000 vectors of 45 numbers and 8,192
+codes are 3e11 operations, some 10 ms. `torch.mm` and `argmin` would take half the operations, but write and read
+13 GB of products, whose rounding errors also grow with the distance from the origin. Those of differences are a
+share of the distance; only where another code is within them, a warp takes the distances to all codes in float64.
 """
 
 from __future__ import annotations

@@ -53,8 +53,8 @@ SOURCE = Source(Path(__file__).with_name("fuse.cu"), structures={"View": View}, 
 class GpuGrid(Grid):
     """Holds the same bits as the grid of the CPU.
 
-    The keys of all blocks are kept sorted, so a view finds its blocks by a search; the voxels of the block at place i of
-    `keys` are those of row i of all chunks together.
+    The voxels of the block at place i of `keys` are those of row i of all chunks together. The keys are also kept
+    sorted, with their places in `order`: a view finds its blocks by a search.
     """
 
     def __init__(self, lattice: Lattice, device: torch.device, on: Kernels | None = None) -> None:
@@ -178,6 +178,6 @@ def most_blocks(device: torch.device) -> int:
 def no_room(device: torch.device, needed: float) -> BadInput:
     """What to say where the GPU has not even memory for one tile."""
     return BadInput(
-        f"{device}: less than {needed / 1e6:.0f} MB of its memory are free, too little to fuse depth maps in; end other "
-        "programs that use this GPU, or mesh with --device cpu"
+        f"{device}: less than {needed / 1e6:.0f} MB of its memory are free, too little to fuse depth maps in; end "
+        "other programs that use this GPU, or mesh with --device cpu"
     )

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from surfkit import BadInput, Compressor, Plan, SplatModel
+from surfkit.compress.base import CPU
 from surfkit.compress.scalars import Floats
 from torch import Tensor
 
@@ -22,7 +24,7 @@ class NewPart(Compressor):
         if "means" in self.half:
             raise BadInput("new-part.half names means; positions need more digits than float16 has")
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = CPU) -> Plan:
         """See `Compressor.plan`."""
         encodings = []
         for name, values in model.primitive.per_point(model.params).items():
