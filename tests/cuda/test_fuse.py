@@ -1,5 +1,7 @@
 """Fusion of depth maps by the kernels: the bits of the grid of the CPU, and the distances of float64 geometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from mesh.shapes import around, look_at, seen, slope, sphere
 
 from surfkit.core.check import BadInput
 from surfkit.cuda.emulated import Emulated, KernelError
+from surfkit.cuda.nvrtc import nvrtc
 from surfkit.mesh.cuda import grid as module
 from surfkit.mesh.cuda.grid import SOURCE, GpuGrid, most_blocks, view_of
 from surfkit.mesh.lattice import BLOCK_BYTES, FADE, FULL, SIDE, Lattice, Picture
@@ -216,6 +219,16 @@ def test_mistakes(name, monkeypatch):
     old, new, skip, message = MISTAKES[name]
     with pytest.raises(KernelError, match=message):
         volume(changed(SOURCE, old, new, skip=skip))
+
+
+def test_no_product_and_sum_in_one_rounding():
+    """On a GPU too, or its bits would not be those of the CPU."""
+    try:
+        compiler = nvrtc()
+    except BadInput as error:
+        pytest.skip(str(error))
+    exact, joined = (compiler.compile(source, "compute_90")[0] for source in (SOURCE, replace(SOURCE, is_exact=False)))
+    assert b"fma.rn" in joined and b"fma.rn" not in exact and b"mul.rn" in exact
 
 
 def test_the_view_of_a_camera():
