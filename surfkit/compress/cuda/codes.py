@@ -2,8 +2,9 @@
 
 Every vector is compared with every code in float32, through shared memory: 400,000 vectors of 45 numbers and 8,192
 codes are 3e11 operations, some 10 ms. `torch.mm` and `argmin` would take half the operations, but write and read
-13 GB of products, whose rounding errors also grow with the distance from the origin. Those of differences are a
-share of the distance; only where another code is within them, a warp takes the distances to all codes in float64.
+13 GB of products, as slow on the fastest memory and slower on any other, whose rounding errors also grow with the
+distance from the origin. Those of differences are a share of the distance; only where another code is within them, a
+warp takes the distances to all codes in float64.
 """
 
 from __future__ import annotations
