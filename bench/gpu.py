@@ -2,8 +2,8 @@
 
 For surfels and ellipsoids, at 1600 x 1200: milliseconds of each part of a step at 1, 5 and 10 million points, pictures
 a second, bytes of a point, what the decomposed gradient costs; the same scene with gsplat, where that is installed; how
-long a photograph takes to the GPU; fusing a depth map, and k-means; and a training on examples/boruszyn beside the same on the CPU. Medians after a
-warm-up. With `--device native` the CPU stands in, to try this program out.
+long a photograph takes to the GPU; fusing a depth map, and k-means; and a training on examples/boruszyn beside the
+same on the CPU. Medians after a warm-up. With `--device native` the CPU stands in, to try this program out.
 """
 
 from __future__ import annotations

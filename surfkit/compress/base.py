@@ -17,8 +17,6 @@ from surfkit.core.registry import Component, name_of
 from surfkit.primitives.model import SplatModel
 from surfkit.primitives.points import Columns
 
-CPU = torch.device("cpu")
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -42,7 +40,9 @@ class Compressor(Component):
     """Whether it wants to know how much each point contributes to the training views."""
 
     @abstractmethod
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = CPU) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """How to encode the model.
 
         Args:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.compress.base import CPU, Compressor, Plan, kinds_of
+from surfkit.compress.base import Compressor, Plan, kinds_of
 from surfkit.compress.colors import COLUMNS, PrincipalComponents, principal_components, vectors
 from surfkit.compress.encoding import ColumnType, Encoding
 from surfkit.compress.plain import exact
@@ -51,7 +51,9 @@ class Packed(Compressor):
         """See `Compressor.coarser`."""
         return replace(self, **{each.name: getattr(self, each.name) * factor for each in fields(self)})
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = CPU) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         kinds, tables = kinds_of(model), {}
         found = shape_encodings(model, self.position, self.scale, self.rotation, self.opacity)

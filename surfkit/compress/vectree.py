@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.compress.base import CPU, Compressor, Plan, kinds_of
+from surfkit.compress.base import Compressor, Plan, kinds_of
 from surfkit.compress.colors import CHOSEN, COLUMNS, Codes, vectors, width
 from surfkit.compress.encoding import Tables
 from surfkit.compress.kmeans import kmeans, nearest
@@ -68,7 +68,9 @@ class Vectree(Compressor):
         steps = {name: getattr(self, name) * factor for name in ("scale", "rotation", "opacity")}
         return replace(self, ratio=min(1.0, self.ratio * factor), codes=codes, **steps)
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = CPU) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         kinds = kinds_of(model)
         if not set(COLUMNS) <= set(kinds):
@@ -123,7 +125,7 @@ def codes(
 
 
 def codebook(
-    numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str, device: torch.device = CPU
+    numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str, device: torch.device = torch.device("cpu")
 ) -> np.ndarray:
     """(C, D) float16 vectors for (n, D) ones, C at most `codes`; in an order that depends on nothing but themselves."""
     given = torch.from_numpy(np.ascontiguousarray(numbers, np.float32))

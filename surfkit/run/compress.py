@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.compress.base import CPU, Compressor
+from surfkit.compress.base import Compressor
 from surfkit.compress.container import ModelFile, write_model
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, read_keys, write_json
@@ -113,7 +113,7 @@ def writing(
     importance: Tensor | None,
     frame: Frame | None,
     seed: int,
-    device: torch.device = CPU,
+    device: torch.device = torch.device("cpu"),
 ) -> Callable[[Path, Compressor], int]:
     """What writes a model as `.surfkit` file with a compressor, tells its progress, and returns the bytes."""
 

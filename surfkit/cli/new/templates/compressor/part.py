@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from surfkit import BadInput, Compressor, Plan, SplatModel
-from surfkit.compress.base import CPU
 from surfkit.compress.scalars import Floats
 from torch import Tensor
 
@@ -24,7 +23,9 @@ class NewPart(Compressor):
         if "means" in self.half:
             raise BadInput("new-part.half names means; positions need more digits than float16 has")
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = CPU) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         encodings = []
         for name, values in model.primitive.per_point(model.params).items():
