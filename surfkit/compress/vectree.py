@@ -91,7 +91,9 @@ class Vectree(Compressor):
             for at, (start, stop) in enumerate(zip(ends, ends[1:], strict=False))
         }
         found = shape_encodings(model, None, self.scale, self.rotation, self.opacity) | {COLUMNS: Codes(parts)}
-        return Plan(encodings_of(kinds, found), tables, {CHOSEN: chosen} | codes(model, chosen, parts, tables, device))
+        return Plan(
+            encodings_of(kinds, found), tables, {CHOSEN: chosen} | find_codes(model, chosen, parts, tables, device)
+        )
 
     def parts(self, coefficients: int) -> tuple[int, ...]:
         """Coefficients that each codebook is for."""
@@ -107,7 +109,7 @@ def least(importance: Tensor, ratio: float) -> Tensor:
     return chosen
 
 
-def codes(
+def find_codes(
     model: SplatModel, chosen: Tensor, parts: Sequence[int], tables: Tables, device: torch.device
 ) -> dict[str, Tensor]:
     """The marks of the codes of the chosen points: (N,) int32 for each codebook, 0 for others."""

@@ -109,7 +109,7 @@ def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
 
 def empty(task: Task, lattice: Lattice) -> Grid:
     """A grid where the depth maps are fused."""
-    return grid(lattice) if task.device.type == "cpu" else GpuGrid(lattice, task.device)
+    return GpuGrid(lattice, task.device) if task.device.type == "cuda" else grid(lattice)
 
 
 def step(task: Task, into: Grid, at: int) -> bool:

@@ -56,7 +56,7 @@ def grid(lattice: Lattice) -> HostGrid:
         return NativeGrid(lattice)
     emit(
         Warned(
-            "surfkit was installed without its compiled part (no C++ compiler was found): depth is fused in numpy "
+            "surfkit was installed without its compiled part (no C++ compiler was found): meshes are made in numpy "
             "instead, about a hundred times slower; install GCC or Clang, then surfkit again"
         )
     )

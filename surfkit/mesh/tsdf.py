@@ -97,7 +97,7 @@ class TSDF(Mesher):
         lengths, found = self._lengths(subject)
         device = subject.rasterizer.where()
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
-        if device.type != "cpu":
+        if device.type == "cuda":
             most_blocks = min(most_blocks, gpu.most_blocks(device))
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)

@@ -182,7 +182,7 @@ def test_blocks_for_the_free_memory(monkeypatch):
     device = torch.device("cuda", 0)
     assert most_blocks(device) == free // 2 // BLOCK_BYTES
     free = 10_000_000
-    with pytest.raises(BadInput, match="cuda:0: less than 29 MB of its memory are free, .* --device cpu"):
+    with pytest.raises(BadInput, match="cuda:0: less than 117 MB of its memory are free, .* --device cpu"):
         most_blocks(device)
 
 

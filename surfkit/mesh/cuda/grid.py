@@ -23,8 +23,6 @@ CHUNK = 1 << 14
 """Blocks whose voxels lie in one allocation, 59 MB: nothing is moved when a grid grows."""
 SHARE = 0.5
 """Of the free memory of the GPU that a grid may take; views are drawn in the rest."""
-LEAST_BLOCKS = 1 << 12
-"""Of a grid: with room for fewer, tiles would be smaller than what a view sees of a wall."""
 Voxels = tuple[Tensor, Tensor, Tensor]
 """Distances (B, 512) int16, weights (B, 512) uint16 as int16, and colours (B, 3, 512) uint8, of blocks."""
 
@@ -165,13 +163,13 @@ def most_blocks(device: torch.device) -> int:
     """Blocks that a GPU has memory for now.
 
     Raises:
-        BadInput: Too few to mesh in.
+        BadInput: Not even for one chunk.
     """
     free = torch.cuda.mem_get_info(device)[0]
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # torch's own, and unused
     blocks = int(SHARE * free / BLOCK_BYTES)
-    if blocks < LEAST_BLOCKS:
-        raise no_room(device, LEAST_BLOCKS * BLOCK_BYTES / SHARE)
+    if blocks < CHUNK:
+        raise no_room(device, CHUNK * BLOCK_BYTES / SHARE)
     return blocks
 
 
