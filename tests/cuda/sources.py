@@ -40,8 +40,8 @@ def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
 SHIPPED: tuple[tuple[Source, dict[str, tuple[int, int]]], ...] = (
     (adam.SOURCE, {"adam": (40, 0)}),
     (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
-    (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 1_100)}),
-    (codes.SOURCE, {"approach": (128, 14_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
+    (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
+    (codes.SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
     (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),
