@@ -178,7 +178,7 @@ def test_a_gpu_without_memory(monkeypatch):
 
 def test_blocks_for_the_free_memory(monkeypatch):
     free = 10_000_000_000
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (free, 2 * free))
     device = torch.device("cuda", 0)
     assert most_blocks(device) == free // 2 // BLOCK_BYTES
     free = 10_000_000

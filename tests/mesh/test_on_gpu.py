@@ -27,7 +27,7 @@ VIEWS = 6
 
 @pytest.fixture(autouse=True)
 def free_memory(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1 << 34, 1 << 34))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device=None: (1 << 34, 1 << 34))
 
 
 def both(mesher, **changes):

@@ -49,7 +49,7 @@ def finished(tmp_path_factory):
 
 def there(patch):
     """Runs draw on the simulated GPU from now on."""
-    patch.setattr(torch.cuda, "mem_get_info", lambda device: (1 << 34, 1 << 34))
+    patch.setattr(torch.cuda, "mem_get_info", lambda device=None: (1 << 34, 1 << 34))
     patch.setattr(pipeline, "select_rasterizer", lambda *given: (OnSimulatedGpu(select("cpu")[0]), "simulated"))
 
 
