@@ -31,6 +31,7 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.stereo import points
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
+from surfkit.raster.reference import Reference
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.scene.scene import Frame, Scene, View
@@ -101,7 +102,7 @@ def subject(scene: Scene, maps: list[Maps]) -> MeshInput:
     def draw(view: View) -> Maps:
         return by_name[view.name]
 
-    return MeshInput(points(scene.train, draw), scene.train, draw, None, 0.01, scene.frame, 4 << 30)
+    return MeshInput(points(scene.train, draw), scene.train, draw, Reference(), 0.01, scene.frame, 4 << 30)
 
 
 def score(mesh: Mesh, scene: Scene, pack: Path, tau: float, crop: object) -> dict[str, float]:

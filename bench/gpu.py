@@ -2,8 +2,8 @@
 
 For surfels and ellipsoids, at 1600 x 1200: milliseconds of each part of a step at 1, 5 and 10 million points, pictures
 a second, bytes of a point, what the decomposed gradient costs; the same scene with gsplat, where that is installed; how
-long a photograph takes to the GPU; and a training on examples/boruszyn beside the same on the CPU. Medians after a
-warm-up. With `--device native` the CPU stands in, to try this program out.
+long a photograph takes to the GPU; fusing a depth map, and k-means; and a training on examples/boruszyn beside the
+same on the CPU. Medians after a warm-up. With `--device native` the CPU stands in, to try this program out.
 """
 
 from __future__ import annotations
@@ -17,10 +17,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 from machine import save
 from scenes import city
 
+from surfkit.compress.cuda.codes import GpuSearch
+from surfkit.compress.cuda.codes import sums as gpu_sums
+from surfkit.compress.kmeans import nearest, sums
+from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.mesh.native import grid
 from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import select
 from surfkit.raster.ssim import ssim
@@ -138,6 +145,29 @@ def upload(device: torch.device, rounds: int) -> float:
     return milliseconds(lambda: uploaded(photo, device), rounds, device)
 
 
+def fusing(device: torch.device, rounds: int) -> float:
+    """Milliseconds of fusing a depth map of 1600 x 1200 pixels of the size of a voxel, after a first one."""
+    lattice, pose = Lattice(0.01, 0.04), torch.eye(4, dtype=torch.float64)
+    camera = Camera(pose, 1000.0, 1000.0, SIZE[0] / 2, SIZE[1] / 2, *SIZE)
+    depth = np.linspace(9, 11, SIZE[0], dtype=np.float32)[None].repeat(SIZE[1], 0)
+    seen = Picture(depth, np.full_like(depth, 32 << 24, np.uint32), camera)
+    into = GpuGrid(lattice, device) if device.type == "cuda" else grid(lattice)
+    return milliseconds(lambda: into.fuse(seen, True), rounds, device)
+
+
+def clustering(device: torch.device, rounds: int) -> dict[str, float]:
+    """Milliseconds of the search and of the sums of an iteration of k-means over 400,000 vectors, with 8,192 codes."""
+    vectors = torch.randn(400_000, 45)
+    there, weights = vectors.to(device), torch.ones(len(vectors), dtype=torch.float64, device=device)
+    index = (torch.arange(len(vectors), dtype=torch.int32) % 8192).to(device)
+    if device.type == "cuda":
+        search = GpuSearch(vectors[:8192], device)
+        find, add = lambda: search.nearest(there, there), lambda: gpu_sums(there, weights, index, 8192)
+    else:
+        find, add = lambda: nearest(vectors, vectors[:8192]), lambda: sums(there, weights, index, 8192)
+    return {"nearest": milliseconds(find, rounds, device), "sums": milliseconds(add, rounds, device)}
+
+
 def training(device: str, recipe: str, steps: int) -> dict[str, float]:
     """PSNR, number of points and seconds of a recipe, through the command line."""
     with tempfile.TemporaryDirectory() as folder:
@@ -162,6 +192,8 @@ def main() -> None:
     rasterizer, title = select(options.device)
     device = rasterizer.where()
     figures: dict[str, object] = {"device": title, "upload of 12 MP, ms": upload(device, options.rounds)}
+    figures["fusing a view, ms"] = fusing(device, options.rounds)
+    figures["k-means, ms"] = clustering(device, options.rounds)
     for kind, name in KINDS.items():
         for count in options.points:
             key = f"{name}, {count:,} points"

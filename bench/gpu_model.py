@@ -12,13 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from machine import save
 
+from surfkit.compress.cuda import codes
 from surfkit.cuda.emulated import Emulated
 from surfkit.cuda.nvrtc import nvrtc, resources
 from surfkit.cuda.source import Source
+from surfkit.mesh.cuda import grid
+from surfkit.mesh.cuda.grid import GpuGrid
+from surfkit.mesh.lattice import Lattice, Picture
 from surfkit.raster.cuda import ssim
+from surfkit.scene.camera import Camera
 from surfkit.train import adam
 
 
@@ -80,12 +86,29 @@ def _backward(on: Emulated) -> None:
     ssim.backward(*_forward(on), torch.tensor(1.0), on)
 
 
+def _fuse(on: Emulated) -> None:
+    """A wall, seen by all voxels of 8 x 8 blocks."""
+    lattice = Lattice(0.01, 0.04, low=(-4, -4, 12), high=(4, 4, 13))
+    camera = Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 48.0, 48.0, 96, 96)
+    depth, shade = np.full((96, 96), 1.0, np.float32), np.full((96, 96), 32 << 24, np.uint32)
+    GpuGrid(lattice, on.device, on).fuse(Picture(depth, shade, camera), carve=False)
+
+
+def _approach(on: Emulated) -> None:
+    none, found = torch.empty(0, dtype=torch.int32), torch.empty(128, dtype=torch.int32)
+    on.launch("approach", 1, 256, torch.rand(128, 45), torch.rand(64, 45), 45, 64, none, 1.0, 0.0, found)
+
+
 IMAGE = 3 * 1600 * 1200
+WALL = 90_000 * 512  # voxels of the blocks that a view of 1600 x 1200 pixels of the size of a voxel shows
+PAIRS = 400_000 * 8_192  # vectors of 45 numbers, and codes
 SURFELS = 1_000_000 * 58  # degree 3
 CASES = (
     Case("adam", adam.SOURCE, 256, _adam, 64 * 1024, SURFELS, 28, 30),
     Case("ssim_forward", ssim.SOURCE, 128, _forward, 128 * 128, IMAGE, 20, 155),
     Case("ssim_backward", ssim.SOURCE, 128, _backward, 128 * 128, IMAGE, 24, 95),
+    Case("fuse", grid.SOURCE, grid.THREADS, _fuse, 64 * 512, WALL, 14, 120),
+    Case("approach", codes.SOURCE, 256, _approach, 128 * 64, PAIRS, 0, 2 * 48),
 )
 
 

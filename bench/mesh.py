@@ -28,6 +28,7 @@ from surfkit.mesh.picture import picture
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
+from surfkit.raster.reference import Reference
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
@@ -260,7 +261,7 @@ def in_tiles(views: int, voxel: float, budget: int) -> dict:
     count = len(means)
     fields = means, torch.ones(count, 4), torch.ones(count, 2), torch.ones(count), torch.ones(count, 1, 3)
     seen = [View(str(at), camera, Path()) for at, camera in enumerate(cameras)]
-    given = MeshInput(Splats("surfel", *fields), seen, draw, None, 0.1, Frame(np.zeros(3), 1.0, 1.0), budget)
+    given = MeshInput(Splats("surfel", *fields), seen, draw, Reference(), 0.1, Frame(np.zeros(3), 1.0, 1.0), budget)
     before, began = rss(), time.perf_counter()
     mesh = TSDF(voxel=voxel, depth_limit=160.0, least_views=0.03).mesh(given)
     seconds, peak = time.perf_counter() - began, rss() - before

@@ -142,12 +142,12 @@ def _signature(node: ast.FunctionDef) -> Iterator[str]:
     """A method's first lines, in lines of WIDE columns."""
     yield from (f"    @{ast.unparse(each)}" for each in node.decorator_list)
     returns = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-    line = f"    def {node.name}({ast.unparse(node.args)}){returns}:"
+    line = f"    def {node.name}({ast.unparse(node.args)}){returns}:".replace("'", '"')
     if len(line) <= WIDE:
         yield line
         return
     given = [ast.unparse(each) for each in node.args.args]
-    defaults = [f" = {ast.unparse(each)}" for each in node.args.defaults]
+    defaults = [f" = {ast.unparse(each)}".replace("'", '"') for each in node.args.defaults]
     defaults = [""] * (len(given) - len(defaults)) + defaults
     yield f"    def {node.name}("
     yield from (f"        {name}{default}," for name, default in zip(given, defaults, strict=True))

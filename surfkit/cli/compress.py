@@ -58,7 +58,7 @@ class Compress:
     """For a FILE: file to write, ending in .surfkit; beside it by default."""
 
     device: Device = "auto"
-    """Device for rendering."""
+    """Device for rendering and for codebooks."""
 
     def __post_init__(self) -> None:
         if self.target_size is not None and self.target_loss is not None:

@@ -59,7 +59,7 @@ class MeshOf:
     """Metres per unit of the data set's coordinates, if the data set does not state it. Settings in metres need it."""
 
     device: Device = "auto"
-    """Device for rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name
+    """Device for rendering and fusing: auto, cpu, cuda, cuda:1, or a rasterizer by its name
     (`surfkit components rasterizer`)."""
 
     prepare: bool = True

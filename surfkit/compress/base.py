@@ -40,13 +40,16 @@ class Compressor(Component):
     """Whether it wants to know how much each point contributes to the training views."""
 
     @abstractmethod
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """How to encode the model.
 
         Args:
             model: All of its columns finite, on the CPU, N points.
             importance: (N,) mean contribution over the training views, if the compressor `needs_importance`.
             seed: Of every random draw.
+            device: Where to do what takes long, if the compressor can; its plan is on the CPU.
 
         Raises:
             BadInput: It cannot compress such a model.

@@ -102,7 +102,8 @@ class Codes(Encoding):
     """Spherical harmonics of the points that matter least as codes of a codebook (Vectree, LightGaussian), those of the
     others in float16.
 
-    The mark `sh.chosen` says which points get codes. Tables `sh.codes.I` hold (codes, D_I) vectors in float16.
+    The mark `sh.chosen` says which points get codes, and the marks `sh.code.I` say which; without these, it is the
+    nearest. Tables `sh.codes.I` hold (codes, D_I) vectors in float16.
     """
 
     parts: tuple[int, ...] = ()
@@ -120,9 +121,13 @@ class Codes(Encoding):
         numbers, chosen = vectors(values), values[CHOSEN].numpy()
         found = {CHOSEN: np.packbits(chosen)[:, None], "sh": float_bits(numbers[~chosen], "float16", "sh")}
         for at, (part, book) in enumerate(zip(self._parts(), self._books(kinds, tables), strict=True)):
-            wanted = torch.from_numpy(np.ascontiguousarray(numbers[chosen][:, part], np.float32))
-            codes = nearest(wanted, torch.from_numpy(book))[0].numpy()
-            found[f"sh.code.{at}"] = codes[:, None].astype(np.uint8 if len(book) <= 256 else np.uint16)
+            name = f"sh.code.{at}"
+            if name in values:
+                codes = values[name].numpy()[chosen]
+            else:
+                wanted = torch.from_numpy(np.ascontiguousarray(numbers[chosen][:, part], np.float32))
+                codes = nearest(wanted, torch.from_numpy(book))[0].numpy()
+            found[name] = codes[:, None].astype(np.uint8 if len(book) <= 256 else np.uint16)
         return found
 
     def decode(

@@ -4,7 +4,7 @@ Lloyd's iterations from vectors drawn at random. As their result depends much on
 merges codes that are close to one another, and splits in their place codes whose vectors lie far apart, wherever this
 makes the sum smaller (after Patane and Russo 2001, "The enhanced LBG algorithm"). Assignments are exact and sums are
 float64 in the order of the vectors, so a seed gives the same bits on any number of threads, with any instruction set,
-and without a compiler.
+without a compiler, and on a GPU.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.compress.nearest import Features, Search, checked, nearest, searching
+from surfkit.compress.cuda import codes as gpu
+from surfkit.compress.nearest import CPU, Features, Search, checked, itself, nearest, searching
 from surfkit.core.check import BadInput, expect
 from surfkit.native import module
 
@@ -43,13 +44,14 @@ def kmeans(
     iterations: int = 10,
     sample: int | None = None,
     progress: Progress | None = None,
+    device: torch.device = CPU,
 ) -> Tensor:
     """(codes, D) float32 centroids that make the weighted sum of squared distances to the nearest one small.
 
     Where no more than `codes` different vectors have a weight, the result is these, then others, then copies of the
     first. Codes without vectors, and those that can be spared, are moved to where the weighted error is largest. Memory
-    is of the order of the arguments. No number of threads and no instruction set changes a bit, nor does a missing
-    compiler, without which it takes some fifty times longer.
+    is of the order of the arguments. No number of threads and no instruction set changes a bit, nor does a GPU, or a
+    missing compiler, without which it takes some fifty times longer.
 
     Args:
         vectors: (N, D) float32.
@@ -60,6 +62,7 @@ def kmeans(
         sample: Vectors that the iterations look at, drawn at random, at least `codes`; None for 64 a code and at
             least 262,144.
         progress: Is given the number of assignments done, and of all; called several times a second.
+        device: Where to compute; the result is on the CPU.
 
     Raises:
         BadInput: For other shapes and types, values that are NaN, Inf or beyond 1e15, and numbers out of range.
@@ -74,7 +77,7 @@ def kmeans(
     generator = np.random.default_rng(seed)
     rows = np.flatnonzero(weight)
     rows = generator.permutation(rows)[: sample or max(EACH * codes, FEWEST)]
-    return Lloyd(vectors[torch.from_numpy(rows)], weight[rows], codes, generator, iterations, progress).run()
+    return Lloyd(vectors[torch.from_numpy(rows)], weight[rows], codes, generator, iterations, progress, device).run()
 
 
 def checked_weights(weights: Tensor | None, count: int) -> np.ndarray:
@@ -120,6 +123,7 @@ class Lloyd:
         generator: Of the first centroids.
         iterations: At most.
         progress: See `kmeans`.
+        device: Where vectors are searched for and added up; all that is done with codes is done on the CPU.
     """
 
     vectors: Tensor
@@ -128,10 +132,16 @@ class Lloyd:
     generator: np.random.Generator
     iterations: int
     progress: Progress | None
+    device: torch.device = CPU
 
     def __post_init__(self) -> None:
-        some = Features.of(self.vectors[:SURVEYED]).fitted(self.vectors, self.vectors[: self.codes])
-        self.features, self.of_vectors = some, some(self.vectors)
+        self.there = self.vectors.to(self.device)
+        self.weights = torch.from_numpy(self.weight).to(self.device)
+        if self.device.type == "cuda":
+            self.features, self.of_vectors = itself, self.there
+        else:
+            some = Features.of(self.vectors[:SURVEYED]).fitted(self.vectors, self.vectors[: self.codes])
+            self.features, self.of_vectors = some, some(self.vectors)
         self.done, self.all = 0, len(self.vectors) * self.iterations
 
     def run(self) -> Tensor:
@@ -160,38 +170,43 @@ class Lloyd:
 
     def improved(self, codebook: Tensor) -> Tensor:
         """Each code at the mean of its vectors, after some are merged and others split."""
-        search = searching(codebook, self.features)
-        index, error = self.assigned(search)
-        means = Means.of(sums(self.vectors, self.weight, index, self.codes), codebook)
+        search = searching(codebook, self.features, self.device)
+        index, distance = self.assigned(search)
+        means = Means.of(self.sums(index, self.codes), codebook)
         places = means.places.copy()
         if self.codes > 1:
-            halves = self.halves(index, error, means)
-            centres = torch.from_numpy(places.astype(np.float32))
+            halves = self.halves(index, distance, means)
+            centres = torch.from_numpy(places.astype(np.float32)).to(self.device)
             own = torch.arange(self.codes, dtype=torch.int32)
-            close = search.nearest(centres, self.features(centres), own)[0].numpy()
+            close = search.nearest(centres, self.features(centres), own)[0].cpu().numpy()
             relocate(places, means, halves, close)
         return torch.from_numpy(places.astype(np.float32))
 
-    def assigned(self, search: Search) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) int32 index of the nearest code, and (N,) float64 weighted squared distance."""
-        index, error = np.empty(len(self.vectors), np.int32), np.empty(len(self.vectors))
-        for rows in search.parts(len(self.vectors)):
-            index[rows], error[rows] = search.nearest(self.vectors[rows], self.of_vectors[rows])
+    def assigned(self, search: Search) -> tuple[Tensor, Tensor]:
+        """(N,) int32 index of the nearest code, and (N,) float32 squared distance, on the device."""
+        found = []
+        for rows in search.parts(len(self.there)):
+            found.append(search.nearest(self.there[rows], self.of_vectors[rows]))
             self.report(rows.stop - rows.start)
-        return index, error * self.weight
+        index, distance = zip(*found, strict=True)
+        return torch.cat(index), torch.cat(distance)
 
-    def halves(self, index: np.ndarray, error: np.ndarray, means: Means) -> Means:
+    def sums(self, index: Tensor, codes: int) -> np.ndarray:
+        """See `sums`."""
+        return sums(self.there, self.weights, index, codes)
+
+    def halves(self, index: Tensor, distance: Tensor, means: Means) -> Means:
         """The means of both halves of the vectors of each code, first of one half and then of the other.
 
         They are halved by their direction from the mean: that of the largest error, and then that from half to half.
         """
-        order = np.argsort(error, kind="stable")
+        order = np.argsort(distance.cpu().double().numpy() * self.weight, kind="stable")
         farthest = np.zeros(self.codes, np.int64)
-        farthest[index[order]] = order  # the last one stays
+        farthest[index.cpu().numpy()[order]] = order  # the last one stays
         directions = self.vectors.numpy()[farthest] - means.places
         for _ in range(HALVINGS):
-            halved = halve(self.vectors, means.places, directions, index)
-            halves = Means.of(sums(self.vectors, self.weight, halved, 2 * self.codes), np.repeat(means.places, 2, 0))
+            halved = halve(self.there, means.places, directions, index)
+            halves = Means.of(self.sums(halved, 2 * self.codes), np.repeat(means.places, 2, 0))
             directions = halves.places[1::2] - halves.places[::2]
         return halves
 
@@ -259,23 +274,27 @@ def squares(rows: np.ndarray) -> np.ndarray:
     return total
 
 
-def halve(vectors: Tensor, middles: np.ndarray, directions: np.ndarray, index: np.ndarray) -> np.ndarray:
+def halve(vectors: Tensor, middles: np.ndarray, directions: np.ndarray, index: Tensor) -> Tensor:
     """(N,) int32: twice the code, and one more for vectors ahead of its middle in its direction."""
-    halved = index.copy()
-    if module() is not None:
-        module().halve(vectors.numpy(), middles, directions, halved, torch.get_num_threads())
+    if vectors.device.type == "cpu" and module() is not None:
+        halved = index.clone()
+        module().halve(vectors.numpy(), middles, directions, halved.numpy(), torch.get_num_threads())
         return halved
-    ahead = np.zeros(len(halved))
-    for x, middle, direction in zip(vectors.numpy().T, middles.T, directions.T, strict=True):
-        ahead += (x - middle[index]) * direction[index]
-    return 2 * halved + (ahead > 0)
+    ahead, code = torch.zeros(len(index), dtype=torch.float64, device=index.device), index.long()
+    columns = (torch.from_numpy(np.ascontiguousarray(each.T)).to(index.device) for each in (middles, directions))
+    for x, middle, direction in zip(vectors.T, *columns, strict=True):
+        ahead += (x - middle[code]) * direction[code]  # two roundings: the bits are those of the CPU
+    return 2 * index + (ahead > 0)
 
 
-def sums(vectors: Tensor, weight: np.ndarray, index: np.ndarray, codes: int) -> np.ndarray:
+def sums(vectors: Tensor, weights: Tensor, index: Tensor, codes: int) -> np.ndarray:
     """(codes, D + 1) float64 weighted sums of the vectors of each code, in their order, and of the weights."""
+    if vectors.device.type == "cuda":
+        return gpu.sums(vectors, weights, index, codes).cpu().numpy()
+    rows, weight, code = vectors.numpy(), weights.numpy(), index.numpy()
     if module() is not None:
-        total = np.zeros((codes, vectors.shape[1] + 1))
-        module().sum_by_code(vectors.numpy(), weight, index, total, torch.get_num_threads())
+        total = np.zeros((codes, rows.shape[1] + 1))
+        module().sum_by_code(rows, weight, code, total, torch.get_num_threads())
         return total
-    columns = [weight, *(weight * column for column in vectors.numpy().T.astype(np.float64))]
-    return np.stack([np.bincount(index, column, codes) for column in columns[1:] + columns[:1]], 1)
+    columns = [weight, *(weight * column for column in rows.T.astype(np.float64))]
+    return np.stack([np.bincount(code, column, codes) for column in columns[1:] + columns[:1]], 1)

@@ -2,12 +2,12 @@
 
 The squared distance is defined as the float64 sum of the squared differences in the order of the dimensions; among
 equal ones the lowest index counts. The compiled search and the one in torch both rule codes out within bounds of their
-rounding errors and then take this sum: both give the same bits, on any number of threads.
+rounding errors and then take this sum, and so does a GPU: all give the same bits, on any number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,9 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.core.check import BadInput, expect
 from surfkit.native import module
 
+CPU = torch.device("cpu")
 MOST = 1e15
 """Greatest absolute value in a vector: its square must be far from the end of float32."""
 WORK = 1 << 31
@@ -34,16 +36,17 @@ FEATURES = (4, 6, 8, 10, 12, 16, 24, 32)
 """Numbers of principal components among which it is chosen, besides all of them."""
 
 
-def nearest(vectors: Tensor, codebook: Tensor) -> tuple[Tensor, Tensor]:
+def nearest(vectors: Tensor, codebook: Tensor, device: torch.device = CPU) -> tuple[Tensor, Tensor]:
     """(N,) int32 index of the nearest code of each vector, and (N,) float32 squared distance to it.
 
     The distance is the float64 sum of the squared differences in the order of the dimensions, rounded; among equal ones
     the lowest index is taken. Memory is of the order of the arguments. No number of threads and no instruction set
-    changes a bit, nor does a missing compiler, without which it takes some fifty times longer.
+    changes a bit, nor does a GPU, or a missing compiler, without which it takes some fifty times longer.
 
     Args:
         vectors: (N, D) float32.
         codebook: (K, D) float32; K may be 0 only where N is.
+        device: Where to search; results are on the CPU.
 
     Raises:
         BadInput: For another shape or type, and for values that are NaN, Inf or beyond 1e15.
@@ -54,10 +57,11 @@ def nearest(vectors: Tensor, codebook: Tensor) -> tuple[Tensor, Tensor]:
         raise BadInput(f"codebook: it has no codes, and there are {len(vectors)} vectors; give at least one code")
     index, distance = torch.zeros(len(vectors), dtype=torch.int32), torch.zeros(len(vectors))
     if len(vectors):
-        features = Features.of(codebook).fitted(vectors, codebook)
-        search = searching(codebook, features)
+        features = itself if device.type == "cuda" else Features.of(codebook).fitted(vectors, codebook)
+        search = searching(codebook, features, device)
         for rows in search.parts(len(vectors)):
-            index[rows], distance[rows] = search.nearest(vectors[rows], features(vectors[rows]))
+            some = vectors[rows].to(device)
+            index[rows], distance[rows] = (found.cpu() for found in search.nearest(some, features(some)))
     return index, distance
 
 
@@ -142,6 +146,11 @@ class Features:
         return torch.from_numpy(order)
 
 
+def itself(vectors: Tensor) -> Tensor:
+    """In place of features, for searches that have no use for them."""
+    return vectors
+
+
 class Search(Protocol):
     """The codes of one codebook, prepared to be searched."""
 
@@ -206,6 +215,8 @@ class TorchSearch(Search):
         return torch.from_numpy(code[first].astype(np.int32)), torch.from_numpy(exact[first].astype(np.float32))
 
 
-def searching(codebook: Tensor, features: Features) -> Search:
-    """The codebook, compiled if surfkit is."""
+def searching(codebook: Tensor, features: Callable[[Tensor], Tensor], device: torch.device = CPU) -> Search:
+    """The codebook on a device: for a GPU, or compiled if surfkit is."""
+    if device.type == "cuda":
+        return GpuSearch(codebook, device)
     return NativeSearch(codebook, features) if module() is not None else TorchSearch(codebook)

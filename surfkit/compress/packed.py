@@ -51,7 +51,9 @@ class Packed(Compressor):
         """See `Compressor.coarser`."""
         return replace(self, **{each.name: getattr(self, each.name) * factor for each in fields(self)})
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         kinds, tables = kinds_of(model), {}
         found = shape_encodings(model, self.position, self.scale, self.rotation, self.opacity)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from surfkit.compress.base import Compressor, Plan, kinds_of
@@ -15,7 +16,9 @@ from surfkit.primitives.model import SplatModel
 class Lossless(Compressor):
     """All numbers as they are, coded without loss."""
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         return Plan(tuple(exact(name, str(kind.dtype)) for name, kind in kinds_of(model).items()))
 
@@ -24,7 +27,9 @@ class Lossless(Compressor):
 class Float16(Compressor):
     """Positions as they are, all other numbers rounded to float16."""
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         found = {name: Floats(name, "float16") for name in kinds_of(model)}
         return Plan(tuple((found | {"means": exact("means", str(model.params["means"].dtype))}).values()))

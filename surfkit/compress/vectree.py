@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -11,7 +12,8 @@ from torch import Tensor
 
 from surfkit.compress.base import Compressor, Plan, kinds_of
 from surfkit.compress.colors import CHOSEN, COLUMNS, Codes, vectors, width
-from surfkit.compress.kmeans import kmeans
+from surfkit.compress.encoding import Tables
+from surfkit.compress.kmeans import kmeans, nearest
 from surfkit.compress.packed import encodings_of, shape_encodings
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
@@ -19,6 +21,8 @@ from surfkit.primitives.model import SplatModel
 
 PASSES = 10
 """Of k-means."""
+PIECE = 1 << 18
+"""Points whose codes are searched for at once."""
 LEARNT_FROM = 1 << 20
 """Points that a codebook is learnt from, so that memory does not grow with the model."""
 
@@ -64,7 +68,9 @@ class Vectree(Compressor):
         steps = {name: getattr(self, name) * factor for name in ("scale", "rotation", "opacity")}
         return replace(self, ratio=min(1.0, self.ratio * factor), codes=codes, **steps)
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         kinds = kinds_of(model)
         if not set(COLUMNS) <= set(kinds):
@@ -81,11 +87,13 @@ class Vectree(Compressor):
         parts = self.parts(width(kinds))
         ends = np.cumsum([0, *parts]).tolist()
         tables = {
-            f"sh.codes.{at}": codebook(numbers[:, start:stop], self.codes, weights, seed, f"codebook {at + 1}")
+            f"sh.codes.{at}": codebook(numbers[:, start:stop], self.codes, weights, seed, f"codebook {at + 1}", device)
             for at, (start, stop) in enumerate(zip(ends, ends[1:], strict=False))
         }
         found = shape_encodings(model, None, self.scale, self.rotation, self.opacity) | {COLUMNS: Codes(parts)}
-        return Plan(encodings_of(kinds, found), tables, {CHOSEN: chosen})
+        return Plan(
+            encodings_of(kinds, found), tables, {CHOSEN: chosen} | find_codes(model, chosen, parts, tables, device)
+        )
 
     def parts(self, coefficients: int) -> tuple[int, ...]:
         """Coefficients that each codebook is for."""
@@ -101,7 +109,26 @@ def least(importance: Tensor, ratio: float) -> Tensor:
     return chosen
 
 
-def codebook(numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str) -> np.ndarray:
+def find_codes(
+    model: SplatModel, chosen: Tensor, parts: Sequence[int], tables: Tables, device: torch.device
+) -> dict[str, Tensor]:
+    """The marks of the codes of the chosen points: (N,) int32 for each codebook, 0 for others."""
+    books = [torch.from_numpy(tables[f"sh.codes.{at}"].astype(np.float32)) for at in range(len(parts))]
+    found = {f"sh.code.{at}": torch.zeros(len(model), dtype=torch.int32) for at in range(len(parts))}
+    ends, rows = np.cumsum([0, *parts]).tolist(), chosen.nonzero()[:, 0]
+    done = 0
+    for some in rows.split(PIECE):
+        numbers = vectors({name: model.params[name][some] for name in COLUMNS})
+        for marks, book, start, stop in zip(found.values(), books, ends, ends[1:], strict=False):
+            wanted = torch.from_numpy(np.ascontiguousarray(numbers[:, start:stop], np.float32))
+            marks[some] = nearest(wanted, book, device)[0]
+        emit(Progress("finding codes", done := done + len(some), len(rows)))
+    return found
+
+
+def codebook(
+    numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: str, device: torch.device = torch.device("cpu")
+) -> np.ndarray:
     """(C, D) float16 vectors for (n, D) ones, C at most `codes`; in an order that depends on nothing but themselves."""
     given = torch.from_numpy(np.ascontiguousarray(numbers, np.float32))
     if not given.isfinite().all():
@@ -117,6 +144,7 @@ def codebook(numbers: np.ndarray, codes: int, weights: Tensor, seed: int, name: 
         seed=seed,
         iterations=PASSES,
         progress=lambda done, of: emit(Progress(name, done, of)),
+        device=device,
     )
     rounded = found.numpy().astype(np.float16)
     if not np.isfinite(rounded).all():

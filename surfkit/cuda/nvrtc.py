@@ -23,6 +23,8 @@ from surfkit.core.files import replacing
 from surfkit.cuda.source import Source
 
 OPTIONS = ("--std=c++17", "--device-as-default-execution-space", "--ptxas-options=-v")
+SEPARATE = "--fmad=false"
+"""Of sources whose products and sums are each rounded."""
 OLDEST = 70
 """Least compute capability, times ten: before it, the threads of a warp could not go separate ways."""
 
@@ -55,7 +57,7 @@ class Nvrtc:
         text, name = source.text.encode(), source.path.name.encode()
         self._call("nvrtcCreateProgram", ctypes.byref(program), text, name, 0, None, None)
         try:
-            options = [option.encode() for option in (f"--gpu-architecture={architecture}", *OPTIONS)]
+            options = [option.encode() for option in (f"--gpu-architecture={architecture}", *_options(source))]
             failed = self._library.nvrtcCompileProgram(
                 program, len(options), (ctypes.c_char_p * len(options))(*options)
             )
@@ -113,7 +115,8 @@ def nvrtc() -> Nvrtc:
 def image(source: Source, architecture: str, driver_version: int = 0) -> bytes:
     """What `Nvrtc.compile` gives, from the user's cache if it was compiled before."""
     compiler = nvrtc()
-    key = (source.text, OPTIONS, compiler.version, architecture, architecture.startswith("compute") and driver_version)
+    made_by = compiler.version, architecture, architecture.startswith("compute") and driver_version
+    key = (source.text, _options(source), *made_by)
     name = f"{source.path.stem}-{architecture}-{sha256(repr(key).encode()).hexdigest()[:24]}"
     path = cache_root() / "cuda" / name
     if path.exists():
@@ -122,6 +125,10 @@ def image(source: Source, architecture: str, driver_version: int = 0) -> bytes:
     with replacing(path) as file:
         file.write(made)
     return made
+
+
+def _options(source: Source) -> tuple[str, ...]:
+    return (*OPTIONS, SEPARATE) if source.is_exact else OPTIONS
 
 
 def resources(log: str) -> dict[str, dict[str, int]]:

@@ -57,11 +57,13 @@ class Source:
         path: The .cu file. It includes other files of surfkit by relative paths; `prelude.h` is in front of it.
         defines: Macros by name, such as a number of channels that the compiler is to know.
         structures: Structures that kernels take by value or as elements of buffers, by their C++ name.
+        is_exact: No product and sum are joined into one rounding, so that the kernels give the bits of the CPU.
     """
 
     path: Path
     defines: Mapping[str, int] = field(default_factory=dict)
     structures: Mapping[str, type[ctypes.Structure]] = field(default_factory=dict)
+    is_exact: bool = False
 
     @cached_property
     def text(self) -> str:

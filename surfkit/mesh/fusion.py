@@ -16,6 +16,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.floaters import drop_floaters
 from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
@@ -48,6 +49,7 @@ class Task:
         compare: What the weights of the pixels of a view are multiplied with, by what all views see; None leaves them.
         floaters: Connected components are dropped that are seen through so many times as often as seen; 0 keeps all.
         stored: Whether `see` costs little, as what the views see is on disk.
+        device: Where depth maps are fused.
     """
 
     lattice: Lattice
@@ -61,6 +63,7 @@ class Task:
     compare: Callable[[int, Depths], Tensor] | None = None
     floaters: float = 0.0
     stored: bool = False
+    device: torch.device = torch.device("cpu")
 
 
 def fuse(task: Task, boxes: list[Box]) -> tuple[Made, dict[str, int]]:
@@ -93,7 +96,7 @@ def see_through(task: Task, made: Made) -> tuple[Made, int]:
 def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
     """Vertices, faces and colours, and the number of tiles, of views whose weights are what they will be."""
     if len(boxes) == 1:
-        whole = grid(task.lattice)
+        whole = empty(task, task.lattice)
         if all(step(task, whole, at) for at in range(len(task.cameras))):
             piece = whole.surface(task.least_weight)
             return (piece.vertices, piece.faces, piece.colors), 1
@@ -102,6 +105,11 @@ def fuse_ready(task: Task, boxes: list[Box]) -> tuple[Made, int]:
         boxes = cut(Box(), task)
     with nullcontext(task) if task.stored else spooled(task) as stored:
         return in_tiles(stored, boxes)
+
+
+def empty(task: Task, lattice: Lattice) -> Grid:
+    """A grid where the depth maps are fused."""
+    return GpuGrid(lattice, task.device) if task.device.type == "cuda" else grid(lattice)
 
 
 def step(task: Task, into: Grid, at: int) -> bool:
@@ -133,7 +141,7 @@ def in_tiles(task: Task, boxes: list[Box]) -> tuple[Made, int]:
 def tile(task: Task, box: Box, views: list[Box]) -> Pieces | None:
     """The surface in a box; None if its grid would become too large."""
     around = box.with_border()
-    part = grid(replace(task.lattice, low=around.low, high=around.high))
+    part = empty(task, replace(task.lattice, low=around.low, high=around.high))
     for at, view in enumerate(views):
         if view.meets(around) and not part.fuse(task.see(at), task.carve):
             return None

@@ -107,3 +107,18 @@ class Grid(ABC):
     def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
         """Triangles where all eight voxels around have a weight, of cells in blocks below `end`; front faces see them
         counter-clockwise."""
+
+
+class HostGrid(Grid):
+    """A grid in the memory of the CPU."""
+
+    @abstractmethod
+    def put(self, keys: np.ndarray, distance: np.ndarray, weight: np.ndarray, color: np.ndarray) -> None:
+        """Take blocks that another grid has fused, none of which is here.
+
+        Args:
+            keys: (B,) int64, the coordinates of each block: from the lowest bit up x, y and z plus `MOST`, `BITS` each.
+            distance: (B, 512) int16, in 1/32767 of the truncation.
+            weight: (B, 512) uint16.
+            color: (B, 3, 512) uint8.
+        """

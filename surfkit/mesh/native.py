@@ -7,12 +7,12 @@ import torch
 
 from surfkit.core.events import Warned, emit
 from surfkit.mesh.cubes import EDGES, triangles
-from surfkit.mesh.lattice import MOST, REACH, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.lattice import MOST, REACH, Corner, HostGrid, Lattice, Picture, Pieces
 from surfkit.mesh.reference import ReferenceGrid
 from surfkit.native import module
 
 
-class NativeGrid(Grid):
+class NativeGrid(HostGrid):
     """Runs on `torch.get_num_threads()` threads; their number does not change a bit."""
 
     def __init__(self, lattice: Lattice) -> None:
@@ -42,18 +42,21 @@ class NativeGrid(Grid):
             torch.get_num_threads(),
         )
 
+    def put(self, keys: np.ndarray, distance: np.ndarray, weight: np.ndarray, color: np.ndarray) -> None:
+        self.native.put(keys, distance, weight, color)
+
     def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
         table = triangles(), EDGES
         return Pieces(*self.native.surface(*table, least_weight, list(end), with_edges, torch.get_num_threads()))
 
 
-def grid(lattice: Lattice) -> Grid:
+def grid(lattice: Lattice) -> HostGrid:
     """An empty grid, compiled if surfkit is."""
     if module() is not None:
         return NativeGrid(lattice)
     emit(
         Warned(
-            "surfkit was installed without its compiled part (no C++ compiler was found): depth is fused in numpy "
+            "surfkit was installed without its compiled part (no C++ compiler was found): meshes are made in numpy "
             "instead, about a hundred times slower; install GCC or Clang, then surfkit again"
         )
     )

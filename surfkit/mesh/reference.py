@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 
 from surfkit.mesh.cubes import EDGES, triangles
-from surfkit.mesh.lattice import BITS, BLOCK_BYTES, MOST, REACH, SIDE, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.lattice import BITS, BLOCK_BYTES, MOST, REACH, SIDE, Corner, HostGrid, Lattice, Picture, Pieces
 
 BATCH = 256
 """Blocks that are fused at once."""
 F = np.float32
 
 
-class ReferenceGrid(Grid):
+class ReferenceGrid(HostGrid):
     """See `Grid`; a thousand times slower than the compiled one."""
 
     def __init__(self, lattice: Lattice) -> None:
@@ -44,6 +44,11 @@ class ReferenceGrid(Grid):
         for at in range(0, len(rows), BATCH):
             self._fuse_rows(rows[at : at + BATCH], picture, offsets)
         return True
+
+    def put(self, keys: np.ndarray, distance: np.ndarray, weight: np.ndarray, color: np.ndarray) -> None:
+        self._insert(keys)
+        rows = np.searchsorted(self.keys, keys)
+        self.distance[rows], self.weight[rows], self.color[rows] = distance, weight, color
 
     def _insert(self, fresh: np.ndarray) -> None:
         keys = np.concatenate([self.keys, fresh])

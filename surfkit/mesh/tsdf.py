@@ -13,6 +13,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
+from surfkit.mesh.cuda import grid as gpu
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
 from surfkit.mesh.lengths import Lengths, resolve, with_unit
@@ -94,16 +95,18 @@ class TSDF(Mesher):
                 f"{LEAST_BYTES // 10**6}MB or more"
             )
         lengths, found = self._lengths(subject)
+        device = subject.rasterizer.where()
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
+        if device.type == "cuda":
+            most_blocks = min(most_blocks, gpu.most_blocks(device))
         lattice = Lattice(lengths.voxel, lengths.truncation, most_blocks=most_blocks)
         cameras = tuple(view.camera for view in subject.views)
         least = max(1, round(FULL * self.least_views))
         label = f"fusing views, {describe_lengths(lengths, subject)}"
         compare = None if self.trust is None else self.trust.among
         see = self._eyes(subject, lengths)
-        task = Task(
-            lattice, cameras, see, lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
-        )
+        how = lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
+        task = Task(lattice, cameras, see, *how, device=device)
         (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
         if not len(faces):
             raise BadInput(

@@ -79,7 +79,7 @@ def compress_run(
     began, run, model = time.perf_counter(), ctx.run, on_cpu(splats_of(ctx.run, made))
     importance = importance_of(model, ctx.scene.train, ctx.rasterizer) if compressor.needs_importance else None
     run.compressed.mkdir(exist_ok=True)
-    write = writing(model, importance, ctx.scene.frame, run.recipe.seed)
+    write = writing(model, importance, ctx.scene.frame, run.recipe.seed, ctx.rasterizer.where())
     if target is not None and target.is_set:
         judge = None if target.decibels is None else Judge(model, ctx.scene.train, ctx.rasterizer)
         compressor = fitted(compressor, target, write, judge)
@@ -109,12 +109,16 @@ def forget_compressed(run: Run) -> None:
 
 
 def writing(
-    model: SplatModel, importance: Tensor | None, frame: Frame | None, seed: int
+    model: SplatModel,
+    importance: Tensor | None,
+    frame: Frame | None,
+    seed: int,
+    device: torch.device = torch.device("cpu"),
 ) -> Callable[[Path, Compressor], int]:
     """What writes a model as `.surfkit` file with a compressor, tells its progress, and returns the bytes."""
 
     def write(path: Path, compressor: Compressor) -> int:
-        plan = compressor.plan(model, importance, seed)
+        plan = compressor.plan(model, importance, seed, device)
         return write_model(
             path, model, plan, compressor, frame, lambda done, of: emit(Progress("compressing points", done, of))
         )

@@ -24,6 +24,7 @@ from surfkit.primitives.points import Columns
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.testing.compare import assert_same, refuses, unchanged
 
+HERE = torch.device("cpu")
 LEAF = 70
 """Points of a leaf in the files of the check, so that there are several."""
 
@@ -124,8 +125,8 @@ def _check_plan(what: str, compressor: Compressor, model: SplatModel) -> Plan:
     if compressor.needs_importance:
         importance = torch.rand(len(model), generator=torch.Generator().manual_seed(1))
     with unchanged(f"{what}: plan", model=model.params, importance=importance):
-        plan = compressor.plan(model, importance, 3)
-    again = compressor.plan(model, importance, 3)
+        plan = compressor.plan(model, importance, 3, HERE)
+    again = compressor.plan(model, importance, 3, HERE)
     assert isinstance(plan, Plan), f"{what}: plan returned {type(plan).__name__}, not a Plan"
     assert_same(f"{what}: plan", [plan.tables, plan.marks], [again.tables, again.marks], "draw from its seed only")
     assert plan.encodings == again.encodings, f"{what}: plan is not repeatable; its encodings differ"
@@ -168,7 +169,7 @@ def _check_coarser(name: str, compressor: Compressor, model: SplatModel, folder:
         sizes = []
         for each in (compressor, other):
             importance = torch.linspace(0, 1, len(model)) if each.needs_importance else None
-            sizes.append(write_model(folder / "coarser.surfkit", model, each.plan(model, importance, 0), each))
+            sizes.append(write_model(folder / "coarser.surfkit", model, each.plan(model, importance, 0, HERE), each))
         assert sizes[1] < sizes[0], f"{name}.coarser(4.0) gives a file of {sizes[1]} bytes in place of {sizes[0]}"
 
 

@@ -1,9 +1,12 @@
 """Sources of kernels for the tests: the small ones here, and every one of surfkit with its limits."""
 
 import ctypes
+from dataclasses import replace
 from pathlib import Path
 
+from surfkit.compress.cuda import codes
 from surfkit.cuda.source import Source
+from surfkit.mesh.cuda import grid
 from surfkit.raster.cuda import rasterizer, ssim
 from surfkit.train import adam
 
@@ -21,7 +24,7 @@ def changed(source: Source, old: str, new: str, skip: int = 0) -> Source:
     """A source with one mistake: `new` in place of the occurrence of `old` after the first `skip`."""
     parts = source.text.split(old)
     assert len(parts) > skip + 1, f"{source.path.name} has no {old}"
-    other = Source(source.path, source.defines, source.structures)
+    other = replace(source)
     other.__dict__["text"] = old.join(parts[: skip + 1]) + new + old.join(parts[skip + 1 :])
     return other
 
@@ -37,6 +40,8 @@ def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
 SHIPPED: tuple[tuple[Source, dict[str, tuple[int, int]]], ...] = (
     (adam.SOURCE, {"adam": (40, 0)}),
     (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
+    (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
+    (codes.SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
     (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
     (raster("forward"), {"forward": (85, 18_000)}),
     (raster("backward"), {"backward": (128, 31_000)}),

@@ -7,6 +7,7 @@ import torch
 
 from surfkit.mesh.base import MeshInput
 from surfkit.raster.api import Maps, Splats
+from surfkit.raster.reference import Reference
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
 
@@ -99,7 +100,7 @@ def subject(cameras, shape, **changes):
         "splats": splats,
         "views": views,
         "draw": lambda view: found[view.name],
-        "rasterizer": None,
+        "rasterizer": Reference(),
         "near": 0.01,
         "frame": Frame(np.array([500_000.0, 5_700_000.0, 100.0]), 0.1, metres=1.0),
         "budget_bytes": 2**30,

@@ -204,7 +204,7 @@ def test_bisection_finds_the_largest_errors_that_fit():
         def __init__(self, factor=1.0):
             self.factor = factor
 
-        def plan(self, model, importance, seed):
+        def plan(self, model, importance, seed, device):
             return self
 
         def coarser(self, factor):

@@ -138,7 +138,7 @@ class Own(Compressor):
 
     needs_importance = True
 
-    def plan(self, model, importance, seed):
+    def plan(self, model, importance, seed, device=None):
         return self.spoilt(Lossless().plan(model, None, seed), model, importance, seed)
 
     def spoilt(self, plan, model, importance, seed):

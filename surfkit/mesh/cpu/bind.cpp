@@ -23,6 +23,7 @@ using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Words = nb::ndarray<const uint32_t, nb::c_contig, nb::device::cpu>;
 using Table = nb::ndarray<const int8_t, nb::c_contig, nb::device::cpu>;
 using Whole = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+using Keys = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
 
 template <class T>
@@ -58,16 +59,10 @@ void add_mesh(nb::module_& m) {
                  FuseJob job;
                  job.depth = depth.data();
                  job.shade = shade.data();
-                 job.height = (int)depth.shape(0);
-                 job.width = (int)depth.shape(1);
-                 job.fx = (float)lens.at(0);
-                 job.fy = (float)lens.at(1);
-                 job.cx = (float)lens.at(2);
-                 job.cy = (float)lens.at(3);
+                 job.lens = {(int)depth.shape(1), (int)depth.shape(0), (float)lens.at(0),
+                             (float)lens.at(1),   (float)lens.at(2),   (float)lens.at(3)};
                  std::memcpy(job.offsets, offsets.data(), sizeof job.offsets);
-                 job.truncation = (float)lengths.at(0);
-                 job.jump = (float)lengths.at(1);
-                 job.fade = (float)lengths.at(2);
+                 job.band = {(float)lengths.at(0), (float)lengths.at(1), (float)lengths.at(2)};
                  const Pose p = pose_of(pose);
                  nb::gil_scoped_release free;
                  return self.fuse(job, p, carve, named(kernels), threads);
@@ -97,6 +92,12 @@ void add_mesh(nb::module_& m) {
                  const size_t count = keys.size();
                  return nb::make_tuple(given(std::move(keys), {count}),
                                        given(std::move(raw), {count, sizeof(Block)}));
+             })
+        .def("put",
+             [](Grid& self, Keys keys, nb::ndarray<const int16_t, nb::c_contig, nb::device::cpu> distance,
+                nb::ndarray<const uint16_t, nb::c_contig, nb::device::cpu> weight, Bytes color) {
+                 nb::gil_scoped_release free;
+                 self.put(keys.data(), (int64_t)keys.shape(0), distance.data(), weight.data(), color.data());
              })
         .def_prop_ro("blocks", &Grid::blocks)
         .def_prop_ro("bytes", &Grid::bytes);

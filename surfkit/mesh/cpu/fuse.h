@@ -4,10 +4,9 @@
 
 #include <cstdint>
 
-namespace surfkit {
+#include "../voxel.h"
 
-constexpr int kSide = 8;  // voxels
-constexpr int kVoxels = kSide * kSide * kSide;
+namespace surfkit {
 
 // 7 bytes a voxel, x fastest. Rounding is dithered, so that means over many views do not get stuck.
 struct alignas(64) Block {
@@ -19,14 +18,11 @@ struct alignas(64) Block {
 struct FuseJob {
     const float* depth;      // (height, width) camera z, 0 for none
     const uint32_t* shade;   // (height, width) red, green, blue, weight from the lowest byte up
-    int width, height;
-    float fx, fy, cx, cy;
+    Lens lens;
     float offsets[3][kVoxels];  // camera coordinates of each voxel less those of the first
-    float truncation, jump, fade;  // fade: depth behind the surface at which the weight begins to fall
+    Band band;
 };
 
-constexpr int kBlockBits = 17;
-constexpr int kBlockBias = 1 << (kBlockBits - 1);  // blocks along each axis, to either side of the origin
 constexpr uint64_t kNoKey = ~uint64_t{0};
 
 // A row of pixels, and how it lies among the blocks. Lengths are in blocks.

@@ -14,37 +14,20 @@ namespace {
 constexpr int kCoarse = 16;  // pixels of a tile of the coarse depth
 constexpr int kRows = 16;    // of the picture in one piece of work
 
-uint64_t pack(int64_t x, int64_t y, int64_t z) {
-    return (uint64_t)(z + kBlockBias) << 2 * kBlockBits | (uint64_t)(y + kBlockBias) << kBlockBits |
-           (uint64_t)(x + kBlockBias);
-}
-
-int64_t part(uint64_t key, int axis) {
-    return (int64_t)(key >> axis * kBlockBits & ((1u << kBlockBits) - 1)) - kBlockBias;
-}
-
-uint64_t mixed(uint64_t x) {
-    x ^= x >> 31;
-    x *= 0x7fb5d329728ea185ull;
-    x ^= x >> 27;
-    x *= 0x81dadef4bc2dd44dull;
-    return x ^ x >> 33;
-}
-
 // The largest depth in each tile of kCoarse x kCoarse pixels, and those next to it, which interpolation may reach.
 struct Coarse {
     int wide, high;
     std::vector<float> most;
 
     Coarse(const FuseJob& job, int threads)
-        : wide((job.width + kCoarse - 1) / kCoarse), high((job.height + kCoarse - 1) / kCoarse), most(wide * high) {
+        : wide((job.lens.width + kCoarse - 1) / kCoarse), high((job.lens.height + kCoarse - 1) / kCoarse), most(wide * high) {
         parallel(high, threads, [&](int64_t row) {
-            const int y0 = std::max((int)row * kCoarse - 1, 0), y1 = std::min((int)(row + 1) * kCoarse + 1, job.height);
+            const int y0 = std::max((int)row * kCoarse - 1, 0), y1 = std::min((int)(row + 1) * kCoarse + 1, job.lens.height);
             for (int col = 0; col < wide; col++) {
-                const int x0 = std::max(col * kCoarse - 1, 0), x1 = std::min((col + 1) * kCoarse + 1, job.width);
+                const int x0 = std::max(col * kCoarse - 1, 0), x1 = std::min((col + 1) * kCoarse + 1, job.lens.width);
                 float top = 0;
                 for (int y = y0; y < y1; y++)
-                    for (int x = x0; x < x1; x++) top = std::max(top, job.depth[(int64_t)y * job.width + x]);
+                    for (int x = x0; x < x1; x++) top = std::max(top, job.depth[(int64_t)y * job.lens.width + x]);
                 most[row * wide + col] = top;
             }
         });
@@ -56,8 +39,8 @@ struct Coarse {
         if (at[2] + radius <= 0) return 0;
         int low[2] = {0, 0}, high_[2] = {wide - 1, high - 1};
         if (near > 0.1 * radius) {  // else it surrounds the camera, or nearly so
-            const double focal[2] = {job.fx, job.fy}, centre[2] = {job.cx, job.cy};
-            const int size[2] = {job.width, job.height};
+            const double focal[2] = {job.lens.fx, job.lens.fy}, centre[2] = {job.lens.cx, job.lens.cy};
+            const int size[2] = {job.lens.width, job.lens.height};
             for (int axis = 0; axis < 2; axis++) {
                 const double a = at[axis] - radius, b = at[axis] + radius, far = at[2] + radius;
                 const double from = focal[axis] * (a < 0 ? a / near : a / far) + centre[axis] - 1;
@@ -126,9 +109,9 @@ void Grid::insert(uint64_t key) {
 std::vector<uint64_t> Grid::seen_by(const FuseJob& job, const Pose& pose, const FuseKernels& kernels,
                                     int threads) const {
     RowJob all{};
-    all.width = job.width;
-    all.fx = job.fx;
-    all.cx = job.cx;
+    all.width = job.lens.width;
+    all.fx = job.lens.fx;
+    all.cx = job.lens.cx;
     all.per_block = 1 / (voxel_ * kSide);
     all.reach = reach_ * all.per_block;
     for (int axis = 0; axis < 3; axis++) {
@@ -139,18 +122,18 @@ std::vector<uint64_t> Grid::seen_by(const FuseJob& job, const Pose& pose, const 
         all.low[axis] = (int32_t)low_[axis];
         all.high[axis] = (int32_t)high_[axis] - 1;
     }
-    const int pieces = (job.height + kRows - 1) / kRows;
+    const int pieces = (job.lens.height + kRows - 1) / kRows;
     std::vector<std::vector<uint64_t>> found(pieces);
     parallel(pieces, threads, [&](int64_t piece) {
-        const size_t width = (size_t)job.width;
+        const size_t width = (size_t)job.lens.width;
         std::vector<uint64_t> low(2 * width, kNoKey), high(2 * width, kNoKey);  // this row and the one above, in turns
         std::vector<uint64_t>& keys = found[piece];
         RowJob row = all;
-        const int end = std::min(job.height, (int)(piece + 1) * kRows);
+        const int end = std::min(job.lens.height, (int)(piece + 1) * kRows);
         for (int y = (int)piece * kRows; y < end; y++) {
-            row.depth = job.depth + (int64_t)y * job.width;
-            row.shade = job.shade + (int64_t)y * job.width;
-            row.row = (y + 0.5 - job.cy) / job.fy;
+            row.depth = job.depth + (int64_t)y * job.lens.width;
+            row.shade = job.shade + (int64_t)y * job.lens.width;
+            row.row = (y + 0.5 - job.lens.cy) / job.lens.fy;
             const size_t here = y % 2 * width, above = (y + 1) % 2 * width;
             kernels.row(row, &low[here], &high[here]);
             uint64_t left_low = kNoKey, left_high = kNoKey;
@@ -161,7 +144,7 @@ std::vector<uint64_t> Grid::seen_by(const FuseJob& job, const Pose& pose, const 
                 if (known || a == kNoKey) continue;
                 for (int64_t k = part(a, 2); k <= part(b, 2); k++)
                     for (int64_t j = part(a, 1); j <= part(b, 1); j++)
-                        for (int64_t i = part(a, 0); i <= part(b, 0); i++) keys.push_back(pack(i, j, k));
+                        for (int64_t i = part(a, 0); i <= part(b, 0); i++) keys.push_back(packed((int)i, (int)j, (int)k));
             }
         }
     });
@@ -185,7 +168,7 @@ std::vector<int64_t> Grid::in_sight(const FuseJob& job, const Pose& pose, int th
                 at[row] = r[0] * world[0] + r[1] * world[1] + r[2] * world[2] + pose.shift[row];
             }
             const float most = coarse.under(job, at, radius);
-            if (most > 0 && at[2] - radius < most + job.truncation) found[at_piece].push_back(index);
+            if (most > 0 && at[2] - radius < most + job.band.truncation) found[at_piece].push_back(index);
         }
     });
     std::vector<int64_t> joined;
@@ -228,6 +211,17 @@ bool Grid::fuse(const FuseJob& job, const Pose& pose, bool carve, const FuseKern
         }
     });
     return true;
+}
+
+void Grid::put(const int64_t* keys, int64_t count, const int16_t* distance, const uint16_t* weight,
+               const uint8_t* color) {
+    for (int64_t i = 0; i < count; i++) {
+        insert((uint64_t)keys[i]);
+        Block& made = block(blocks() - 1);
+        std::memcpy(made.distance, distance + i * kVoxels, sizeof made.distance);
+        std::memcpy(made.weight, weight + i * kVoxels, sizeof made.weight);
+        std::memcpy(made.color, color + i * 3 * kVoxels, sizeof made.color);
+    }
 }
 
 std::vector<int64_t> Grid::order() const {

@@ -37,6 +37,9 @@ class Grid {
     // nothing is done, if there would be more than `most_blocks`.
     bool fuse(const FuseJob& job, const Pose& pose, bool carve, const FuseKernels& kernels, int threads);
 
+    // Take blocks that were fused elsewhere, none of which is here: their keys, and the voxels of each in turn.
+    void put(const int64_t* keys, int64_t count, const int16_t* distance, const uint16_t* weight, const uint8_t* color);
+
     // The surface where the weight of all voxels around is at least `least_weight`; of cells below `end` alone.
     Triangles surface(const CubeTable& table, int least_weight, const int64_t end[3], bool with_edges,
                       int threads) const;

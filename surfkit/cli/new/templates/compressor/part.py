@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from surfkit import BadInput, Compressor, Plan, SplatModel
 from surfkit.compress.scalars import Floats
 from torch import Tensor
@@ -22,7 +23,9 @@ class NewPart(Compressor):
         if "means" in self.half:
             raise BadInput("new-part.half names means; positions need more digits than float16 has")
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         encodings = []
         for name, values in model.primitive.per_point(model.params).items():

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 from surfkit import BadInput, ColumnType, Columns, Compressor, Encoding, Leaf, Plan, SplatModel, choice
 from surfkit.compress.encoding import Streams, Tables, flat, from_whole, multiples
 from surfkit.compress.scalars import Floats
@@ -53,7 +54,9 @@ class NewPartFiles(Compressor):
     encoding: Annotated[Encoding, choice(Encoding)] = field(default_factory=NewPart)
     """How it is encoded; columns that a model does not have are left out."""
 
-    def plan(self, model: SplatModel, importance: Tensor | None, seed: int) -> Plan:
+    def plan(
+        self, model: SplatModel, importance: Tensor | None, seed: int, device: torch.device = torch.device("cpu")
+    ) -> Plan:
         """See `Compressor.plan`."""
         columns = model.primitive.per_point(model.params)
         chosen = [self.encoding] if set(self.encoding.columns) <= set(columns) else []

@@ -1,0 +1,1 @@
+"""Fusion of depth maps on NVIDIA GPUs."""
