@@ -23,7 +23,7 @@ FLOORS = (
     "run",
     "blocks",
     "pipeline",
-    "report doctor",
+    "report doctor render",
     "recipes",
     "cli viewer testing",
 )

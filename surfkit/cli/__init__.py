@@ -27,6 +27,7 @@ COMMANDS = {
     "compress": "Compress the model of a finished run, or a file of splats.",
     "lod": "Make levels of detail of a finished run, or make them again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
+    "render": "Draw a finished run along a path of the camera, as a video or as pictures.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",
@@ -48,6 +49,7 @@ MEMORY_ADVICE = {
     "mesh": "mesh:tsdf, a larger --mesh.voxel or a lower --memory need less, mesh:tetra with a higher --mesh.faint too",
     "lod": "a lower --memory or --lod.steps 0 need less",
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
+    "render": "a smaller --size needs less",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
     "prepare": "a lower --estimator.longest or smaller photographs (--longest, --scale) need less",
 }

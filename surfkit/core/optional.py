@@ -11,8 +11,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
-    "OpenEXR": "exr", "lpips": "lpips", "open3d": "mesh", "pyproj": "crs", "ray": "ray", "submitit": "slurm",
-    "tensorboard": "tensorboard", "transformers": "depth",
+    "OpenEXR": "exr", "cv2": "video", "lpips": "lpips", "open3d": "mesh", "pyproj": "crs", "ray": "ray",
+    "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""
 LIBRARIES = {

@@ -1,0 +1,152 @@
+"""`surfkit render`."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.lock import locked
+from surfkit.pipeline import loaded
+from surfkit.raster.select import Device
+from surfkit.render.frames import Show, draw_frames
+from surfkit.render.path import LONGEST, MOST_FRAMES, Flight, flyover, from_file, lens_of, orbit
+from surfkit.render.video import is_video, require_video, write_video
+from surfkit.run.folder import Run
+from surfkit.run.notes import collect_notes
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import Scene
+from surfkit.train.bars import bars
+from surfkit.train.faults import full_disk_in_one_line
+
+SIZE = re.compile(r"(\d{1,5})x(\d{1,5})")
+FPS = 30.0
+MADE: dict[str, Callable[[Scene, Camera, int], Flight]] = {"orbit": orbit, "flyover": flyover}
+
+
+@dataclass(frozen=True)
+class Render:
+    """Draw a finished run along a path of the camera, as a video or as pictures.
+
+    Example: `surfkit render RUN --path orbit --out orbit.mp4 --seconds 20 --size 1920x1080`. When it is interrupted,
+    the same command goes on where it stopped.
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Folder that `surfkit train` made."""
+
+    path: Annotated[str, tyro.conf.arg(metavar="orbit|flyover|FILE")] = "orbit"
+    """orbit: around the middle of the scene. flyover: straight over it, along its longest side. FILE: JSON with cameras
+    to fly through, as RUN/cameras.json, or a camera path of nerfstudio in the frame of the data set."""
+
+    out: Path | None = None
+    """Video file, .mp4 or .webm (needs OpenCV: `pip install 'surfkit[video]'`), or a folder for pictures. Default: a
+    video in the run folder, named after the path."""
+
+    seconds: float = 10.0
+    """Length of the video. A camera path of nerfstudio has its own number of frames."""
+
+    fps: float | None = None
+    """Frames per second. Default: what the file of cameras says, otherwise 30."""
+
+    size: Annotated[str | None, tyro.conf.arg(metavar="WIDTHxHEIGHT")] = None
+    """Size of the pictures, pixels, such as 1920x1080. Default: that of the training photographs."""
+
+    show: Show = "color"
+    """What is drawn."""
+
+    compressed: bool = False
+    """Draw the compressed model of the run (`surfkit compress`)."""
+
+    keep_frames: bool = False
+    """Keep the folder of pictures beside the video, OUT.frames."""
+
+    device: Device = "auto"
+    """Device for rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name (`surfkit components rasterizer`)."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("seconds", self.seconds), ("fps", self.fps)):
+            if value is not None and not 0 < value <= 1e6:
+                raise BadInput(f"--{name} {value:g}: give more than 0, up to a million")
+        if self.frames > MOST_FRAMES:
+            raise BadInput(f"--seconds {self.seconds:g}: that is {self.frames} frames; at most {MOST_FRAMES} are drawn")
+        self.sides()
+        if self.path not in MADE and not Path(self.path).is_file():
+            raise BadInput(f"--path {self.path}: no such file; give {', '.join(MADE)} or a JSON file with cameras")
+        if self.out is not None and self.out.suffix and not is_video(self.out):
+            raise BadInput(f"--out {self.out}: give a video, .mp4 or .webm, or a folder for pictures")
+
+    @property
+    def frames(self) -> int:
+        """How many there are, if the path does not say."""
+        return max(1, round(self.seconds * (self.fps or FPS)))
+
+    def sides(self) -> tuple[int, int] | None:
+        """Width and height in pixels; BadInput if `size` is none."""
+        if self.size is None:
+            return None
+        found = SIZE.fullmatch(self.size)
+        sides = tuple(map(int, found.groups())) if found else (0, 0)
+        if not all(16 <= side <= LONGEST for side in sides):
+            raise BadInput(f"--size {self.size}: give width and height such as 1920x1080, of 16 to {LONGEST} pixels")
+        return sides[0], sides[1]
+
+    def run(self) -> None:
+        """Draw the frames, make the video, and print what was written."""
+        name = self.path if self.path in MADE else Path(self.path).stem
+        out = self.out or self.run_folder / f"{name}.mp4"
+        film = is_video(out)
+        if film:
+            require_video()  # before hours are spent
+        folder = out.with_name(f"{out.name}.frames") if film else out
+        with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
+            draw = (made.draw_color if self.show == "color" else None) or made.draw
+            if draw is None:
+                raise BadInput(f"{ctx.run.out}: what its method has made draws no pictures")
+            flight = self.flight(ctx.scene)
+            fps = self.fps or flight.fps or FPS
+            with locked(folder), full_disk_in_one_line(folder):
+                frames = draw_frames(folder, flight.cameras, draw, self.show, identity(ctx.run), replace=film)
+                if film:
+                    write_video(out, frames, fps)
+                    if not self.keep_frames:
+                        shutil.rmtree(folder)
+        lens = flight.cameras[0]
+        print_table(
+            ("render", "value"),
+            [
+                ("path", self.path),
+                ("frames", f"{len(frames)}, {len(frames) / fps:.1f} s at {fps:g} per second"),
+                ("size", f"{lens.width} x {lens.height}"),
+                ("video" if film else "pictures", str(out)),
+            ],
+        )
+
+    def flight(self, scene: Scene) -> Flight:
+        """The cameras of all frames."""
+        lens = lens_of(scene, self.sides())
+        if self.path in MADE:
+            return MADE[self.path](scene, lens, self.frames)
+        return from_file(Path(self.path), scene, lens, self.frames)
+
+
+def identity(run: Run) -> str:
+    """A text that differs between models: of the files that describe them, and of what they hold."""
+    found = hashlib.sha256()
+    for name in ("recipe.json", "run.json", "point_cloud.ply", "model.surfkit"):
+        path = run.out / name
+        if path.exists():
+            facts = path.stat()
+            found.update(f"{name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    return found.hexdigest()
+
+
+COMMAND = Render

@@ -1,0 +1,1 @@
+"""Pictures and videos of a model along a path of the camera."""

@@ -1,0 +1,69 @@
+"""Frames to a video file: VP9, in MP4 or WebM, by OpenCV."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.core.files import sync_folder
+from surfkit.core.optional import needed
+
+CODECS = {".mp4": "vp09", ".webm": "VP90"}
+"""Names of VP9 by container. OpenCV's packages have no encoder of H.264."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path names a video file, and not a folder of pictures."""
+    return path.suffix.lower() in CODECS
+
+
+def require_video() -> ModuleType:
+    """OpenCV; BadInput where it does not load."""
+    with needed("cv2", "a video"):
+        import cv2
+
+    return cv2
+
+
+def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
+    """Make a video of pictures of one size; the file is whole or not there.
+
+    Raises:
+        BadInput: OpenCV is not installed, or has no encoder.
+    """
+    cv2 = require_video()
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix.lower()}")  # the ending is the container
+    with Image.open(frames[0]) as first:
+        size = first.size
+    try:
+        writer = cv2.VideoWriter(
+            str(unfinished), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*CODECS[path.suffix.lower()]), fps, size
+        )
+        if not writer.isOpened():
+            raise BadInput(
+                f"{path}: OpenCV {cv2.__version__} cannot encode VP9; install opencv-python-headless, or give a "
+                "folder as --out and encode its pictures with another program"
+            )
+        _write(writer, frames)
+        os.replace(unfinished, path)
+        sync_folder(path.parent)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _write(writer: Any, frames: Sequence[Path]) -> None:
+    try:
+        for at, frame in enumerate(frames):
+            with Image.open(frame) as picture:
+                writer.write(np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1]))
+            emit(Progress("encoding the video", at + 1, len(frames)))
+    finally:
+        writer.release()
