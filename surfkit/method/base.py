@@ -36,6 +36,7 @@ class Reconstruction:
         seconds: Wall time, of all the processes that have worked on it; None for what surfkit has measured.
         cpu_seconds: CPU time of all threads, likewise.
         peak_memory_bytes: Most memory held, likewise.
+        peak_gpu_bytes: Most memory of the GPU held, likewise; 0 without one.
         correct_color: Whether to measure PSNR after a colour correction too, as training let photographs differ.
     """
 
@@ -49,6 +50,7 @@ class Reconstruction:
     seconds: float | None = None
     cpu_seconds: float | None = None
     peak_memory_bytes: int | None = None
+    peak_gpu_bytes: int | None = None
     correct_color: bool = False
 
 

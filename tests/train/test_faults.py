@@ -24,7 +24,7 @@ def cuda_error():
 @pytest.mark.parametrize("fails", [real_cpu_error, python_error, cuda_error])
 def test_out_of_memory_says_what_to_lower(fails):
     with pytest.raises(
-        Fault, match=r"run: out of memory.*--longest.*--pretrain.densify.threshold.*checkpoint is whole"
+        Fault, match=r"run: out of (GPU )?memory.*--longest.*--pretrain.densify.threshold.*checkpoint is whole"
     ):
         with in_one_line(Path("run")):
             fails()
