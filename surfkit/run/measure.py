@@ -60,7 +60,7 @@ def evaluate(
             measured = evaluate_views(
                 scene.held_out,
                 photo_cache(scene.held_out, ahead),
-                made.draw,
+                made.draw_there or made.draw,
                 timed=colors,
                 show=show,
                 correct_color=made.correct_color,

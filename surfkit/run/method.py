@@ -28,7 +28,7 @@ from surfkit.method.base import MethodInput, Reconstruction
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import Device, torch_device
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
@@ -270,14 +270,19 @@ def with_drawing(made: Reconstruction, rasterizer: Rasterizer) -> Reconstruction
     """The reconstruction with its splats drawn by the rasterizer, where it does not draw by itself."""
     if made.draw is not None or made.splats is None:
         return made
-    splats, near = made.splats.splats, made.splats.near
+    near, draws = made.splats.near, drawn_by(made.splats.primitive, rasterizer)
 
-    draws = drawn_by(made.splats.primitive, rasterizer)
+    @cache
+    def there() -> Splats:
+        return made.splats.splats.to(rasterizer.where())
 
     def maps(view: View, geometry: bool) -> Maps:
-        return draws.render(splats, view.camera, near, geometry, distortion=False).maps
+        return draws.render(there(), view.camera, near, geometry, distortion=False).maps
 
-    return replace(made, draw=lambda view: maps(view, True), draw_color=lambda view: maps(view, False))
+    def here(view: View) -> Maps:
+        return Maps(**{name: value.cpu() for name, value in maps(view, True).present().items()})
+
+    return replace(made, draw=here, draw_there=lambda view: maps(view, True), draw_color=lambda view: maps(view, False))
 
 
 def splats_of(run: Run, made: Reconstruction) -> SplatModel:

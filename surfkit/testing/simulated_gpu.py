@@ -182,6 +182,7 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
         "mem_get_info": lambda: (gpu.free(), gpu.free() + gpu.held),
         "memory_allocated": lambda: gpu.held,
         "memory_reserved": lambda: gpu.held,
+        "synchronize": lambda device=None: gpu._wait("synchronize"),
     }
     with mock.patch.object(modules, "_loaded", emulated), mock.patch.multiple(torch.cuda, **memory), gpu:
         yield gpu
