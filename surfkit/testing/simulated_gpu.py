@@ -177,11 +177,11 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
 
     gpu = SimulatedGpu()
     memory = {
-        "max_memory_allocated": lambda: gpu.peak,
-        "reset_peak_memory_stats": gpu.reset_peak,
-        "mem_get_info": lambda: (gpu.free(), gpu.free() + gpu.held),
-        "memory_allocated": lambda: gpu.held,
-        "memory_reserved": lambda: gpu.held,
+        "max_memory_allocated": lambda device=None: gpu.peak,
+        "reset_peak_memory_stats": lambda device=None: gpu.reset_peak(),
+        "mem_get_info": lambda device=None: (gpu.free(), gpu.free() + gpu.held),
+        "memory_allocated": lambda device=None: gpu.held,
+        "memory_reserved": lambda device=None: gpu.held,
         "synchronize": lambda device=None: gpu._wait("synchronize"),
     }
     with mock.patch.object(modules, "_loaded", emulated), mock.patch.multiple(torch.cuda, **memory), gpu:
