@@ -160,10 +160,10 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
             if not is_out_of_memory(error):
                 raise
             if is_out_of_gpu_memory(error):
-                if state.whole and state.index:
+                if state.whole and state.index and at.block is None:  # a block falls back to an earlier, smaller state
                     save(at, state, job.meter)
                 if not trainer.uploads.bytes:
-                    raise out_of_memory(at.out, ", though no photographs are kept in it", error) from error
+                    raise out_of_memory(at.out, ", though photographs are not kept in it", error) from error
                 emit(Warned(lowered(trainer.uploads, f"step {state.index + 1}: the memory of the GPU gave out")))
             elif not lower_caches(given, f"step {state.index + 1}: out of memory"):
                 raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
