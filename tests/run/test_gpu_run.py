@@ -12,13 +12,15 @@ from surfkit.cli.result import result_rows
 from surfkit.cli.status import rows
 from surfkit.core.check import Fault
 from surfkit.core.tree import evolve
+from surfkit.evaluate.images.measure import evaluate_views
 from surfkit.pipeline import Intervals, run, with_steps
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.report.html.sections.resources import resources
 from surfkit.report.html.source import read_source
 from surfkit.report.status import status
-from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
+from surfkit.run import measure
+from surfkit.testing.simulated_gpu import OnSimulatedGpu, is_there, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import CacheSettings
 from surfkit.train.stage import Trainer
@@ -78,6 +80,18 @@ def test_its_memory_is_told_beside_that_of_the_cpu(gpu, data, recipe, tmp_path):
     assert 0 < found.peak_gpu_bytes <= peak and "peak GPU memory" in dict(rows(found))
     text = str(resources([read_source(tmp_path / "run", "run", 1)]))
     assert "peak GPU memory" in text and "The most memory of the GPU" in text
+
+
+def test_held_out_photographs_are_measured_there(gpu, data, recipe, tmp_path, monkeypatch):
+    drawn = []
+
+    def measured(views, photos, draw, **given):
+        drawn.extend(is_there(each(views[0]).color) for each in (draw, given["timed"]))
+        return evaluate_views(views, photos, draw, **given)
+
+    monkeypatch.setattr(measure, "evaluate_views", measured)
+    metrics = run(with_steps(recipe, 2), data, tmp_path / "run", intervals=EVERY)
+    assert drawn == [True, True] and metrics["images"]["psnr"] > 5 and metrics["fps"] > 0
 
 
 def test_nothing_is_told_of_a_gpu_without_one(data, recipe, tmp_path):
