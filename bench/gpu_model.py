@@ -215,8 +215,8 @@ def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
     render.backward(cotangents, Maps(color=cotangents.color))
     step = dict(launches)
     on.contribution(splats, camera, 0.2, 0.5, 0.5)
-    drawn = render._pass
-    facts = {"seen": len(drawn.index) / share, "pairs": len(drawn.entries) / share}
+    lists = render._pass
+    facts = {"seen": len(lists.index) / share, "pairs": len(lists.entries) / share}
     return step | {name: launches[name] for name in ("contribution", "total")}, facts
 
 

@@ -35,9 +35,15 @@ def is_out_of_memory(error: BaseException) -> bool:
     return known and any(words in str(error).lower() for words in NO_MEMORY)
 
 
+def is_out_of_gpu_memory(error: BaseException | None) -> bool:
+    """Whether the memory of the GPU ran out, as torch or the driver says it, and not that of the CPU."""
+    text = str(error).lower() if isinstance(error, RuntimeError) else ""
+    return type(error).__name__ == "OutOfMemoryError" or ("cuda" in text and "out of memory" in text)
+
+
 def out_of_memory(error: BaseException | None = None) -> str:
     """What to say when memory gave out: how much is held, and how much more was wanted if the error tells."""
-    on_gpu = type(error).__name__ == "OutOfMemoryError"
+    on_gpu = is_out_of_gpu_memory(error)
     parts = [f"{peak / 2**30:.1f} GiB held"] if (peak := peak_memory_bytes()) and not on_gpu else []
     if found := ASKED.search(str(error)):
         number, _, unit = found[1].partition(" ")

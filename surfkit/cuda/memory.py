@@ -1,4 +1,4 @@
-"""The memory of the GPU that torch uses: how much of it tensors have held, and whether it gave out."""
+"""The memory of the GPU that torch uses: how much of it tensors have held, and how much is free."""
 
 from __future__ import annotations
 
@@ -27,9 +27,3 @@ def free_gpu_bytes() -> int:
 def release_gpu() -> None:
     """Hand what torch keeps in reserve back to the driver, so that one large piece can be had instead of many small."""
     torch.cuda.empty_cache()
-
-
-def is_out_of_gpu_memory(error: BaseException) -> bool:
-    """Whether the memory of the GPU ran out, and not that of the CPU."""
-    driver = isinstance(error, RuntimeError) and "cuda error: out of memory" in str(error).lower()
-    return driver or isinstance(error, torch.cuda.OutOfMemoryError)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
-from surfkit.core.memory import peak_memory_bytes
-from surfkit.cuda.memory import is_out_of_gpu_memory, peak_gpu_bytes
+from surfkit.core.memory import is_out_of_gpu_memory, peak_memory_bytes
+from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from surfkit.core.check import Fault
 from surfkit.core.files import DISK_FULL
-from surfkit.core.memory import is_out_of_memory
+from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory
 from surfkit.core.memory import out_of_memory as say_out_of_memory
-from surfkit.cuda.memory import is_out_of_gpu_memory
 from surfkit.train.cotangents import as_numbers
 
 MOST_HALVINGS = 2
