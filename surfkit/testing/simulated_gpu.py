@@ -26,6 +26,8 @@ from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
+MEMORY = 1 << 34
+"""Bytes."""
 WAITS = {"item", "tolist", "nonzero", "unique", "masked_select", "__bool__", "__float__", "__int__", "__index__"}
 """Operations after which the host knows something that was computed on the GPU."""
 FACTS = {"data_ptr", "__len__", "__hash__", "__repr__", "__format__", "__dir__", "__reduce_ex__", "untyped_storage"}
@@ -40,7 +42,8 @@ class SimulatedGpu(TorchFunctionMode):
         waits: How often the host waited for a result, by the name of the operation.
         held: Bytes of all tensors on the GPU now.
         peak: Most of them so far, since it was last reset.
-        limit: Bytes that the GPU has; None for no limit. What needs more raises what torch raises.
+        limit: Bytes that the GPU has; what needs more raises what torch raises. None for none: it says that it has
+            `MEMORY`.
         refused: Numbers of allocations, counted from 1, that fail as if the GPU were full.
         allocations: How many there have been.
     """
@@ -87,7 +90,7 @@ class SimulatedGpu(TorchFunctionMode):
 
     def free(self) -> int:
         """Bytes that can still be had."""
-        return 10**12 if self.limit is None else self.limit - self.held
+        return (MEMORY if self.limit is None else self.limit) - self.held
 
     def _put(self, value: Any, there: bool) -> Any:
         """The same, with all its tensors in a place."""
