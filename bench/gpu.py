@@ -33,7 +33,7 @@ from surfkit.raster.select import select
 from surfkit.raster.ssim import ssim
 from surfkit.scene.camera import Camera
 from surfkit.train.adam import update
-from surfkit.train.state import uploaded
+from surfkit.train.uploads import uploaded
 
 KINDS = {"surfel": "2dgs", "gaussian": "3dgs"}
 SIZE = (1600, 1200)

@@ -4,17 +4,23 @@ A small launch in the emulator gives what each value costs: bytes of global and 
 them, shuffles. NVRTC gives registers and shared memory of a block, from which follows how many warps a multiprocessor
 holds. The time of a full-sized launch is at least that of its busiest part: main memory (each tensor once), the path to
 the first cache and shared memory (128 bytes a clock and multiprocessor, a shuffle of a warp counts as 128), arithmetic
-(128 fused multiply-adds a clock). Nothing here is measured on a GPU.
+(128 fused multiply-adds a clock, in double `doubles`). Nothing here is measured on a GPU.
+
+The rasterizer draws a piece of 64 x 64 pixels of bench/gpu.py's view, with as many surfels a tile, and its launches are
+scaled up by the tiles. PTX gives its arithmetic: for each splat once what a kernel has of it, for each warp and splat
+what the loops have. torch's sorts are taken as passes over main memory.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from machine import save
+from scenes import city
 
 from surfkit.compress.cuda import codes
 from surfkit.cuda.emulated import Emulated
@@ -23,7 +29,10 @@ from surfkit.cuda.source import Source
 from surfkit.mesh.cuda import grid
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.lattice import Lattice, Picture
+from surfkit.raster.api import Maps
 from surfkit.raster.cuda import ssim
+from surfkit.raster.cuda.rasterizer import TileRasterizer
+from surfkit.raster.cuda.rasterizer import source as raster_source
 from surfkit.scene.camera import Camera
 from surfkit.train import adam
 
@@ -40,6 +49,8 @@ class Gpu:
     warps: int
     blocks: int
     shared: int
+    doubles: int = 2
+    """Fused multiply-adds in double precision, a clock and multiprocessor."""
     registers: int = 65536
 
     def resident(self, registers: int, shared: int, threads: int) -> int:
@@ -52,7 +63,7 @@ class Gpu:
 
 
 GPUS = (
-    Gpu("H200", "sm_90", 132, 1.98e9, 4.8e12, 64, 32, 228 << 10),
+    Gpu("H200", "sm_90", 132, 1.98e9, 4.8e12, 64, 32, 228 << 10, 64),
     Gpu("RTX 4090", "sm_89", 128, 2.52e9, 1.008e12, 48, 24, 100 << 10),
 )
 
@@ -131,6 +142,138 @@ def expected(case: Case, gpu: Gpu) -> dict[str, float | int | str]:
     return {"ms": times[longest], "limit": longest, "warps": f"{resident} of {gpu.warps}", **used, "parts_ms": times}
 
 
+PIECE, TILES = (64, 64), 7500
+"""Pixels that are emulated, and tiles of 16 x 16 of 1600 x 1200."""
+SORTED = 4 * 2 * (4 + 8) + 4
+"""Bytes of main memory to sort a key of 32 bits with a place of 64: a count, four passes that read and write both."""
+LISTED = 60
+"""Bytes of main memory to bring what was sorted in order."""
+SLOW = {"div": 10, "rcp": 6, "sqrt": 10}
+"""Multiply-adds that one of these takes."""
+
+
+class Noted:
+    """Kernels of the rasterizer, emulated; notes what their launches did, by kernel."""
+
+    def __init__(self, source: Source, launches: dict[str, Launch]) -> None:
+        self.source, self.launches, self.on = source, launches, Emulated(source)
+
+    def launch(self, name: str, grid: int, block: int, *arguments: object) -> None:
+        self.on.launch(name, grid, block, *arguments)
+        work, tensors = self.on.work, [each for each in arguments if isinstance(each, torch.Tensor)]
+        asked = sum(work.global_bytes) + sum(work.shared_bytes) + 128 * work.collectives
+        memory = sum(each.nbytes for each in tensors)
+        self.launches[name] = Launch(self.source, name, block, grid, asked, memory, work.collectives, tensors)
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What a launch did; `memory` is each of its tensors once."""
+
+    source: Source
+    kernel: str
+    threads: int
+    blocks: int
+    asked: int
+    memory: int
+    collectives: int
+    tensors: list[torch.Tensor]
+
+    def arithmetic(self) -> tuple[float, float]:
+        """Multiply-adds of all lanes, in float and in double: of a thread each, or of a warp and splat."""
+        ptx = nvrtc().compile(self.source, "compute_89")[0].decode(errors="replace")
+        body = ptx.partition(f".entry {self.kernel}(")[2].partition(".entry ")[0]
+        if self.kernel in EVALUATIONS:
+            return 32 * EVALUATIONS[self.kernel](self) * instructions(blending(body), "f32"), 0
+        floats, doubles = (instructions(body, kind) for kind in ("f32", "f64"))
+        threads = self.blocks * self.threads
+        return threads * floats, threads * doubles
+
+
+EVALUATIONS: dict[str, Callable[[Launch], float]] = {
+    "forward": lambda launch: launch.collectives,  # a vote after each splat
+    "backward": lambda launch: sum((word & 0xFFFFFFFF).bit_count() for word in launch.tensors[-3].tolist()),
+    "contribution": lambda launch: launch.collectives / 6,  # five shuffles and a vote
+}
+"""How often a warp looks at a splat."""
+
+
+def blending(ptx: str) -> str:
+    """The innermost loop with an exponential: what a warp does with a splat."""
+    lines = ptx.splitlines()
+    labels = {line.rstrip(":"): at for at, line in enumerate(lines) if line.startswith("$") and line.endswith(":")}
+    jumps = ((at, re.search(r"bra\S*\s+(\$\w+);", line)) for at, line in enumerate(lines))
+    loops = (lines[labels[to[1]] : at] for at, to in jumps if to and labels.get(to[1], at) < at)
+    return "\n".join(min((loop for loop in loops if any("ex2." in line for line in loop)), key=len))
+
+
+def instructions(ptx: str, kind: str) -> int:
+    """Arithmetic of a type in PTX, that which takes longer as often as it does."""
+    found = re.findall(
+        rf"^\s+(add|sub|mul|fma|mad|min|max|abs|neg|div|rcp|sqrt|ex2|lg2|setp|selp)\S*\.{kind}\s", ptx, re.M
+    )
+    return sum(SLOW.get(name, 1) for name in found)
+
+
+def drawn(count: int) -> tuple[dict[str, Launch], dict[str, float]]:
+    """The launches of a step on a piece of a view of so many surfels, and how many points and pairs it has."""
+    share = PIECE[0] * PIECE[1] / 256 / TILES
+    splats, camera = city("surfel", round(count * share), *PIECE)
+    wider = 1600 / PIECE[0] * (200_000 / count) ** 0.5  # as large in pixels as in the whole view
+    tensors = splats.tensors()
+    sh = torch.cat([splats.sh, torch.zeros(len(splats), 15, 3)], 1)
+    splats = splats.with_named({**tensors, "scales": splats.scales * wider, "sh": sh})
+    launches: dict[str, Launch] = {}
+
+    class Emulation(TileRasterizer):
+        def where(self) -> torch.device:
+            return torch.device("cpu")
+
+        def program(self, name: str, **defines: int) -> Noted:
+            return Noted(raster_source(name, **defines), launches)
+
+    on = Emulation()
+    render = on.render(splats, camera, 0.2)
+    cotangents = Maps(**{name: torch.randn_like(value) for name, value in render.maps.present().items()})
+    render.backward(cotangents, Maps(color=cotangents.color))
+    step = dict(launches)
+    on.contribution(splats, camera, 0.2, 0.5, 0.5)
+    lists = render._pass
+    facts = {"seen": len(lists.index) / share, "pairs": len(lists.entries) / share}
+    return step | {name: launches[name] for name in ("contribution", "total")}, facts
+
+
+def rasterizer(count: int, gpu: Gpu) -> dict[str, object]:
+    """Milliseconds of the kernels of a step at 1600 x 1200, at least."""
+    launches, facts = drawn(count)
+    scale, clocks = TILES * 256 / (PIECE[0] * PIECE[1]), gpu.multiprocessors * gpu.hertz
+    times: dict[str, float] = {}
+    limits: dict[str, str] = {}
+    for name, each in launches.items():
+        floats, doubles = each.arithmetic()
+        parts = {
+            "main memory": each.memory * scale / gpu.memory,
+            "first cache and shared": each.asked * scale / (128 * clocks),
+            "arithmetic": floats * scale / (128 * clocks),
+            "double precision": doubles * scale / (gpu.doubles * clocks),
+        }
+        limits[name] = max(parts, key=parts.__getitem__)
+        times[name] = 1e3 * parts[limits[name]]
+    times["sort"] = 1e3 * (SORTED + LISTED) * (facts["pairs"] + facts["seen"]) / gpu.memory
+    limits["sort"] = "main memory"
+    forward = sum(times[name] for name in ("measure", "sort", "record", "forward"))
+    return {
+        "seen": round(facts["seen"]),
+        "pairs": round(facts["pairs"]),
+        "ms": {name: round(value, 3) for name, value in times.items()},
+        "limits": limits,
+        "all maps, ms": round(forward, 2),
+        "backward, ms": round(times["backward"] + times["gather"], 2),
+        "contribution, ms": round(forward - times["forward"] + times["contribution"] + times["total"], 2),
+        "pictures a second, at most": round(1e3 / forward, 1),
+    }
+
+
 def main() -> None:
     figures = {}
     for case in CASES:
@@ -140,6 +283,10 @@ def main() -> None:
                 f"{case.kernel:<14} {gpu.name:<9} at least {found['ms']:7.3f} ms ({found['limit']}), "
                 f"{found['warps']} warps, {found['registers']} registers, {found['shared']} B shared"
             )
+    for count in (1_000_000, 5_000_000, 10_000_000):
+        for gpu in GPUS:
+            found = figures[f"rasterizer, {count:,} surfels on {gpu.name}"] = rasterizer(count, gpu)
+            print(f"{count:,} surfels, {gpu.name}: {found}", flush=True)
     print(save("gpu_model", figures))
 
 

@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.core.events import Warned, emit, say
 from surfkit.core.memory import size
+from surfkit.run.folder import read_record
 from surfkit.scene.memory import free_bytes
 from surfkit.train.streaming import Stored
 
@@ -36,6 +37,7 @@ class Forecast:
         least_bytes: Of disk, for the last checkpoint of each if no point is added.
         disk_bytes: Of disk, for all checkpoints if points are added.
         memory_bytes: Of the block that needs most; 0 where blocks are trained on other machines.
+        gpu_bytes: Memory of a GPU, of the block that needs most; 0 where the coarse model was trained without one.
     """
 
     steps: int
@@ -43,6 +45,7 @@ class Forecast:
     least_bytes: int
     disk_bytes: int
     memory_bytes: int
+    gpu_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def forecast(blocks: Sequence[Block], coarse: Stored, memory: Sequence[int]) -> 
     whole = coarse.path.stat().st_size
     each = whole / max(1, len(model.points))
     begins, there = [initial_points(block) for block in blocks], [checkpoint_bytes(block) for block in blocks]
-    grown = GROWN if tune.densify is not None else 1.0
+    grown, on_gpu = GROWN if tune.densify is not None else 1.0, gpu_point_bytes(blocks[0].run.out, len(model.points))
     least, most = ([points.bytes(each, each / 3, times) for points in begins] for times in (1.0, grown))
     return Forecast(
         steps=sum(steps),
@@ -110,7 +113,14 @@ def forecast(blocks: Sequence[Block], coarse: Stored, memory: Sequence[int]) -> 
         disk_bytes=sum(max(0, KEPT * size - found) for size, found in zip(most, there, strict=True))
         + int(KEPT * grown * whole),  # of the blocks, and of all when they are merged
         memory_bytes=max(memory, default=0),
+        gpu_bytes=max(points.bytes(on_gpu, on_gpu / 2, grown) for points in begins),
     )
+
+
+def gpu_point_bytes(out: Path, points: int) -> float:
+    """Bytes of a GPU that each of `points` points of the coarse model took, without photographs; 0 without a GPU."""
+    held = read_record(out).get("gpu_memory_bytes") or {}
+    return (held.get("peak", 0) - held.get("photographs", 0)) / max(1, points)
 
 
 def checkpoint_bytes(block: Block) -> int:
@@ -132,6 +142,8 @@ def report_forecast(out: Path, found: Forecast) -> None:
     )
     if found.memory_bytes:
         text += f"; a block needs up to {size(found.memory_bytes)} of memory, {size(memory)} are free"
+    if found.gpu_bytes:
+        text += f"; a block needs up to {size(found.gpu_bytes)} of the memory of its GPU"
     say(text)
     if found.least_bytes > disk:
         raise BadInput(

@@ -69,6 +69,7 @@ def merged_state(ctx: RunContext, parts: Sequence[StageState], shares: Sequence[
     state.seconds = sum(part.seconds for part in parts)
     state.cpu_seconds = sum(part.cpu_seconds for part in parts)
     state.peak_memory_bytes = max(part.peak_memory_bytes for part in parts)
+    state.peak_gpu_bytes = max(part.peak_gpu_bytes for part in parts)
     state.sh_degree = max(part.sh_degree for part in parts)
     if recipe.tune.appearance is not None:  # the blocks' own are folded into their colours
         state.looks = fresh_looks(recipe.tune.appearance, len(ctx.scene.train))

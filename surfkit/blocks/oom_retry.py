@@ -76,7 +76,7 @@ def apply_fallback(block: Block, caches: CacheSettings) -> tuple[RunStage, Cache
     """The stage of a block and the settings of its caches, as changed by the fallbacks it has used."""
     state, stage = block.state, block.stage
     if state.fallback >= NO_CACHE:
-        caches = replace(caches, cache="0")
+        caches = replace(caches, cache="0", gpu="0")
     tune = stage.stage
     if state.most_points is not None and tune.densify is not None:
         stage = replace(stage, stage=replace(tune, densify=tune.densify.limited(state.most_points)))

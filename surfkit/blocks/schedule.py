@@ -335,6 +335,7 @@ def job_of(ctx: RunContext, block: Block, compute: Compute) -> Job:
     share = ctx.caches.bytes() // (compute.workers.at_once or 1)
     command = ["-m", "surfkit.cli", "tune", str(ctx.run.out.resolve()), str(block.index), "--device", compute.device]
     command += ["--cache", ctx.caches.cache if elsewhere else f"{share}"]
+    command += ["--gpu-cache", ctx.caches.gpu]
     command += ["--checkpoint-every", f"{ctx.intervals.checkpoint}"]
     command += ["--resized-copies"] * ctx.caches.copies + ["--tensorboard"] * compute.tensorboard
     command += ["--patience", f"{PATIENCE_S}"] * elsewhere

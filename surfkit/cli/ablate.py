@@ -72,7 +72,7 @@ class Ablate:
 
     columns: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all that were measured)")] = ()
     """Columns of the table, in this order: ssim, psnr, lpips, precision, recall, f1, points, seconds, cpu_seconds,
-    bytes, peak_memory_bytes, fps. lpips is measured only if it is named."""
+    bytes, peak_memory_bytes, peak_gpu_bytes, fps. lpips is measured only if it is named."""
 
     show: bool = False
     """Run nothing, and write nothing: show what is finished."""

@@ -161,6 +161,7 @@ def rows(found: Estimate) -> list[tuple[str, str]]:
             f"{size(found.memory_bytes)}, of which photographs {size(found.cache_bytes)}; "
             f"{size(room.memory_bytes)} are free",
         ),
+        *_gpu_rows(found),
         ("disk", f"{size(found.run_bytes)} for the run folder; {size(room.run_bytes)} are free"),
     ]
     if found.data_bytes:
@@ -168,6 +169,14 @@ def rows(found: Estimate) -> list[tuple[str, str]]:
     if not found.points_known:
         table.append(("", "how much the number of points grows is a rule of thumb; --points tries another number"))
     return table
+
+
+def _gpu_rows(found: Estimate) -> list[tuple[str, str]]:
+    """Of the memory of the GPU, if there is one."""
+    if (gpu := found.gpu) is None:
+        return []
+    text = f"{size(gpu.memory_bytes)}, of which photographs {size(gpu.cache_bytes)}; {size(gpu.free_bytes)} are free"
+    return [("GPU memory", text)]
 
 
 def verdict(diagnosis: Diagnosis, estimate_wanted: bool) -> str:

@@ -123,6 +123,8 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("depth maps", f"{metrics['prepare_cpu_seconds']:.0f} s of CPU time"))
     if metrics.get("peak_memory_bytes"):
         rows.append(("peak memory", f"{metrics['peak_memory_bytes'] / 1e6:.0f} MB"))
+    if metrics.get("peak_gpu_bytes"):
+        rows.append(("peak GPU memory", f"{metrics['peak_gpu_bytes'] / 1e6:.0f} MB"))
     if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
     return rows

@@ -60,6 +60,8 @@ def rows(found: Status) -> list[tuple[str, str]]:
         table.append(("loss", f"{found.loss:.4f}"))
     if found.peak_memory_bytes:
         table.append(("peak memory", f"{found.peak_memory_bytes / 1e6:.0f} MB"))
+    if found.peak_gpu_bytes:
+        table.append(("peak GPU memory", f"{found.peak_gpu_bytes / 1e6:.0f} MB"))
     if found.metrics and found.metrics["psnr"] is not None:
         when = f" after step {found.metrics['step']:,}" if "step" in found.metrics else ""
         table.append(("PSNR", f"{found.metrics['psnr']:.2f} dB of {found.metrics['views']} views{when}"))

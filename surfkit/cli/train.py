@@ -89,6 +89,10 @@ class Train:
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto is half of the free memory. It does
     not change the result. When the run is out of memory, it is lowered automatically."""
 
+    gpu_cache: str = "auto"
+    """Memory of the GPU for them, where there is one; auto is a quarter of what is free on it. It does not change the
+    result. When the GPU is out of memory, nothing is kept there any more."""
+
     resized_copies: bool = False
     """Also keep photographs that do not fit into the cache on disk, decoded and resized, in DATA/resized. It saves time
     when large photographs are used at a much smaller size. It does not change the result."""
@@ -126,7 +130,9 @@ class Train:
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
-            caches = CacheSettings(self.cache, self.resized_copies, self.prepare_cache if self.prepare else None)
+            caches = CacheSettings(
+                self.cache, self.resized_copies, self.prepare_cache if self.prepare else None, self.gpu_cache
+            )
             metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
 

@@ -45,6 +45,9 @@ class Tune:
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB; auto is half of the free memory."""
 
+    gpu_cache: str = "auto"
+    """Memory of the GPU for them; auto is a quarter of what is free on it."""
+
     resized_copies: bool = False
     """Also keep photographs that do not fit into the cache on disk, at the size at which they are used."""
 
@@ -69,8 +72,9 @@ class Tune:
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:
             raise BadInput(f"block {self.block} has no views; it stays as it is in the coarse model")
-        caches, intervals = CacheSettings(self.cache, self.resized_copies), Intervals(self.checkpoint_every, 0)
+        caches = CacheSettings(self.cache, self.resized_copies, gpu=self.gpu_cache)
         caches.bytes()
+        intervals = Intervals(self.checkpoint_every, 0)
         scalars = tensorboard(self.run_folder) if self.tensorboard else nullcontext()
         with scalars, collect_notes(), in_one_line(self.run_folder), bars():
             rasterizer, _ = select_rasterizer(self.device)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ class StepDone:
         losses: Weighted value of each loss, by its name in the recipe.
         points: After the step; 0 for a method without points.
         peak_memory_bytes: Most memory held so far in the stage; 0 where that is not known.
+        peak_gpu_bytes: Most memory of the GPU held so far in the stage; 0 without one.
     """
 
     index: int
@@ -50,6 +51,7 @@ class StepDone:
     losses: Mapping[str, float]
     points: int
     peak_memory_bytes: int = 0
+    peak_gpu_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -142,9 +144,11 @@ class MemoryTaken:
 
     Attributes:
         parts: Bytes by part, and "peak" for all of them together.
+        gpu: The same of the memory of the GPU; empty without one.
     """
 
     parts: Mapping[str, int]
+    gpu: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

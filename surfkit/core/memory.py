@@ -18,6 +18,8 @@ NO_MEMORY = (
 """Words of torch, Qhull, C++, threads and shared libraries, whose errors have no class of their own."""
 ASKED = re.compile(r"allocate ([\d.]+ ?\w+)")
 """How numpy and torch say what they wanted."""
+CAPACITY = re.compile(r"total capacity of ([\d.]+ \w+)")
+"""How torch says what a GPU has."""
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 """What Linux tells of this process, and where it is asked to count its peak anew."""
 PEAK = re.compile(r"^VmHWM:\s*(\d+) kB", re.MULTILINE)
@@ -33,14 +35,23 @@ def is_out_of_memory(error: BaseException) -> bool:
     return known and any(words in str(error).lower() for words in NO_MEMORY)
 
 
+def is_out_of_gpu_memory(error: BaseException | None) -> bool:
+    """Whether the memory of the GPU ran out, as torch or the driver says it, and not that of the CPU."""
+    text = str(error).lower() if isinstance(error, RuntimeError) else ""
+    return type(error).__name__ == "OutOfMemoryError" or ("cuda" in text and "out of memory" in text)
+
+
 def out_of_memory(error: BaseException | None = None) -> str:
     """What to say when memory gave out: how much is held, and how much more was wanted if the error tells."""
-    parts = [f"{peak / 2**30:.1f} GiB held"] if (peak := peak_memory_bytes()) else []
+    on_gpu = is_out_of_gpu_memory(error)
+    parts = [f"{peak / 2**30:.1f} GiB held"] if (peak := peak_memory_bytes()) and not on_gpu else []
     if found := ASKED.search(str(error)):
         number, _, unit = found[1].partition(" ")
         wanted = f"{float(number) / 2**30:.1f} GiB" if unit == "bytes" else found[1]
         parts.append(f"{wanted} more wanted")
-    return f"out of memory{' with ' if parts else ''}{' and '.join(parts)}"
+    if on_gpu and (found := CAPACITY.search(str(error))):
+        parts.append(f"{found[1]} there in all")
+    return f"out of{' GPU' * on_gpu} memory{' with ' if parts else ''}{' and '.join(parts)}"
 
 
 _passed = 0

@@ -11,6 +11,7 @@ from surfkit.core.memory import size
 from surfkit.doctor.finding import Finding
 from surfkit.doctor.growth import SPREAD, Growth
 from surfkit.doctor.probe import Part, Probed
+from surfkit.train.material import GPU_SHARE
 
 EVENT_BYTES = 260
 """A line of events.jsonl."""
@@ -20,6 +21,8 @@ MARGIN = 0.9
 """Share of what is free that advice counts on."""
 LEAST_CACHE = 200e6
 """A cache that is large enough to read ahead."""
+COUNT_CAP = "pretrain.densify.filters.0:count-cap --pretrain.densify.filters.0.points"
+"""What limits the number of points, before that number."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,23 @@ class Room:
 
 
 @dataclass(frozen=True)
+class GpuEstimate:
+    """What a whole run will take of the memory of a GPU.
+
+    Attributes:
+        memory_bytes: Most that tensors hold.
+        cache_bytes: Of that, photographs, masks and priors, which are no longer kept where it gives out.
+        point_bytes: That one point more takes.
+        free_bytes: What the GPU has free.
+    """
+
+    memory_bytes: int
+    cache_bytes: int
+    point_bytes: float
+    free_bytes: int
+
+
+@dataclass(frozen=True)
 class Estimate:
     """What a whole run will take.
 
@@ -83,6 +103,7 @@ class Estimate:
         memory_bytes: Most memory held.
         cache_bytes: Of that, photographs, masks and priors.
         point_bytes: Memory that one point more takes.
+        gpu: The memory of the GPU; None without one.
         run_bytes: The run folder.
         data_bytes: Undistorted photographs, beside the data set or in the user's cache.
         room: What the machine has.
@@ -100,6 +121,7 @@ class Estimate:
     data_bytes: int
     room: Room
     probe_seconds: float = 0.0
+    gpu: GpuEstimate | None = None
 
 
 def estimate(load: Load, parts: Sequence[Part], rising: Growth, probed: Probed, room: Room) -> Estimate:
@@ -143,7 +165,18 @@ def estimate(load: Load, parts: Sequence[Part], rising: Growth, probed: Probed, 
         run_bytes=int(on_disk),
         data_bytes=int(load.undistort * load.undistort_bytes),
         room=room,
+        gpu=_on_gpu(load, rising, probed) if probed.started.gpu_free_bytes else None,
     )
+
+
+def _on_gpu(load: Load, rising: Growth, probed: Probed) -> GpuEstimate:
+    counts, peaks = (
+        np.array(each, float) for each in zip(*((t.points, t.gpu_bytes) for t in probed.taken), strict=True)
+    )
+    each, free = max(0.0, slope(counts, peaks)), probed.started.gpu_free_bytes
+    held = int(peaks.max() + each * max(0, rising.last - counts.max()))
+    cached = min(load.view_bytes, int(GPU_SHARE * free))
+    return GpuEstimate(held + cached, cached, each, free)
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> float:
@@ -154,7 +187,22 @@ def slope(x: np.ndarray, y: np.ndarray) -> float:
 
 def advice(found: Estimate) -> list[Finding]:
     """What to lower where a run will not fit, or take days."""
-    return [*_memory(found), *_disk(found), *_time(found)]
+    return [*_memory(found), *_gpu_memory(found), *_disk(found), *_time(found)]
+
+
+def _gpu_memory(found: Estimate) -> list[Finding]:
+    gpu = found.gpu
+    if gpu is None or (rest := gpu.memory_bytes - gpu.cache_bytes) <= (free := MARGIN * gpu.free_bytes):
+        return []
+    likely = "" if found.points_known else f" with the {found.points:,} points that are likely"
+    text = (
+        f"the run will take about {size(rest)} of the memory of the GPU{likely}, and {size(free)} can be used: smaller "
+        "photographs (--scale 2) need less"
+    )
+    fewer = found.points - (rest - free) / max(gpu.point_bytes, 1)
+    if fewer > 0.1 * found.points:
+        text += f", and so do fewer points: {COUNT_CAP} {one_digit(fewer)}"
+    return [Finding("warning", "gpu-memory", text)]
 
 
 def _memory(found: Estimate) -> list[Finding]:
@@ -170,10 +218,7 @@ def _memory(found: Estimate) -> list[Finding]:
         fewer = found.points - (rest + LEAST_CACHE - free) / max(found.point_bytes, 1)
         text += "smaller photographs (--scale 2) need less"
         if fewer > 0.1 * found.points:
-            text += (
-                ", and so do fewer points: pretrain.densify.filters.0:count-cap --pretrain.densify.filters.0.points "
-                f"{one_digit(fewer)}"
-            )
+            text += f", and so do fewer points: {COUNT_CAP} {one_digit(fewer)}"
         text += f" with --cache {size(LEAST_CACHE, 0).replace(' ', '')}"
     return [Finding("warning", "memory", text)]
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import torch
 
 from surfkit.core.memory import peak_memory_bytes
+from surfkit.cuda.memory import free_gpu_bytes, peak_gpu_bytes
 from surfkit.densify.base import Prune, Step
 from surfkit.evaluate.images.pictures import panel, write_picture
 from surfkit.export.ply import write_splats
@@ -62,6 +63,7 @@ class EditStress(Prune):
         if step.index not in self.at:
             return None
         draw = torch.rand(len(points), generator=torch.Generator().manual_seed(step.index))
+        draw = draw.to(points.params["means"].device)
         return Edit(drop=draw < EDITED, clone=draw > 1 - EDITED)
 
 
@@ -111,11 +113,13 @@ class Started:
         photo_seconds: To read one photograph.
         init_seconds: To make the points.
         held_bytes: Photographs, masks and priors in memory.
+        gpu_free_bytes: What the GPU has free; 0 without one.
     """
 
     photo_seconds: float
     init_seconds: float
     held_bytes: int
+    gpu_free_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,11 +130,13 @@ class Taken:
         points: How many there were.
         seconds: Of a step: the median one, or the mean of the medians where some take a second view.
         peak_bytes: Most memory that the process has held by its end.
+        gpu_bytes: The same of the memory of the GPU; 0 without one.
     """
 
     points: int
     seconds: float
     peak_bytes: int
+    gpu_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -232,12 +238,12 @@ def measure(job: Job) -> Iterator[Started | Taken | Written]:
     held += sum((20 if normals else 8) * prior.inverse.numel() for prior in priors or ())
     generator, start = torch.Generator().manual_seed(recipe.seed), time.perf_counter()
     points = Points.fresh(recipe.primitive.init(job.scene.cloud, generator), recipe.primitive.shared())
-    yield Started(photo_seconds, time.perf_counter() - start, held)
+    init_seconds, rasterizer = time.perf_counter() - start, select(job.device)[0]
+    on_gpu = rasterizer.where().type == "cuda"
+    yield Started(photo_seconds, init_seconds, held, free_gpu_bytes() if on_gpu else 0)
     churn = EditStress(tuple(part.index + 1 for part in job.parts))
     stage = replace(recipe.pretrain, prune=(*recipe.pretrain.prune, churn))
-    trainer = Trainer(
-        stage, recipe.primitive, views, photos, select(job.device)[0], priors, masks, beside=_next_of(len(views))
-    )
+    trainer = Trainer(stage, recipe.primitive, views, photos, rasterizer, priors, masks, beside=_next_of(len(views)))
     state = trainer.begin(points, generator)
     del points
     done = 0.0
@@ -285,7 +291,7 @@ def _taken(trainer: Trainer, state: StageState, part: Part, job: Job, kinds: dic
             state.index = index - 1
             own = [_timed(trainer, state)[1]]
         seconds += statistics.median(own) * len(indices) / sum(map(len, kinds.values()))
-    return Taken(len(state.points), seconds, peak_memory_bytes())
+    return Taken(len(state.points), seconds, peak_memory_bytes(), peak_gpu_bytes())
 
 
 def _timed(trainer: Trainer, state: StageState) -> tuple[bool, float]:

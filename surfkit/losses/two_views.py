@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import pad
 
 from surfkit.core.check import BadInput
 from surfkit.core.schedule import Steps
@@ -96,11 +96,21 @@ def projected(camera: Camera, points: Tensor) -> Tensor:
 
 
 def sampled(image: Tensor, at: Tensor) -> Tensor:
-    """(...) bilinear samples of an image (h, w) at (2, ...) x and y in pixels, centres at +0.5; 0 outside."""
-    size = at.new_tensor([image.shape[1], image.shape[0]])
-    places = (2 * at.flatten(1).T / size - 1).clamp(-2, 2)  # far outside is outside
-    values = grid_sample(image[None, None], places[None, None], mode="bilinear", align_corners=False)
-    return values.view(at.shape[1:])
+    """(...) bilinear samples of an image (h, w) at (2, ...) x and y in pixels, centres at +0.5; 0 outside.
+
+    The image is held constant, and each place has a gradient of its own: nothing is added up in an order that the
+    threads of a GPU decide, as `grid_sample` does.
+    """
+    (height, width), around = image.shape, pad(image.detach(), (1, 1, 1, 1))
+    x, y = (
+        (place.nan_to_num(nan=-1.0) + 0.5).clamp(0, size + 1)  # far outside is outside; in `around`, centres at +0
+        for place, size in zip(at, (width, height), strict=True)
+    )
+    left, top = (place.detach().clamp_max(size).long() for place, size in ((x, width), (y, height)))
+    right, below = x - left, y - top
+    upper = (1 - right) * around[top, left] + right * around[top, left + 1]
+    lower = (1 - right) * around[top + 1, left] + right * around[top + 1, left + 1]
+    return (1 - below) * upper + below * lower
 
 
 def is_whole(counts: Tensor, at: Tensor) -> Tensor:

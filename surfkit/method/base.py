@@ -29,19 +29,22 @@ class Reconstruction:
         splats: Written as point_cloud.ply; they are drawn by the rasterizer where there is no `draw`.
         draw: Maps of a view. Held-out photographs are compared with `color`; a mesher also looks at `alpha`, `depth`,
             `median` and, where there is one, `normal`.
-        draw_color: The same with colours alone, whose speed is measured; None for `draw`.
+        draw_there: The same, with maps that stay on the device that draws; None for `draw`.
+        draw_color: The same as `draw_there` with colours alone, whose speed is measured; None for `draw`.
         facts: Plain values for metrics.json, under "method".
         steps: Optimisation steps that were made, of all stages; 0 for a method without any.
         last_steps: Those of the last stage, where there are several.
         seconds: Wall time, of all the processes that have worked on it; None for what surfkit has measured.
         cpu_seconds: CPU time of all threads, likewise.
         peak_memory_bytes: Most memory held, likewise.
+        peak_gpu_bytes: Most memory of the GPU held, likewise; 0 without one.
         correct_color: Whether to measure PSNR after a colour correction too, as training let photographs differ.
     """
 
     mesh: Mesh | None = None
     splats: SplatModel | None = None
     draw: Callable[[View], Maps] | None = None
+    draw_there: Callable[[View], Maps] | None = None
     draw_color: Callable[[View], Maps] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
@@ -49,6 +52,7 @@ class Reconstruction:
     seconds: float | None = None
     cpu_seconds: float | None = None
     peak_memory_bytes: int | None = None
+    peak_gpu_bytes: int | None = None
     correct_color: bool = False
 
 

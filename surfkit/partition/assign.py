@@ -61,12 +61,17 @@ class SSIMDifference(Assign):
         Each view is drawn once whole, and once without each block of which it shows anything.
         """
         difference = torch.zeros(len(sight.views), count)
+        device = sight.rasterizer.where()
+        splats, owner = sight.splats.to(device), owner.to(device)
         for at, view in enumerate(sight.views):
-            whole = sight.rasterizer.render(sight.splats, view.camera, sight.near, geometry=False)
-            for block in owner[whole.seen].unique().tolist():
-                without = replace(sight.splats, opacities=sight.splats.opacities * (owner != block))
+            whole, found = sight.rasterizer.render(splats, view.camera, sight.near, geometry=False), []
+            blocks = owner[whole.seen].unique().tolist()
+            for block in blocks:
+                without = replace(splats, opacities=splats.opacities * (owner != block))
                 rest = sight.rasterizer.render(without, view.camera, sight.near, geometry=False)
-                difference[at, block] = 1 - ssim(rest.maps.color, whole.maps.color)
+                found.append(1 - ssim(rest.maps.color, whole.maps.color))
+            if blocks:
+                difference[at, blocks] = torch.stack(found).cpu()
             emit(Progress("assigning views", at + 1, len(sight.views)))
         return difference
 

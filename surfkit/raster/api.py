@@ -98,6 +98,10 @@ class Splats:
         shared = {name: value.detach() for name, value in self.shared.items()}
         return replace(self._with(lambda value, _: value.detach(), self), shared=shared)
 
+    def to(self, device: torch.device) -> Splats:
+        """The same on a device."""
+        return self.with_named({name: value.to(device) for name, value in self.named().items()})
+
     def first(self, count: int) -> Splats:
         """The first so many of them."""
         return self._with(lambda value, _: value[:count], self)

@@ -145,7 +145,16 @@ class DerivedRender(Render):
         return replace(gradients, derived=derived)
 
     def _summed(self, signal: Tensor) -> Tensor:
-        return signal.new_zeros(self._count, 2).index_add(0, self._owner, signal)
+        return summed_by_owner(signal, self._owner, self._count)
+
+
+def summed_by_owner(values: Tensor, owner: Tensor, count: int) -> Tensor:
+    """(count, ...) sums of (M, ...) values by their (M,) owners, in the same order each time.
+
+    On a GPU `index_add` adds in any order and `index_put` sorts first; on a CPU it is the other way round.
+    """
+    zeros = values.new_zeros(count, *values.shape[1:])
+    return zeros.index_put((owner,), values, accumulate=True) if values.is_cuda else zeros.index_add(0, owner, values)
 
 
 def gathered(

@@ -73,6 +73,7 @@ COLUMNS = {
     "cpu_seconds": Column("CPU min", 1, "lower", factor=1 / 60, in_percent=True),
     "bytes": Column("size", 2, "lower", unit="B", scaled=True, in_percent=True),
     "peak_memory_bytes": Column("memory", 2, "lower", unit="B", scaled=True, in_percent=True),
+    "peak_gpu_bytes": Column("GPU memory", 2, "lower", unit="B", scaled=True, in_percent=True),
     "fps": Column("FPS", 1, "higher", in_percent=True),
 }
 """Every column by its name in ablation.json and on the command line, in the order of the paper's tables."""

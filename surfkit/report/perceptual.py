@@ -59,7 +59,7 @@ def measure_lpips(folder: Path, device: Device) -> dict[str, Any]:
         for at, view in enumerate(views):
             mask = None if masks is None else masks[at]
             if mask is None or mask.any():
-                color = made.draw(view).color.clamp(0, 1)
+                color = (made.draw_color or made.draw)(view).color.clamp(0, 1)
                 mask = None if mask is None else mask.to(color.device)
                 found[view.name] = lpips_values([network], color, view_photo(view).to(color) / 255, mask)
         images |= {name: statistics.fmean(one[name] for one in found.values()) for name in lpips_names([network])}

@@ -16,7 +16,14 @@ from surfkit.evaluate.metrics import read_metrics
 from surfkit.execute.state import read_state
 from surfkit.run import journal
 
-NUMBERS = {"points": int, "losses": dict[str, float], "peak_memory_bytes": int, "psnr": dict[str, float], "stage": str}
+NUMBERS = {
+    "points": int,
+    "losses": dict[str, float],
+    "peak_memory_bytes": int,
+    "peak_gpu_bytes": int,
+    "psnr": dict[str, float],
+    "stage": str,
+}
 """What lines of the journal may have, and of what kind it is."""
 STAGED = "splats"
 """The method that optimises splats in the stages of a recipe, as recipe.json has it; others have none."""
@@ -77,6 +84,7 @@ class Status:
         points: After the last step.
         loss: Of the last step.
         peak_memory_bytes: Most memory held.
+        peak_gpu_bytes: Most memory of the GPU held; None without one.
         metrics: PSNR and SSIM of held-out photographs, at the end or when they were last looked at.
         warnings: Notes of the run.
         skipped: Photographs that could not be read.
@@ -94,6 +102,7 @@ class Status:
     points: int | None = None
     loss: float | None = None
     peak_memory_bytes: int | None = None
+    peak_gpu_bytes: int | None = None
     metrics: dict[str, Any] | None = None
     warnings: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
@@ -127,6 +136,7 @@ def status(out: Path) -> Status:
         points=last["StepDone"].get("points"),
         loss=_total(last["StepDone"].get("losses")),
         peak_memory_bytes=last["StepDone"].get("peak_memory_bytes") or None,
+        peak_gpu_bytes=last["StepDone"].get("peak_gpu_bytes") or None,
         metrics=metrics,
         warnings=_texts(record, kept, "notes"),
         skipped=_texts(record, kept, "skipped"),

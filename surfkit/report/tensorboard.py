@@ -36,6 +36,8 @@ class Scalars:
             self.writer.add_scalar("loss", sum(event.losses.values()), event.index)
             self.writer.add_scalar("points", event.points, event.index)
             self.writer.add_scalar("peak memory, bytes", event.peak_memory_bytes, event.index)
+            if event.peak_gpu_bytes:
+                self.writer.add_scalar("peak GPU memory, bytes", event.peak_gpu_bytes, event.index)
         elif isinstance(event, Measured):
             for name, value in event.psnr.items():
                 self.writer.add_scalar(f"psnr/{name}", value, event.index)

@@ -255,8 +255,9 @@ def read_record(out: Path) -> dict[str, Any]:
     record = read_json(path, dict[str, Any]) if path.exists() else {}
     for name in ("notes", "skipped"):
         _require_texts(path, name, record.get(name, []))
-    if (memory := record.get("memory_bytes")) is not None:
-        load(dict[str, int], memory, f"{path}: memory_bytes")
+    for name in ("memory_bytes", "gpu_memory_bytes"):
+        if (memory := record.get(name)) is not None:
+            load(dict[str, int], memory, f"{path}: {name}")
     return record
 
 

@@ -60,7 +60,7 @@ def evaluate(
             measured = evaluate_views(
                 scene.held_out,
                 photo_cache(scene.held_out, ahead),
-                made.draw,
+                made.draw_there or made.draw,
                 timed=colors,
                 show=show,
                 correct_color=made.correct_color,
@@ -72,7 +72,9 @@ def evaluate(
     if meter:
         meter.tell()
     record = read_record(run.out)
-    memory = record.get("memory_bytes") or {}
+    memory, on_gpu = record.get("memory_bytes") or {}, record.get("gpu_memory_bytes") or {}
+    if (made.peak_gpu_bytes or 0) > on_gpu.get("peak", 0):
+        on_gpu = {"peak": made.peak_gpu_bytes}  # of a process of its own
     metrics = {
         **measured,
         "fps": measured["fps"] or (frames_per_second(scene.train, colors) if colors else None),
@@ -84,6 +86,7 @@ def evaluate(
         "prepare_cpu_seconds": record.get("prepare_cpu_seconds"),
         "peak_memory_bytes": max(made.peak_memory_bytes or 0, memory.get("peak", 0)) or None,
         "memory_bytes": memory,
+        **({"peak_gpu_bytes": on_gpu["peak"], "gpu_memory_bytes": on_gpu} if on_gpu else {}),
         **({"method": dict(made.facts)} if made.facts else {}),
         **({"before": before} if (before := measured_before(run)) else {}),
     }

@@ -22,12 +22,13 @@ from surfkit.core.events import Progress, StepDone, emit, say
 from surfkit.core.files import replacing
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import hookimpl, name_of, plugins
+from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.mesh.base import Mesh
 from surfkit.method.base import MethodInput, Reconstruction
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import Device, torch_device
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
@@ -67,6 +68,7 @@ class Kept:
     sh_degree: int
     near: float
     draws: bool
+    peak_gpu_bytes: int = 0
 
 
 class Pictures:
@@ -154,10 +156,13 @@ def reconstruct(run: Run, given: MethodInput) -> Reconstruction:
     with clocked(result_path(run).with_name("cost.json")) as cost, steps_shown(name_of(method)):
         made = method.reconstruct(given)
     seconds, cpu_seconds = cost()
-    own = (made.seconds, made.cpu_seconds, made.peak_memory_bytes)
-    measured = (seconds, cpu_seconds, peak_memory_bytes())
-    values = [value if mine is None else mine for mine, value in zip(own, measured, strict=True)]
-    made = replace(made, **dict(zip(("seconds", "cpu_seconds", "peak_memory_bytes"), values, strict=True)))
+    measured = {
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "peak_memory_bytes": peak_memory_bytes(),
+        "peak_gpu_bytes": peak_gpu_bytes(),
+    }
+    made = replace(made, **{name: value for name, value in measured.items() if getattr(made, name) is None})
     keep(run, made)
     return with_drawing(made, given.rasterizer)
 
@@ -194,6 +199,7 @@ def reopened(run: Run, given: MethodInput) -> Reconstruction:
         draw=(lambda view: again()(view)) if kept.draws else None,
         **{name: getattr(kept, name) for name in ("facts", "steps", "seconds", "cpu_seconds")},
         peak_memory_bytes=kept.peak_memory_bytes,
+        peak_gpu_bytes=kept.peak_gpu_bytes,
         correct_color=kept.correct_color,
     )
     return with_drawing(made, given.rasterizer)
@@ -226,6 +232,7 @@ def keep(run: Run, made: Reconstruction) -> None:
             seconds=made.seconds or 0.0,
             cpu_seconds=made.cpu_seconds or 0.0,
             peak_memory_bytes=made.peak_memory_bytes or 0,
+            peak_gpu_bytes=made.peak_gpu_bytes or 0,
             correct_color=made.correct_color,
             mesh=None if made.mesh is None else dump(dict(made.mesh.facts)),
             primitive=made.splats.primitive if made.splats else None,
@@ -263,14 +270,19 @@ def with_drawing(made: Reconstruction, rasterizer: Rasterizer) -> Reconstruction
     """The reconstruction with its splats drawn by the rasterizer, where it does not draw by itself."""
     if made.draw is not None or made.splats is None:
         return made
-    splats, near = made.splats.splats, made.splats.near
+    near, draws = made.splats.near, drawn_by(made.splats.primitive, rasterizer)
 
-    draws = drawn_by(made.splats.primitive, rasterizer)
+    @cache
+    def there() -> Splats:
+        return made.splats.splats.to(rasterizer.where())
 
     def maps(view: View, geometry: bool) -> Maps:
-        return draws.render(splats, view.camera, near, geometry, distortion=False).maps
+        return draws.render(there(), view.camera, near, geometry, distortion=False).maps
 
-    return replace(made, draw=lambda view: maps(view, True), draw_color=lambda view: maps(view, False))
+    def here(view: View) -> Maps:
+        return Maps(**{name: value.cpu() for name, value in maps(view, True).present().items()})
+
+    return replace(made, draw=here, draw_there=lambda view: maps(view, True), draw_color=lambda view: maps(view, False))
 
 
 def splats_of(run: Run, made: Reconstruction) -> SplatModel:
@@ -323,6 +335,7 @@ def optimised(run: Run, state: StageState) -> Reconstruction:
         seconds=state.seconds,
         cpu_seconds=state.cpu_seconds,
         peak_memory_bytes=state.peak_memory_bytes,
+        peak_gpu_bytes=state.peak_gpu_bytes,
         correct_color=run.color_stage.stage.appearance is not None,
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ class Notes:
         self.texts: list[str] = []
         self.skipped: list[str] = []
         self.memory: dict[str, int] = {}
+        self.gpu: dict[str, int] = {}
         self.path: Path | None = None
         self.facts: dict[str, Any] = {}
         self.prefix = ""
@@ -34,12 +35,14 @@ class Notes:
         self.texts = list(dict.fromkeys([*before.get("notes", []), *self.texts]))
         self.skipped = list(dict.fromkeys([*before.get("skipped", []), *self.skipped]))
         self.memory = before.get("memory_bytes") or {}
+        self.gpu = before.get("gpu_memory_bytes") or {}
         self.write()
 
     def write(self) -> None:
         """Save what there is."""
         if self.path is not None:
             found = {"notes": self.texts, "skipped": self.skipped, "memory_bytes": self.memory}
+            found |= {"gpu_memory_bytes": self.gpu} if self.gpu else {}
             write_json(self.path, self.facts | found)
 
     @hookimpl
@@ -51,9 +54,9 @@ class Notes:
             say(f"note: {self.prefix}{event.text}")
             self.keep(self.texts, self.prefix + event.text)
         elif isinstance(event, MemoryTaken):
-            known = (self.memory.get("peak", 0), len(self.memory))
-            if (event.parts["peak"], len(event.parts)) >= known:  # of equal peaks, the one with more parts
-                self.memory = dict(event.parts)
+            before = self.memory, self.gpu
+            self.memory, self.gpu = higher(self.memory, event.parts), higher(self.gpu, event.gpu)
+            if (self.memory, self.gpu) != before:
                 self.write()
         elif isinstance(event, PhotoSkipped) and self.keep(self.skipped, event.name):
             say(f"note: {event.reason}; the run goes on without this photograph")
@@ -65,6 +68,11 @@ class Notes:
         kept.append(text)
         self.write()
         return True
+
+
+def higher(known: Mapping[str, int], found: Mapping[str, int]) -> dict[str, int]:
+    """The report with the higher peak; of equal peaks, the later one unless it has fewer parts."""
+    return dict(max((found, known), key=lambda parts: (parts.get("peak", 0), len(parts))))
 
 
 @contextmanager

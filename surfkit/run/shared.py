@@ -222,7 +222,7 @@ def repeat(out: Path, folder: Path, prefix: str) -> None:
     with prefix_notes(prefix):
         for line in journal.read(folder / journal.NAME):
             if line["event"] == "MemoryTaken":
-                emit(MemoryTaken(line["parts"]))
+                emit(MemoryTaken(line["parts"], line.get("gpu") or {}))
     repeat_warnings(out, folder, prefix)
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, StageBegan, StageEnded, Warned, emit, say
-from surfkit.core.memory import peak_memory_bytes
+from surfkit.core.memory import is_out_of_gpu_memory, peak_memory_bytes
+from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
@@ -29,6 +30,7 @@ from surfkit.train.interrupt import graceful
 from surfkit.train.material import TrainingData
 from surfkit.train.meter import Meter
 from surfkit.train.progress import Display
+from surfkit.train.sparing import lowered
 from surfkit.train.stage import Trainer
 from surfkit.train.state import StageState
 
@@ -114,11 +116,14 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
     """Run the stage from its last state, or from its beginning, to its end.
 
     On NaN or Inf it returns to its last checkpoint with half the learning rates, twice at most. When memory runs out,
-    it returns to its last checkpoint with a smaller cache, until there is no cache.
+    it returns to its last checkpoint with a smaller cache, until there is no cache; for the GPU, with no cache there.
     """
     at, given, stage, primitive = job.stage, job.given, job.stage.stage, job.stage.primitive
     sources = (given.photos, job.rasterizer, given.priors, given.masks, given.expect)
-    trainer = Trainer(stage, primitive, job.scene.train, *sources, job.owns)
+    on_gpu = job.rasterizer.where().type == "cuda"
+    trainer = Trainer(
+        stage, primitive, job.scene.train, *sources, job.owns, gpu_bytes=given.gpu_bytes() if on_gpu else 0
+    )
     along = (
         ProgressPictures(at.out / "progress", job.scene.held_out)
         if job.intervals.pictures and job.scene.held_out
@@ -140,6 +145,7 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
             fresh.seconds += job.before.seconds
             fresh.cpu_seconds += job.before.cpu_seconds
             fresh.peak_memory_bytes = job.before.peak_memory_bytes
+            fresh.peak_gpu_bytes = job.before.peak_gpu_bytes
         return fresh
 
     if state is not None:
@@ -153,7 +159,13 @@ def optimise(job: StageJob, state: StageState | None) -> StageState:
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
-            if not lower_caches(given, f"step {state.index + 1}: out of memory"):
+            if is_out_of_gpu_memory(error):
+                if state.whole and state.index and at.block is None:  # a block falls back to an earlier, smaller state
+                    save(at, state, job.meter)
+                if not trainer.uploads.bytes:
+                    raise out_of_memory(at.out, ", though photographs are not kept in it", error) from error
+                emit(Warned(lowered(trainer.uploads, f"step {state.index + 1}: the memory of the GPU gave out")))
+            elif not lower_caches(given, f"step {state.index + 1}: out of memory"):
                 raise out_of_memory(at.out, ", though photographs are no longer kept in it") from error
             state = None  # the error and all that it holds go first
         state = state or load_last_state(at, begin)
@@ -167,7 +179,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     with graceful() as request, Display(at.title, steps) as display:
         for done in trainer.run(state):
             display.show(done)
-            meter.step(state, job.given)
+            meter.step(state, job.given, trainer.uploads)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
                 lower_caches(job.given, f"step {done.index}: only {free >> 20} MiB of memory are free")
             if along is not None and done.index % intervals.pictures == 0 and done.index < steps:
@@ -189,6 +201,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
 def save(stage: RunStage, state: StageState, meter: Meter) -> None:
     """Write a checkpoint, and emit what the memory is used for."""
     state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+    state.peak_gpu_bytes = max(state.peak_gpu_bytes, peak_gpu_bytes())
     with meter.adding("checkpoints"):
         checkpoint.save(stage.checkpoint, state)
     emit(FileWritten(stage.checkpoint, "checkpoint"))

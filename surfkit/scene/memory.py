@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -20,10 +20,10 @@ OWN = Path("/proc/self/cgroup")
 VMSTAT = Path("/proc/vmstat")
 
 
-def cache_bytes(text: str, flag: str = "--cache") -> int:
-    """Bytes of a size such as 4GB, 500 MB or 2GiB; a share of the free memory for "auto"."""
+def cache_bytes(text: str, flag: str = "--cache", auto: Callable[[], int] | None = None) -> int:
+    """Bytes of a size such as 4GB, 500 MB or 2GiB; for "auto" what `auto` gives, or a share of the free memory."""
     if text.strip().lower() == "auto":
-        return int(SHARE * free_bytes())
+        return int(SHARE * free_bytes()) if auto is None else auto()
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
     if not found or found[2] not in UNITS:
         raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, or auto")

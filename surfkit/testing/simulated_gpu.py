@@ -1,11 +1,13 @@
 """A GPU that is not there: tensors of the CPU which say that they are on cuda:0, and refuse what CUDA refuses.
 
 With it a machine without a GPU tests that code runs on one: that all tensors of an operation are in one place, that
-nothing hands a tensor of a GPU to NumPy, and how often the host waits for the GPU. Kernels are run by the emulator.
+nothing hands a tensor of a GPU to NumPy, how often the host waits for the GPU, how much memory is held there, and what
+happens when it gives out. Kernels are run by the emulator.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -24,6 +26,8 @@ from surfkit.scene.camera import Camera
 
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
+MEMORY = 1 << 34
+"""Bytes."""
 WAITS = {"item", "tolist", "nonzero", "unique", "masked_select", "__bool__", "__float__", "__int__", "__index__"}
 """Operations after which the host knows something that was computed on the GPU."""
 FACTS = {"data_ptr", "__len__", "__hash__", "__repr__", "__format__", "__dir__", "__reduce_ex__", "untyped_storage"}
@@ -36,11 +40,21 @@ class SimulatedGpu(TorchFunctionMode):
 
     Attributes:
         waits: How often the host waited for a result, by the name of the operation.
+        held: Bytes of all tensors on the GPU now.
+        peak: Most of them so far, since it was last reset.
+        limit: Bytes that the GPU has; what needs more raises what torch raises. None for none: it says that it has
+            `MEMORY`.
+        refused: Numbers of allocations, counted from 1, that fail as if the GPU were full.
+        allocations: How many there have been.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.waits: dict[str, int] = {}
+        self.held = self.peak = self.allocations = 0
+        self.limit: int | None = None
+        self.refused: set[int] = set()
+        self._storages: set[int] = set()
 
     def __torch_function__(
         self, func: Callable, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -63,12 +77,51 @@ class SimulatedGpu(TorchFunctionMode):
             there = torch.device(device).type == "cuda"
             if there and isinstance(draws := kwargs.get("generator"), torch.Generator) and draws.device.type == "cpu":
                 raise RuntimeError(f"{name}: expected a 'cuda' device type for generator but found 'cpu'")
-            return _put(func(*args, **kwargs), there)
+            return self._put(func(*args, **kwargs), there)
         if name == "copy_":
             return func(*args, **kwargs)
         self._check(name, tensors, args)
         out = func(*args, **kwargs)
-        return _put(out, there) if there else out
+        return self._put(out, there) if there else out
+
+    def reset_peak(self) -> None:
+        """Count the peak from what is held now."""
+        self.peak = self.held
+
+    def free(self) -> int:
+        """Bytes that can still be had."""
+        return (MEMORY if self.limit is None else self.limit) - self.held
+
+    def _put(self, value: Any, there: bool) -> Any:
+        """The same, with all its tensors in a place."""
+        for tensor in _tensors(value):
+            tensor.__dict__["_is_on_simulated_gpu"] = there
+            if there:
+                self._allocate(tensor)
+        return value
+
+    def _allocate(self, tensor: Tensor) -> None:
+        """Count the memory of a tensor once, until it is freed."""
+        with torch._C.DisableTorchFunction():
+            storage = tensor.untyped_storage()
+            key, size = storage._cdata, storage.nbytes()
+        if key in self._storages or not size:
+            return
+        self.allocations += 1
+        if self.allocations in self.refused or (self.limit is not None and self.held + size > self.limit):
+            capacity = (self.held if self.limit is None else self.limit) / 2**20
+            raise torch.cuda.OutOfMemoryError(
+                f"CUDA out of memory. Tried to allocate {size / 2**20:.2f} MiB. GPU 0 has a total capacity of "
+                f"{capacity:.2f} MiB of which {max(0, self.free()) / 2**20:.2f} MiB is free."
+            )
+        self._storages.add(key)
+        self.held += size
+        self.peak = max(self.peak, self.held)
+        weakref.finalize(storage, self._freed, key, size)
+
+    def _freed(self, key: int, size: int) -> None:
+        self._storages.discard(key)
+        self.held -= size
 
     def _moved(self, func: Callable, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """What `Tensor.to` and its like give: another tensor if the place changes."""
@@ -92,7 +145,7 @@ class SimulatedGpu(TorchFunctionMode):
             self._wait("to cpu")
         if there != was and out is args[0]:
             out = out.clone()
-        return _put(out, there)
+        return self._put(out, there)
 
     def _check(self, name: str, tensors: list[Tensor], args: tuple[Any, ...]) -> None:
         """Raise what CUDA raises where tensors of both places meet; a number of the CPU may meet all."""
@@ -125,7 +178,16 @@ def simulated_gpu() -> Iterator[SimulatedGpu]:
             loaded[source, device] = Emulated(source, device=device)
         return loaded[source, device]
 
-    with mock.patch.object(modules, "_loaded", emulated), SimulatedGpu() as gpu:
+    gpu = SimulatedGpu()
+    memory = {
+        "max_memory_allocated": lambda device=None: gpu.peak,
+        "reset_peak_memory_stats": lambda device=None: gpu.reset_peak(),
+        "mem_get_info": lambda device=None: (gpu.free(), gpu.free() + gpu.held),
+        "memory_allocated": lambda device=None: gpu.held,
+        "memory_reserved": lambda device=None: gpu.held,
+        "synchronize": lambda device=None: gpu._wait("synchronize"),
+    }
+    with mock.patch.object(modules, "_loaded", emulated), mock.patch.multiple(torch.cuda, **memory), gpu:
         yield gpu
 
 
@@ -151,13 +213,6 @@ def _tensors(value: Any) -> Iterator[Tensor]:
     elif isinstance(value, dict):
         for each in value.values():
             yield from _tensors(each)
-
-
-def _put(value: Any, there: bool) -> Any:
-    """The same, with all its tensors in a place."""
-    for tensor in _tensors(value):
-        tensor.__dict__["_is_on_simulated_gpu"] = there
-    return value
 
 
 @dataclass(frozen=True)

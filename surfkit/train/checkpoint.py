@@ -35,6 +35,7 @@ SCALARS = {
     "seconds": float,
     "cpu_seconds": float,
     "peak_memory_bytes": int,
+    "peak_gpu_bytes": int,
     "reset_at": int,
     "sh_degree": int,
     "halvings": int,
@@ -42,6 +43,8 @@ SCALARS = {
 }
 """What of a state is written as it is."""
 FACTS = {"views": int, "shown": int, **SCALARS}
+ADDED = {"peak_gpu_bytes": 0}
+"""What files of older versions lack, and stands for it."""
 SYSTEM = re.compile(r"os error (\d+)")
 """How safetensors says what the system has refused."""
 Read = TypeVar("Read")
@@ -222,6 +225,7 @@ def _facts(path: Path, tensors: Mapping[str, Tensor], text: str) -> dict[str, An
         raise BadInput(f"{path} is no readable checkpoint ({error}); delete it to start anew") from error
     if not isinstance(facts, dict):
         raise _unusable(path, "it lacks its facts")
+    facts = ADDED | facts
     wanted = {"params.means", "order", "generator"}
     if missing := (wanted - tensors.keys()) | (FACTS.keys() - facts.keys()):
         raise _unusable(path, f"it lacks {', '.join(sorted(missing))}")

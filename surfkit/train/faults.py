@@ -12,7 +12,7 @@ from torch import Tensor
 
 from surfkit.core.check import Fault
 from surfkit.core.files import DISK_FULL
-from surfkit.core.memory import is_out_of_memory
+from surfkit.core.memory import is_out_of_gpu_memory, is_out_of_memory
 from surfkit.core.memory import out_of_memory as say_out_of_memory
 from surfkit.train.cotangents import as_numbers
 
@@ -103,15 +103,22 @@ def in_one_line(out: Path) -> Iterator[None]:
     except (MemoryError, RuntimeError, OSError) as error:
         if not is_out_of_memory(error):
             raise
-        raise out_of_memory(out) from error
+        raise out_of_memory(out, error=error if is_out_of_gpu_memory(error) else None) from error
 
 
-def out_of_memory(out: Path, also: str = "") -> OutOfMemory:
-    """What is said of a run in the folder `out` that cannot go on; `also` tells what has been tried."""
-    what = f"{say_out_of_memory()}{also}"
+def out_of_memory(out: Path, also: str = "", error: BaseException | None = None) -> OutOfMemory:
+    """What is said of a run in the folder `out` that cannot go on.
+
+    Args:
+        out: The folder.
+        also: Tells what has been tried.
+        error: That of the GPU; None for the memory of the CPU.
+    """
+    what = f"{say_out_of_memory(error)}{also}"
+    more = "where there is more memory" if error is None else "on a GPU with more memory, or with --device cpu,"
     return OutOfMemory(
         f"{out}: {what}; smaller photographs (--longest, --scale) or fewer points (a higher "
         "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
-        "last checkpoint is whole, and where there is more memory the same command goes on from there",
+        f"last checkpoint is whole, and {more} the same command goes on from there",
         what,
     )

@@ -44,11 +44,14 @@ class Look:
         """(3, H, W) the render as the photograph would show it."""
         return self.model(self.numbers.to(color), color)
 
-    def learn(self, losses: list[Tensor]) -> None:
-        """Take this photograph's next step of Adam, if any loss looks at colours."""
-        grad = None
-        if losses:
-            (grad,) = torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)
+    def gradient(self, losses: list[Tensor]) -> Tensor | None:
+        """That of the sum of losses, whose graph stays; None if none of them looks at colours."""
+        if not losses:
+            return None
+        return torch.autograd.grad(sum(losses), self.numbers, retain_graph=True, allow_unused=True)[0]
+
+    def learn(self, grad: Tensor | None) -> None:
+        """Take this photograph's next step of Adam, if there is a gradient."""
         if grad is None:
             return
         self.looks["shown"][self.row] += 1

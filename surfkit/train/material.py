@@ -9,6 +9,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.memory import give_back
+from surfkit.cuda.memory import free_gpu_bytes
 from surfkit.losses.base import Loss
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import Alignment, Priors, prior_bytes, read_priors
@@ -23,6 +24,9 @@ from surfkit.scene.scene import Scene
 LOWERED = 4
 """The caches keep this share of what they held when memory ran short, the first time; nothing the second time."""
 
+GPU_SHARE = 0.25
+"""Of the free memory of a GPU that views take by default: the points are yet to grow."""
+
 
 @dataclass(frozen=True)
 class CacheSettings:
@@ -31,6 +35,8 @@ class CacheSettings:
     Attributes:
         cache: Memory for them, such as "4GB"; "auto" takes half of what is free.
         copies: Whether photographs that do not fit are also kept on disk as they are used, decoded and reduced.
+        gpu: Memory of the GPU for the same, where there is one, likewise; "auto" takes a quarter of what is free on it
+            when a stage begins.
         maps: Disk, in the user's cache, for depth maps that runs make whose data sets have none, such as "20GB"; None
             makes none, which does change the result of recipes that want some.
     """
@@ -38,9 +44,11 @@ class CacheSettings:
     cache: str = "auto"
     copies: bool = False
     maps: str | None = "20GB"
+    gpu: str = "auto"
 
     def bytes(self) -> int:
         """The memory that may be taken now."""
+        cache_bytes(self.gpu, "--gpu-cache", lambda: 0)
         return cache_bytes(self.cache)
 
     def maps_bytes(self) -> int:
@@ -58,11 +66,17 @@ class TrainingData:
         photos: (3, H, W) uint8.
         masks: (H, W) bool or None.
         priors: Estimated depths, if a loss of the recipe needs them and the data set has any.
+        gpu: As in `CacheSettings`.
     """
 
     photos: Cache[Tensor]
     masks: Cache[Tensor | None] | None = None
     priors: Priors | None = None
+    gpu: str = "auto"
+
+    def gpu_bytes(self) -> int:
+        """Of the GPU, that views may take."""
+        return cache_bytes(self.gpu, "--gpu-cache", lambda: int(GPU_SHARE * free_gpu_bytes()))
 
     def caches(self) -> Iterator[Cache]:
         """Those that there are."""
@@ -120,4 +134,5 @@ def read_ahead(
     for_photos, for_masks, for_priors = share(budget, wanted)
     priors = read_priors(data, scene, for_priors, known, normals) if needed else None
     copies = Copies(data.path) if caches.copies and 3 * pixels > for_photos else None
-    return TrainingData(photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks), priors)
+    photos, masks = photo_cache(scene.train, for_photos, copies), mask_cache(scene.train, for_masks)
+    return TrainingData(photos, masks, priors, caches.gpu)

@@ -1,14 +1,16 @@
-"""What the memory of a run is taken by."""
+"""What the memory of a run is taken by, on the CPU and on the GPU."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from surfkit.core.events import MemoryTaken, emit
 from surfkit.core.memory import highest_memory_bytes, peak_memory_bytes, reset_peak_memory, resident_bytes
+from surfkit.cuda.memory import peak_gpu_bytes, reset_peak_gpu
 from surfkit.train.material import TrainingData
 from surfkit.train.state import StageState
+from surfkit.train.uploads import Uploads
 
 
 class Meter:
@@ -20,11 +22,13 @@ class Meter:
     The program and the scene are what the process held before and more of it after reading the data. Points with their
     moments, and what the caches keep, are counted: the most of each. Writing checkpoints and drawing pictures or
     measuring count by what they add to the most that was held until then. All else is taken by the steps: the
-    rasterizer, gradients, losses, and photographs while they are decoded.
+    rasterizer, gradients, losses, and photographs while they are decoded. The memory of a GPU is split likewise.
     """
 
     def __init__(self) -> None:
         reset_peak_memory()
+        reset_peak_gpu()
+        self.gpu = {"points": 0, "photographs": 0}
         self.parts = {"program": resident_bytes(), "scene": 0, "points": 0}
         self.caches: dict[str, int] = {}
         self.added = {"checkpoints": 0, "pictures": 0}
@@ -32,19 +36,23 @@ class Meter:
     @classmethod
     def of_stage(cls) -> Meter:
         """A meter of a stage within a run; what the run has held since the meter before is emitted."""
-        if peak := peak_memory_bytes():
-            emit(MemoryTaken({"peak": peak, "program": peak}))
+        peak, on_gpu = peak_memory_bytes(), peak_gpu_bytes()
+        if peak or on_gpu:
+            gpu = {"peak": on_gpu, "steps": on_gpu} if on_gpu else {}
+            emit(MemoryTaken({"peak": peak, "program": peak} if peak else {}, gpu))
         return cls()
 
     def scene_read(self) -> None:
         """The scene has just been read."""
         self.parts["scene"] = max(0, resident_bytes() - self.parts["program"])
 
-    def step(self, state: StageState, material: TrainingData) -> None:
+    def step(self, state: StageState, material: TrainingData, uploads: Uploads) -> None:
         """See what is held after a step."""
         groups = (*vars(state.points).values(), state.frozen, state.looks)
         points = sum(value.nbytes for group in groups for value in group.values())
-        self.parts["points"] = max(self.parts["points"], points)
+        where = self.gpu if state.points.params["means"].is_cuda else self.parts
+        where["points"] = max(where["points"], points)
+        self.gpu["photographs"] = max(self.gpu["photographs"], uploads.bytes)
         for name, count in material.bytes().items():
             self.caches[name] = max(self.caches.get(name, 0), count)
 
@@ -59,18 +67,29 @@ class Meter:
 
     def tell(self) -> None:
         """Emit the report, where the peak is known."""
-        if report := self.report():
-            emit(MemoryTaken(report))
+        report, gpu = self.report(), self.gpu_report()
+        if report or gpu:
+            emit(MemoryTaken(report, gpu))
 
     def report(self) -> dict[str, int]:
         """The peak, and its parts by name; empty where it is not known."""
         peak = peak_memory_bytes()
         if not peak:
             return {}
-        parts = {**self.parts, **self.caches, **self.added, "steps": 0}
-        rest = peak - sum(parts.values())
-        parts["steps"] = max(0, rest)
-        for name, held in parts.items():  # what one had let go of again was taken by others
-            cut = min(held, max(0, -rest))
-            parts[name], rest = held - cut, rest + cut
-        return {"peak": peak, **parts}
+        return _split(peak, {**self.parts, **self.caches, **self.added})
+
+    def gpu_report(self) -> dict[str, int]:
+        """The same of the GPU; empty where nothing has been held on one."""
+        peak = peak_gpu_bytes()
+        return _split(peak, self.gpu) if peak else {}
+
+
+def _split(peak: int, held: Mapping[str, int]) -> dict[str, int]:
+    """The peak, and its parts: what was held, and the rest as that of the steps."""
+    parts = {**held, "steps": 0}
+    rest = peak - sum(parts.values())
+    parts["steps"] = max(0, rest)
+    for name, count in parts.items():  # what one had let go of again was taken by others
+        cut = min(count, max(0, -rest))
+        parts[name], rest = count - cut, rest + cut
+    return {"peak": peak, **parts}

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from surfkit.core.clock import clock
 from surfkit.core.memory import peak_memory_bytes
+from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.train.stage import Done
 
 PLAIN_EVERY_S = 5.0
@@ -107,6 +108,7 @@ class Display:
         ]
         parts += [f"PSNR {self.psnr.value:.2f} dB"] * (self.psnr.count > 0)
         parts += [f"{memory / 2**30:.1f} GiB" for memory in [peak_memory_bytes()] if memory]
+        parts += [f"GPU {memory / 2**30:.1f} GiB" for memory in [peak_gpu_bytes()] if memory]
         return "  ".join(parts)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from surfkit.core.events import PhotoSkipped, PointsEdited, StepDone, emit
 from surfkit.core.memory import peak_memory_bytes
 from surfkit.core.registry import choice, name_of
 from surfkit.core.schedule import Interval, LearningRate
+from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
@@ -28,7 +29,6 @@ from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, 
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
-from surfkit.scene.cache import out_of_turn
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
 from surfkit.train.cotangents import added, as_numbers, gradient, pulled, regularizer_terms
@@ -36,7 +36,10 @@ from surfkit.train.faults import require_finite_losses, require_finite_values
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.reads import maps_read
 from surfkit.train.rig import Rig
-from surfkit.train.state import StageState, uploaded
+from surfkit.train.seen import Seen
+from surfkit.train.sparing import sparing
+from surfkit.train.state import StageState
+from surfkit.train.uploads import Pictures, Shown, Uploads
 from surfkit.train.views import Order, ViewContributions
 
 MOST_STEPS = 100_000_000
@@ -118,13 +121,6 @@ class Done:
     target: Target
 
 
-class Pictures(Protocol):
-    """Photographs by the position of their view."""
-
-    def __getitem__(self, at: int, /) -> Tensor:
-        """(3, H, W) uint8."""
-
-
 @dataclass(frozen=True)
 class Trainer:
     """A stage and all it runs on.
@@ -141,6 +137,7 @@ class Trainer:
         owns: (N, 3) positions to (N,) bool: points elsewhere are neither copied nor split; None if all points may be.
         beside: Gives the positions of the views that may be second ones, best first, from the position of a view and
             the depth that is rendered there; None finds them by the cameras (`Rig.neighbours`).
+        gpu_bytes: Photographs, masks and priors that may be kept on a GPU.
     """
 
     stage: Stage
@@ -153,6 +150,7 @@ class Trainer:
     expect: Callable[[Sequence[int]], None] | None = None
     owns: Callable[[Tensor], Tensor] | None = None
     beside: Callable[[int, Tensor], list[int]] | None = None
+    gpu_bytes: int = 0
 
     def begin(self, points: Points, generator: torch.Generator, frozen: Columns | None = None) -> StageState:
         """The state before the first step; `frozen` as in `StageState`."""
@@ -181,23 +179,31 @@ class Trainer:
             state.seconds += time.perf_counter() - wall
             state.cpu_seconds += time.process_time() - cpu
             wall, cpu = time.perf_counter(), time.process_time()
-            emit(StepDone(done.index, self.stage.steps, done.losses, done.points, peak_memory_bytes()))
+            held = peak_memory_bytes(), peak_gpu_bytes()
+            emit(StepDone(done.index, self.stage.steps, done.losses, done.points, *held))
             yield done
 
     def foretell(self, order: Order) -> None:
         """Say which views come next, so that their pictures can be read ahead."""
         if self.expect is not None and order.at < len(order.queue):
-            self.expect(order.queue[order.at :].tolist())
+            self.expect(self.uploads.missing(order.queue[order.at :].tolist()))
 
     def step(self, state: StageState) -> Done:
         """One optimisation step: render a view, compare it with its photograph, update the points, then edit them."""
-        stage, index = self.stage, state.index + 1
+        index = state.index + 1
         if state.index % OBSERVED_EVERY == 0:
-            state.points = observe(self.primitive, state.points, self.views, stage.near)
+            state.points = observe(self.primitive, state.points, self.views, self.stage.near)
+        state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // self.stage.sh_every))
+        found = sparing(state, self.uploads, lambda: self.seen(state))
+        self.learn(state, found)
+        return Done(index, found.losses, len(state.points), found.render.maps, found.target)
+
+    def seen(self, state: StageState) -> Seen:
+        """Render the next view, compare it with its photograph, and go back to the splats."""
+        stage, index = self.stage, state.index + 1
         shown, target = self.target(state)
         active, reads = stage.weights_at(index), self.maps_read(index)
         leaves = {name: value.detach().requires_grad_() for name, value in state.points.all_params().items()}
-        state.sh_degree = max(state.sh_degree, min(self.primitive.sh_degree, index // stage.sh_every))
         shape = self.primitive.activate(leaves, state.sh_degree)
         splats = self.drawn(state, shape)
 
@@ -205,24 +211,35 @@ class Trainer:
         geometry, distortion = paired or bool(reads.keys() & GEOMETRY), "distortion" in reads
         render = self.draws.render(splats, target.view.camera, stage.near, geometry, distortion)
         refuse_wrong_maps(self.primitive, render.maps, target.view.camera, reads)
+        self.uploads.ahead(state.order, state.skipped)
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
-        losses, total, chosen = self.cotangents(active, render.maps, compared, self.look(state, shown))
-        seen = render.seen[: len(state.points)]
-        given = RegularizerInput(index, stage.steps, target, render.maps, seen, state.points.stat, leaves)
-        terms = regularizer_terms(stage.regularizers, shape, given)
-        losses |= as_numbers(terms)
-        require_finite_losses(index, target.view.name, losses)
+        look = self.look(state, shown)
+        losses, total, chosen, by_look = self.cotangents(active, render.maps, compared, look)
         gradients = render.backward(total, chosen, stage.signal.absolute, len(state.points))
-        facts = self.facts(state, splats, target, render, gradients)
+        return Seen(target, leaves, shape, splats, render, losses, gradients, look and (look, by_look))
+
+    def learn(self, state: StageState, found: Seen) -> None:
+        """Change the points by what a step has seen."""
+        stage, index, target, render = self.stage, state.index + 1, found.target, found.render
+        state.whole = False
+        if found.look is not None:
+            look, by_look = found.look
+            look.learn(by_look)
+        seen = render.seen[: len(state.points)]
+        given = RegularizerInput(index, stage.steps, target, render.maps, seen, state.points.stat, found.leaves)
+        terms = regularizer_terms(stage.regularizers, found.shape, given)
+        found.losses.update(as_numbers(terms))
+        require_finite_losses(index, target.view.name, found.losses)
+        facts = self.facts(state, found.splats, target, render, found.gradients)
         edit = self.wanted(state.points, facts)
-        adam_step(state.points, pulled(shape, gradients, leaves, list(terms.values())), facts.rates, index)
+        grads = pulled(found.shape, found.gradients, found.leaves, list(terms.values()))
+        adam_step(state.points, grads, facts.rates, index)
         require_finite_values(index, target.view.name, state.points.all_params())
         state.points = fitted(self.primitive, state.points)
         if edit is not None:
-            state.points = self.edited(state, edit, index)
-        state.index = index
-        return Done(index, losses, len(state.points), render.maps, target)
+            state.points = sparing(state, self.uploads, lambda: self.edited(state, edit, index))
+        state.index, state.whole = index, True
 
     def drawn(self, state: StageState, shape: Splats) -> Splats:
         """The splats of a state, detached, and then those that are frozen."""
@@ -256,26 +273,24 @@ class Trainer:
             if state.order.at == len(state.order.queue):
                 state.order.shuffle(state.generator)
                 self.foretell(state.order)
-            shown = state.order.next(state.generator)
-            if shown in state.skipped or (photo := self.photo(state, shown)) is None:
+            at = state.order.next(state.generator)
+            if at in state.skipped or (shown := self.readable(state, at, self.uploads.get(at))) is None:
                 continue
-            prior, mask = (None if known is None else known[shown] for known in (self.priors, self.masks))
-            prior, mask = (None if known is None else uploaded(known, photo.device) for known in (prior, mask))
-            return shown, Target(self.views[shown], photo, prior, mask, seed=state.seed)
+            return at, Target(self.views[at], shown.in_floats(), shown.prior, shown.mask, seed=state.seed)
         raise BadInput(f"none of the {len(self.views)} photographs can be read, {self.views[0].path} for one")
 
-    def photo(self, state: StageState, at: int, aside: bool = False) -> Tensor | None:
-        """(3, H, W) in [0, 1], the photograph of a view; None for a damaged one, which is named and not shown again.
+    @cached_property
+    def uploads(self) -> Uploads:
+        """The photographs, masks and priors, where the points are."""
+        return Uploads(self.rasterizer.where(), self.photos, self.masks, self.priors, self.gpu_bytes)
 
-        `aside`: it is looked at out of turn.
-        """
-        try:
-            photo = out_of_turn(self.photos, at) if aside else self.photos[at]
-        except BadInput as error:
-            state.skipped.append(at)
-            emit(PhotoSkipped(self.views[at].name, str(error)))
-            return None
-        return uploaded(photo, state.points.params["means"].device).to(torch.float32).div_(255)
+    def readable(self, state: StageState, at: int, found: Shown | BadInput) -> Shown | None:
+        """A view; None for one with a damaged photograph, which is named and not shown again."""
+        if isinstance(found, Shown):
+            return found
+        state.skipped.append(at)
+        emit(PhotoSkipped(self.views[at].name, str(found)))
+        return None
 
     @cached_property
     def rig(self) -> Rig:
@@ -292,19 +307,17 @@ class Trainer:
         generator = torch.Generator().manual_seed(state.seed)
         first = int(torch.randint(max(1, len(found)), (), generator=generator))
         for at in (*found[first:], *found[:first]):
-            photo = None if at in state.skipped else self.photo(state, at, aside=True)
-            if photo is None:
+            if at in state.skipped or (shown := self.readable(state, at, self.uploads.aside(at))) is None:
                 continue
             drawn = self.draws.render(splats, self.views[at].camera, self.stage.near, True, False).maps
-            mask = None if self.masks is None else out_of_turn(self.masks, at)
-            mask = None if mask is None else uploaded(mask, photo.device)
-            return Neighbour(self.views[at], photo, replace(drawn, color=None, distortion=None), mask)
+            shape = replace(drawn, color=None, distortion=None)
+            return Neighbour(self.views[at], shown.in_floats(), shape, shown.mask)
         return None
 
     def cotangents(
         self, active: Mapping[str, float], maps: Maps, target: Target, look: Look | None
-    ) -> tuple[dict[str, float], Maps, Maps | None]:
-        """The weighted losses, their gradient by the maps, and that of the losses that `Signal.terms` names."""
+    ) -> tuple[dict[str, float], Maps, Maps | None, Tensor | None]:
+        """The weighted losses; their gradient by the maps, that of those that `Signal.terms` names, and by the look."""
         losses, terms = self.stage.losses, self.stage.signal.terms
         leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
         leafy = Maps(**leaves)
@@ -312,14 +325,13 @@ class Trainer:
         compared, target = ignoring(compared, target)
         values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
         numbers = as_numbers(values)
-        if look is not None:
-            look.learn(list(values.values()))
+        by_look = None if look is None else look.gradient(list(values.values()))
         if terms is None:
             total = gradient(list(values.values()), leaves)
-            return numbers, total, total if self.stage.signal.absolute else None
+            return numbers, total, total if self.stage.signal.absolute else None, by_look
         chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared=look is not None)
         others = gradient([value for name, value in values.items() if name not in terms], leaves)
-        return numbers, added(chosen, others), chosen
+        return numbers, added(chosen, others), chosen, by_look
 
     def look(self, state: StageState, shown: int) -> Look | None:
         """The look of a photograph, if the stage learns any."""

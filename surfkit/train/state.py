@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
 
 from surfkit.primitives.points import Columns, Points
-from surfkit.readers.depth_prior import DepthPrior
 from surfkit.train.views import Order
-
-Known = TypeVar("Known", Tensor, DepthPrior)
 
 
 @dataclass
@@ -30,6 +25,8 @@ class StageState:
     """CPU time of the steps done, all threads, seconds."""
     peak_memory_bytes: int = 0
     """Most memory held so far; 0 where the system does not tell."""
+    peak_gpu_bytes: int = 0
+    """Most memory of the GPU held so far; 0 without one."""
     looks: Columns = field(default_factory=dict)
     """What is known of the look of each photograph (`train.look`)."""
     reset_at: int = 0
@@ -40,6 +37,8 @@ class StageState:
     """How often the learning rates have been halved, after numbers that were not finite."""
     skipped: list[int] = field(default_factory=list)
     """Positions of photographs that turned out damaged, and are not shown any more."""
+    whole: bool = True
+    """Whether it is that after a step, and not one in which a step has changed a part."""
     frozen: Columns = field(default_factory=dict)
     """Raw parameters of points that are drawn behind and before `points`, and that nothing changes; none if empty."""
 
@@ -53,13 +52,3 @@ class StageState:
     def seed(self) -> int:
         """Of what is drawn in the coming step beside the generator, in [0, 2^63)."""
         return (self.generator.initial_seed() * 1_000_003 + self.index + 1) % 2**63
-
-
-def uploaded(known: Known, device: torch.device) -> Known:
-    """A photograph, mask or depth prior on a device; to a GPU it travels while the host goes on."""
-    if isinstance(known, DepthPrior):
-        there = {name: uploaded(v, device) for name, v in vars(known).items() if isinstance(v, Tensor)}
-        return replace(known, **there)
-    if device == known.device:
-        return known
-    return (known.pin_memory() if torch.cuda.is_available() else known).to(device, non_blocking=True)

@@ -92,14 +92,17 @@ def same(a: Path, b: Path) -> bool:
     return (a / "point_cloud.ply").read_bytes() == (b / "point_cloud.ply").read_bytes()
 
 
-def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
+def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0, on_gpu: bool = False) -> None:
     """Memory gives out in a block whenever it has more than some points."""
+    wanted = "Tried to allocate 20.00 GiB"
     optimise, step = worker.optimise, Trainer.step
 
     def optimising(job, state):
         def short(self, state):
             if job.stage.block == block and len(state.points) > limit:
-                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
+                if on_gpu:
+                    raise torch.OutOfMemoryError(f"CUDA out of memory. {wanted}")
+                raise RuntimeError(f"DefaultCPUAllocator: can't allocate memory. {wanted}")
             return step(self, state)
 
         patch.setattr(Trainer, "step", short)
@@ -108,19 +111,23 @@ def short_above(limit: int, patch: pytest.MonkeyPatch, block: int = 0) -> None:
     patch.setattr(worker, "optimise", optimising)
 
 
-def test_a_block_for_which_memory_is_short_stops_to_grow(undisturbed, data, recipe, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_a_block_for_which_memory_is_short_stops_to_grow(
+    undisturbed, data, recipe, tmp_path, monkeypatch, capsys, on_gpu
+):
     """It has about 200 points in its last checkpoint when it comes to 400; with 300 it would fit."""
     before = points_of(undisturbed, 0)
     with monkeypatch.context() as patch:
-        short_above(300, patch)
+        short_above(300, patch, on_gpu=on_gpu)
         run(recipe, data, tmp_path, Compute("cpu"), EVERY)
     state = read_state(tmp_path / "blocks" / "000")
     assert (state.status, state.fallback, state.attempts, state.kind) == ("done", NO_GROWTH, 3, None)
     assert points_of(tmp_path, 0) <= state.most_points == 199 < 700 < before
     assert read_state(tmp_path / "blocks" / "001").fallback == 0 and points_of(tmp_path, 1) > 700
     said = notes(tmp_path)
-    assert [text for text in said if text.startswith("block 0 failed: out of memory")][0].endswith(
-        "though photographs are no longer kept in it; it is tried again: photographs are not kept in memory, which "
+    where, kept = ("GPU ", "not") if on_gpu else ("", "no longer")
+    assert [text for text in said if text.startswith(f"block 0 failed: out of {where}memory")][0].endswith(
+        f"though photographs are {kept} kept in it; it is tried again: photographs are not kept in memory, which "
         "is slower and does not change the result"
     )
     assert "block 0: after running out of memory: at most 199 points from step 3 on" in said

@@ -8,6 +8,7 @@ import pytest
 import torch
 from two_blocks import EVERY, STEPS, same, stop_after
 
+from surfkit.blocks import forecast as forecasts
 from surfkit.blocks import schedule, worker
 from surfkit.blocks.block import Block
 from surfkit.blocks.forecast import FROZEN_BYTES, POINT_BYTES, BlockPoints, forecast, initial_points, point_memory
@@ -215,7 +216,7 @@ class Found:
     seconds: float
 
 
-def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):
+def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path, capsys):
     loaded, _, scene = load_run(runs["frozen"])
     coarse, plan = coarse_and_plan(runs["frozen"])
     found = {}
@@ -236,6 +237,17 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path):
         block.write(begun_points=own + 7 if context == "frozen" else both + 7)
         more = {"densified": 3 * 7, "tuned": 7, "frozen": 3 * 7}[context] * POINT_BYTES
         assert point_memory(block) - found[context].memory == more
+    held = {"peak": 10_000_000, "photographs": 4_000_000, "points": 1_000_000, "steps": 5_000_000}
+    (place.out / "run.json").write_text(json.dumps({"gpu_memory_bytes": held}))
+    told_of_gpu = forecast([block], worker.open_coarse_model(place), [])
+    assert told.gpu_bytes == 0 and told_of_gpu.memory_bytes == 0
+    assert told_of_gpu.gpu_bytes == initial_points(block).bytes(
+        6e6 / len(coarse.points), 3e6 / len(coarse.points), forecasts.GROWN
+    )
+    forecasts.report_forecast(place.out, told_of_gpu)
+    assert (
+        f"a block needs up to {told_of_gpu.gpu_bytes / 1e6:.0f} MB of the memory of its GPU" in capsys.readouterr().err
+    )
     around = plan.blocks[0].begins - plan.blocks[0].points
     assert found["densified"].memory - found["tuned"].memory == 2 * around * POINT_BYTES
     less = POINT_BYTES - FROZEN_BYTES

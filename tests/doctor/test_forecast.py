@@ -28,6 +28,7 @@ from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.scene.scene import Cloud
+from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.stage import Trainer
 
@@ -288,3 +289,34 @@ def test_the_forecast_of_a_short_run_is_near_what_it_takes(farm, tmp_path):
     assert 0.8 * undistorted < found.data_bytes < 1.2 * undistorted
     again, _ = forecast(data, recipe, examined, Plan(10, out=out))
     assert again.data_bytes == 0  # they are there now
+
+
+def test_the_memory_of_a_gpu_is_measured_and_added_up(farm, monkeypatch, tmp_path):
+    monkeypatch.setattr("surfkit.doctor.probe.select", lambda device: (OnSimulatedGpu(select("cpu")[0]), "simulated"))
+    job = replace(tiny(farm, tmp_path), parts=parts(200, 300, 600), steps=12)
+    with simulated_gpu() as gpu:
+        gpu.limit = 10**9
+        started, *taken, _ = measure(job)
+        assert 0.9e9 < started.gpu_free_bytes <= 1e9 and taken[-1].gpu_bytes <= gpu.peak
+    found = estimate(LOAD, parts(200, 300, 600), rising(10**6), Probed(started, tuple(taken), WRITTEN), ROOM).gpu
+    columns = 3 * 4 * (3 + 2 + 4 + 1 + 4 * 3)  # parameters and moments, each of them float32
+    assert columns < found.point_bytes < 10 * columns
+    assert found.memory_bytes - found.cache_bytes == pytest.approx(10**6 * found.point_bytes, rel=0.2)
+    assert found.cache_bytes == int(0.25 * found.free_bytes), "of 4 GB of photographs"
+
+
+@pytest.mark.parametrize(
+    "free, words",
+    [
+        (10**10, None),
+        (5 * 10**9, "about 8.0 GB of the memory of the GPU, and 4.5 GB can be used: smaller photographs (--scale 2)"),
+    ],
+)
+def test_what_to_lower_where_a_gpu_is_small(free, words):
+    taken = (Taken(1_000_000, 0.5, 10**9, 4 * 10**9), Taken(2_000_000, 0.5, 10**9, 8 * 10**9))
+    started = replace(STARTED, gpu_free_bytes=free)
+    found = estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), Probed(started, taken, WRITTEN), ROOM)
+    assert found.gpu.memory_bytes == 8 * 10**9 + min(LOAD.view_bytes, free // 4)
+    assert [finding.what for finding in advice(found)] == ["gpu-memory"] * (words is not None)
+    assert words is None or words in advice(found)[0].text and "filters.0.points 1000000" in advice(found)[0].text
+    assert estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), probed(), ROOM).gpu is None

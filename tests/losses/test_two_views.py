@@ -263,6 +263,30 @@ def test_samples_are_those_between_the_centres_of_pixels():
     assert sampled(image, at).tolist() == pytest.approx([0.0, 2.5, 11.0, 0.0], abs=1e-6)
 
 
+def test_samples_and_their_gradients_are_those_of_torch():
+    draw = torch.Generator().manual_seed(5)
+    image = torch.rand(11, 17, generator=draw, dtype=torch.float64)
+    at = torch.rand(2, 6, 50, generator=draw, dtype=torch.float64) * torch.tensor([23.0, 17.0])[:, None, None] - 3
+    weights, found = torch.rand(6, 50, generator=draw, dtype=torch.float64), []
+    for way in ("own", "torch"):
+        place = at.clone().requires_grad_()
+        grid = 2 * place.flatten(1).T / torch.tensor([17.0, 11.0]) - 1
+        given = {"mode": "bilinear", "align_corners": False}
+        values = (
+            sampled(image, place)
+            if way == "own"
+            else torch.nn.functional.grid_sample(image[None, None], grid[None, None], **given).view(6, 50)
+        )
+        found.append((values.detach(), *torch.autograd.grad((values * weights).sum(), place)))
+    assert all(torch.allclose(a, b, atol=1e-12) for a, b in zip(*found, strict=True))
+    assert (found[0][0] == 0).any() and (found[0][0] > 0).any(), "some lie outside"
+
+
+def test_places_that_are_none_are_outside():
+    far = torch.tensor([[torch.nan, torch.inf, -1e30, 1e30, 2.0], [2.0, 2.0, torch.nan, 2.0, -torch.inf]])
+    assert torch.equal(sampled(torch.ones(4, 4), far), torch.zeros(5))
+
+
 def test_only_some_steps_count():
     for loss in (Reprojection(start=4, every=3), WarpedPatches(start=4, every=3)):
         assert [index for index in range(13) if loss.weight_at(index, 12)] == [6, 9, 12]

@@ -39,7 +39,7 @@ def test_a_stopped_run(folder, capsys):
     assert found == {
         "state": "stopped", "process": None, "stage": "pretrain", "step": 120, "steps": 400, "saved_step": 100,
         "steps_per_second": pytest.approx(4), "seconds_left": None, "points": 170, "loss": 0.75,
-        "peak_memory_bytes": 10**9, "metrics": {"psnr": 20.5, "views": 2, "step": 80},
+        "peak_memory_bytes": 10**9, "peak_gpu_bytes": None, "metrics": {"psnr": 20.5, "views": 2, "step": 80},
         "warnings": ["the scene is odd"], "skipped": ["c.jpg"], "blocks": [],
     }  # fmt: skip
     assert main(["status", str(folder)]) == 3

@@ -54,13 +54,18 @@ def everything(tiny):
 
 
 def trained(begin, stage, rasterizer, tiny, primitive=None):
-    """The trainer and its state after all steps."""
+    """The trainer and its state after all steps; where there are second views, also of a surface."""
     trainer, _ = begin(stage, primitive)
     priors, masks = everything(tiny)
     trainer = replace(trainer, rasterizer=rasterizer, priors=priors, masks=masks)
     _, state = begin(stage, primitive)
-    for _ in trainer.run(state):
-        pass
+    if any(loss.needs_neighbour for loss in stage.losses.values()):
+        trainer = replace(trainer, beside=lambda at, depth: [(at + 1) % len(tiny.views)])
+        state.points.params["opacities"] += 4.0
+        state.points.params["scales"] += 0.5
+    for done in trainer.run(state):
+        paired = stage.is_paired(done.index)
+        assert not paired or all(value > 0 for value in done.losses.values()), "a second view shows nothing of use"
     return trainer, state
 
 
@@ -121,8 +126,8 @@ def soon(part):
     return replace(part, **wanted, **wrapped)
 
 
-@pytest.mark.parametrize(("kind", "name"), PARTS, ids=[f"{kind.__name__}-{name}" for kind, name in PARTS])
-def test_every_part_runs_there(tiny, begin, kind, name):
+def staged(kind, name):
+    """A few steps with a part that acts in them, and the primitive if it is the part."""
     part, stage, primitive = soon(components(kind)[name]()), Stage(steps=6, densify=None), None
     edits = soon(ADC())
     if kind is Loss:
@@ -140,6 +145,12 @@ def test_every_part_runs_there(tiny, begin, kind, name):
             Prune: {"prune": (part,)},
         }
         stage = replace(stage, **changes[kind])
+    return stage, primitive
+
+
+@pytest.mark.parametrize(("kind", "name"), PARTS, ids=[f"{kind.__name__}-{name}" for kind, name in PARTS])
+def test_every_part_runs_there(tiny, begin, kind, name):
+    stage, primitive = staged(kind, name)
     with simulated_gpu():
         _, state = trained(begin, stage, OnSimulatedGpu(tiny.rasterizer), tiny, primitive)
         assert all(places(state)), f"{name}: not all is on the GPU"

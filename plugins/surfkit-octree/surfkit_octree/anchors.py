@@ -26,6 +26,7 @@ from surfkit import (
     seeds,
 )
 from surfkit.raster.api import CUTOFF
+from surfkit.raster.autograd import summed_by_owner
 from surfkit_octree.decode import decode, fresh_networks, network_columns
 from surfkit_octree.levels import TABLE, LevelTable, is_in_view
 
@@ -155,7 +156,7 @@ class Anchors(Primitive):
         with torch.no_grad():
             made, owner = self.derived(splats, camera, near)
         found = rasterizer.contribution(made, camera, near, alpha_power, transmittance_power)
-        total, hits = (value.new_zeros(len(splats)).index_add(0, owner, value) for value in found)
+        total, hits = (summed_by_owner(value, owner, len(splats)) for value in found)
         return total, hits
 
     def opacity_before(

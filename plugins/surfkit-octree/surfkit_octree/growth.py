@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit import BadInput, Columns, Densify, Edit, NewPoints, Points, Step, StepCount, Steps
+from surfkit.raster.autograd import summed_by_owner
 from surfkit_octree.anchors import FULL
 from surfkit_octree.levels import TABLE, LevelTable, centres, voxels
 
@@ -108,7 +109,7 @@ class AnchorGrowth(Densify):
         lit = (derived.seen & (made > 0)).to(grad)
         grad.view(-1).index_add_(0, slots, derived.grad_norm * lit)
         seen.view(-1).index_add_(0, slots, lit)
-        opacity.index_add_(0, derived.owner, made)
+        opacity += summed_by_owner(made, derived.owner, len(opacity))
         views.index_add_(0, derived.owner[::count], torch.ones_like(made[::count]))
 
     def edit(self, points: Points, step: Step) -> Edit | None:

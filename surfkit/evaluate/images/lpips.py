@@ -77,13 +77,14 @@ class Perceptual:
             unscaled: Give the network [0, 1] in place of the [-1, 1] that it was made for, as the published tables of
                 Gaussian splatting do; the distances are smaller.
         """
-        total = 0.0
+        total = torch.zeros((), dtype=torch.float64)
         with torch.inference_mode():
             pair = torch.stack([a, b if mask is None else torch.where(mask, b, a)]).to(self.heads[0])
             for head, (one, two) in zip(self.heads, self._features(pair if unscaled else 2 * pair - 1), strict=True):
                 apart = ((one - two).square() * head[:, None, None]).sum(0)
-                total += float(apart.mean() if mask is None else _mean_where(apart, mask))
-        return total
+                mean = apart.mean() if mask is None else _mean_where(apart, mask)
+                total = total.to(mean.device) + mean.double()
+        return float(total)
 
     def _features(self, pair: Tensor) -> Iterator[Tensor]:
         x = (pair - pair.new_tensor(SHIFT)[:, None, None]) / pair.new_tensor(SCALE)[:, None, None]

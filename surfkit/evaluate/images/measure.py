@@ -107,6 +107,7 @@ def evaluate_views(
         maps, mask = draw(view), None if masks is None else masks[at]
         if mask is None or mask.any():
             render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
+            mask = None if mask is None else mask.to(render.device)
             per_image[view.name] = _measured(render, target, mask, correct_color)
             per_image[view.name] |= lpips_values(networks, render, target, mask)
         if show is not None:
@@ -117,7 +118,6 @@ def evaluate_views(
 
 
 def _measured(render: Tensor, photo: Tensor, mask: Tensor | None, correct_color: bool) -> dict[str, float]:
-    mask = None if mask is None else mask.to(render.device)
     found = {"psnr": psnr(render, photo, mask), "ssim": mean_ssim(render, photo, mask)}
     if correct_color:
         found["psnr_corrected"] = psnr(color_corrected(render, photo, mask), photo, mask)

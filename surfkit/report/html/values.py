@@ -119,6 +119,7 @@ QUANTITIES = {
     "seconds": Quantity("training", (("seconds",),), form="duration"),
     "cpu_seconds": Quantity("CPU time", (("cpu_seconds",),), form="duration"),
     "peak_memory_bytes": Quantity("peak memory", (("peak_memory_bytes",),), form="bytes"),
+    "peak_gpu_bytes": Quantity("peak GPU memory", (("peak_gpu_bytes",),), form="bytes"),
     "bytes": Quantity("model size", (("bytes",),), form="bytes"),
     "fps": Quantity("frames/s", (("fps",),), 1),
 }

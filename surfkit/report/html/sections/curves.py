@@ -25,6 +25,12 @@ def memory(line: dict[str, Any]) -> float | None:
     return found / 1e9 if found else None
 
 
+def gpu_memory(line: dict[str, Any]) -> float | None:
+    """The most memory of the GPU held so far, GB."""
+    found = number(line, "peak_gpu_bytes")
+    return found / 1e9 if found else None
+
+
 def mean_psnr(line: dict[str, Any]) -> float | None:
     """The mean PSNR of the held-out views that were looked at."""
     found = mapping(line, "psnr")
@@ -37,6 +43,7 @@ WHAT: tuple[tuple[str, Value, str], ...] = (
     ("Points", points, "StepDone"),
     ("Mean PSNR of a few held-out views, dB", mean_psnr, "Measured"),
     ("Most memory held so far, GB", memory, "StepDone"),
+    ("Most memory of the GPU held so far, GB", gpu_memory, "StepDone"),
 )
 
 

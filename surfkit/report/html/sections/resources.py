@@ -9,6 +9,7 @@ from surfkit.report.html.source import Part, Source, heading
 from surfkit.report.html.values import NONE, as_bytes, as_duration, mapping, number, numeric
 
 MEMORY = "The most memory that was held, by what it was taken by"
+GPU_MEMORY = "The most memory of the GPU that was held, by what it was taken by"
 
 
 def resources(runs: Sequence[Source]) -> Section | None:
@@ -32,40 +33,44 @@ def seconds_of(part: Part) -> float | None:
 
 
 def _stages(run: Source) -> list[Element]:
-    rows: list[tuple[str, float | None, float | None, float | None, float | None]] = []
+    rows: list[tuple[str, float | None, float | None, float | None, float | None, float | None]] = []
     if (prepared := number(run.metrics, "prepare_cpu_seconds")) or (
         prepared := number(run.record, "prepare_cpu_seconds")
     ):
-        rows.append(("depth maps (CPU time)", prepared, None, None, None))
+        rows.append(("depth maps (CPU time)", prepared, None, None, None, None))
     for part in run.parts:
         last = next(iter(reversed(part.of("StepDone"))), None)
         if last is not None:
-            held = number(last, "peak_memory_bytes") or None
-            points = number(last, "points") or None
-            rows.append((part.title, seconds_of(part), number(last, "index"), points, held))
+            points, *held = (number(last, key) or None for key in ("points", "peak_memory_bytes", "peak_gpu_bytes"))
+            rows.append((part.title, seconds_of(part), number(last, "index"), points, *held))
     for name, data in (("mesh", run.mesh), ("compression", run.compressed)):
         if (took := number(data, "seconds")) is not None:
-            rows.append((name, took, None, None, None))
+            rows.append((name, took, None, None, None, None))
     longest = max((row[1] or 0 for row in rows), default=0)
+    with_gpu = any(row[5] for row in rows)
     cells = [
         (
             Cell(name, at),
             Cell(NONE) if took is None else Cell(as_duration(took), took, share=took / longest if longest else 0.0),
             *(numeric(value, "" if value is None else f"{value:,.0f}") for value in (steps, points)),
-            numeric(held, "" if held is None else as_bytes(held)),
+            *(numeric(value, "" if value is None else as_bytes(value)) for value in held[: 1 + with_gpu]),
         )
-        for at, (name, took, steps, points, held) in enumerate(rows)
+        for at, (name, took, steps, points, *held) in enumerate(rows)
     ]
-    head = ("part", "time", "steps", "points", "peak memory")
+    head = ("part", "time", "steps", "points", "peak memory", *["peak GPU memory"] * with_gpu)
     return [Table("Time and memory by stage", head, tuple(cells), is_sortable=True)] if cells else []
 
 
 def _memory(run: Source) -> list[Element]:
-    found = mapping(run.metrics, "memory_bytes") or mapping(run.record, "memory_bytes")
+    return [*_parts(run, "memory_bytes", MEMORY), *_parts(run, "gpu_memory_bytes", GPU_MEMORY)]
+
+
+def _parts(run: Source, kind: str, title: str) -> list[Element]:
+    found = mapping(run.metrics, kind) or mapping(run.record, kind)
     parts = {name: value for name in found if name != "peak" and (value := number(found, name)) is not None}
     most = max(parts.values(), default=0.0)
     rows = [
         (Cell(name), Cell(as_bytes(value), value, share=max(0.0, value) / most if most > 0 else 0.0))
         for name, value in parts.items()
     ]
-    return [Table(MEMORY, ("part", "memory"), tuple(rows), is_sortable=True)] if rows else []
+    return [Table(title, ("part", "memory"), tuple(rows), is_sortable=True)] if rows else []

@@ -1,0 +1,37 @@
+"""What a step of a stage has seen of a view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from surfkit.losses.base import Target
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.train.look import Look
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a step knows before it changes anything.
+
+    Attributes:
+        target: The view and its photograph.
+        leaves: Raw parameters, that gradients can be taken by.
+        shape: The splats made of them.
+        splats: The same, detached, and the frozen ones.
+        render: The view as drawn.
+        losses: Weighted value of each loss.
+        gradients: By the splats.
+        look: The look of the photograph, and the gradient by it, if the stage learns any.
+    """
+
+    target: Target
+    leaves: Columns
+    shape: Splats
+    splats: Splats
+    render: Render
+    losses: dict[str, float]
+    gradients: Gradients
+    look: tuple[Look, Tensor | None] | None
