@@ -21,7 +21,7 @@ from surfkit.scene.scene import Frame, Scene, View
 
 FROM, TO = 0.05, 0.95
 """Where a flight over the scene begins and ends: quantiles of the camera positions along it."""
-PITCH_DEGREES = 35.0
+PITCH_DEGREES = 45.0
 """By which the camera looks down in a flight over the scene."""
 LOW = 0.05
 """Height of the cameras above what they see, as a share of the length of the flight, below which they stand on the
@@ -69,7 +69,8 @@ def orbit(scene: Scene, lens: Camera, count: int) -> Flight:
 def flyover(scene: Scene, lens: Camera, count: int) -> Flight:
     """A straight flight along the direction in which the training cameras are spread most, at their median height.
 
-    The camera looks ahead and down; ahead alone where the cameras stand on the ground.
+    The camera looks ahead and down, and what it looks at moves from one end of the cameras to the other; where these
+    stand on the ground, it stands there too and looks ahead.
     """
     up, middle, centres = up_of(scene), middle_of(scene), centres_of(scene.train)
     level = centres - np.outer(centres @ up, up)
@@ -80,9 +81,11 @@ def flyover(scene: Scene, lens: Camera, count: int) -> Flight:
         raise BadInput("--path flyover: all training cameras stand above one place; give --path orbit or a file")
     across = np.cross(up, along)
     height = float(np.median(centres @ up))
-    pitch = math.radians(PITCH_DEGREES) if height - middle @ up > LOW * (end - begin) else 0.0
+    above = height - float(middle @ up)
+    pitch = math.radians(PITCH_DEGREES) if above > LOW * (end - begin) else 0.0
     ahead = math.cos(pitch) * along - math.sin(pitch) * up
-    start = float(np.median(level @ across)) * across + height * up
+    behind = above / math.tan(pitch) if pitch else 0.0
+    start = float(np.median(level @ across)) * across + height * up - behind * along
     steps = np.linspace(begin, end, count)
     return Flight([looking(lens, start + step * along, ahead, up) for step in steps])
 
