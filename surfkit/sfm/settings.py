@@ -1,0 +1,51 @@
+"""How cameras are found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from surfkit.core.check import BadInput, require_within
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of structure from motion."""
+
+    longest: int = 1600
+    """Features are found in photographs reduced to this longer side, pixels; 3200 is more exact and takes four times as
+    long. The photographs that are written keep their size."""
+
+    features: int = 8192
+    """About how many features are kept of a photograph."""
+
+    pairs: Literal["auto", "exhaustive", "gps", "sequence", "retrieval"] = "auto"
+    """Which photographs are compared: all with all, each with its neighbours by GPS, by time or name, or by likeness
+    (sequence too). `auto` compares all of up to 60 photographs, of more those near by GPS, else those alike."""
+
+    neighbours: int = 20
+    """How many photographs each is compared with, where not with all."""
+
+    lens: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"] = "SIMPLE_RADIAL"
+    """COLMAP's model of the lens: one or two radial terms, radial and tangential terms, more of both, or a fisheye.
+    Photographs of equal camera, size and focal length share a lens."""
+
+    mapper: Literal["incremental", "global"] = "incremental"
+    """How cameras are placed: one after the other, or all at once, which is faster for thousands of photographs and
+    less robust."""
+
+    gps: bool = True
+    """Place the scene on Earth by the positions in EXIF. Without it, or without such positions, it is only levelled."""
+
+    crs: str = "auto"
+    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is the zone of UTM."""
+
+    seed: int = 0
+    """Of all that is drawn at random."""
+
+    def __post_init__(self) -> None:
+        require_within(
+            {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000), "seed": (0, 2**31 - 1)}, self
+        )
+        if not self.crs.strip():
+            raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")
