@@ -26,9 +26,9 @@ class Photos:
     """Find the cameras of a folder of photographs by structure from motion, and write a data set that
     `surfkit train` reads.
 
-    SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With positions
-    in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one with
-    other settings or photographs does again only what depends on them.
+    SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
+    positions in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one
+    with other settings or photographs does again only what depends on them.
     """
 
     photos: Annotated[Path, tyro.conf.Positional]
@@ -92,5 +92,3 @@ def show(report: dict[str, Any], scene: Path) -> None:
     if len(lost) > SHOWN:
         print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
     print(f"data set in {scene}; look at {scene / PICTURE}")
-
-

@@ -1,4 +1,4 @@
-"""The data set: photographs as pinhole cameras would have taken them, and models of these cameras, as COLMAP lays out."""
+"""The data set: photographs as pinhole cameras would have taken them, and COLMAP models of these cameras."""
 
 from __future__ import annotations
 
@@ -66,6 +66,7 @@ def deliver(
         cameras = {image.camera_id: _pinhole(model.cameras[image.camera_id]) for image in images}
         sights = {}
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+
             def undistort(image: Any, model: Any = model) -> Sight:
                 key = _key(photos[image.name], model.cameras[image.camera_id])
                 name = file_name(image.name)
@@ -121,9 +122,7 @@ def _write(source: Path, target: Path, model: Any, image: Any, there: bool) -> S
     camera = model.cameras[image.camera_id]
     bent = np.array([spot.xy for spot in image.get_observation_points2D()], np.float64).reshape(-1, 2)
     pinhole = _pinhole(camera)
-    if there and target.is_file():
-        straight = read_photo(target, (pinhole.width, pinhole.height)).permute(1, 2, 0).numpy()
-    else:
+    if not (there and target.is_file()):
         pixels = read_photo(source, (camera.width, camera.height)).permute(1, 2, 0).numpy()
         bitmap = engine.Bitmap.from_array(np.ascontiguousarray(pixels))
         straight = np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
@@ -132,6 +131,7 @@ def _write(source: Path, target: Path, model: Any, image: Any, there: bool) -> S
                 Image.fromarray(straight).save(file, "PNG", compress_level=1)
             else:
                 Image.fromarray(straight).save(file, "JPEG", quality=QUALITY, subsampling=0)
+    straight = read_photo(target, (pinhole.width, pinhole.height)).permute(1, 2, 0).numpy()
     rays = np.asarray(camera.cam_from_img(bent)).reshape(-1, 2)
     spots = np.asarray(pinhole.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))).reshape(-1, 2)
     column = np.floor(np.nan_to_num(spots[:, 0])).clip(0, pinhole.width - 1).astype(int)

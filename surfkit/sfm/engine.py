@@ -19,7 +19,9 @@ def load_engine() -> Any:
     pycolmap = load_pycolmap()
     if not hasattr(pycolmap, "CancellationToken"):
         version = getattr(pycolmap, "__version__", "")
-        raise BadInput(f"`surfkit prepare photos` needs pycolmap 4.2 or newer, this is {version}: pip install -U pycolmap")
+        raise BadInput(
+            f"`surfkit prepare photos` needs pycolmap 4.2 or newer, this is {version}: pip install -U pycolmap"
+        )
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     return pycolmap
 
@@ -54,6 +56,8 @@ def run(what: str, work: Callable[[Any], T]) -> T:
     if failed:
         if isinstance(failed[0], (RuntimeError, ValueError, IndexError)) and not isinstance(failed[0], BadInput):
             said = " ".join(str(failed[0]).split())[:300]
-            raise BadInput(f"{what} failed in pycolmap: {said}; delete the scene's prepare/ and try again") from failed[0]
+            raise BadInput(f"{what} failed in pycolmap: {said}; delete the scene's prepare/ and try again") from failed[
+                0
+            ]
         raise failed[0]
     return result[0]

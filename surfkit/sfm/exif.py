@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
 
+# What is damaged counts as not said.
+warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
 TAKEN, SUBSECOND, FOCAL_MM, FOCAL35_MM = 0x9003, 0x9291, 0x920A, 0xA405

@@ -119,7 +119,7 @@ def place(
     sigma = None if None in stated else np.linalg.norm(np.array(stated, np.float64), axis=1) / np.sqrt(3)
     fit = fit_robustly(xyz, onto, sigma, seed)
     if fit is None:
-        return Refused(f"positions of {len(known)} photographs contradict the cameras: fewer than half agree")
+        return Refused(f"of {len(known)} positions fewer than {FEWEST} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
     along, across = fit.similarity.scale * spread[:2] / np.sqrt(fit.inside.sum()) * chart.metres
     rms = float(np.linalg.norm(fit.sigma)) * chart.metres

@@ -74,7 +74,8 @@ def _incremental(engine: Any, database: Path, folder: Path, count: int, settings
             database, folder, folder, options, "", lambda: one_more(2), one_more, token
         ),
     )
-    emit(Progress("placing cameras", count, count))
+    if placed < count:
+        emit(Progress("placing cameras", count, count))
     return models
 
 

@@ -52,9 +52,7 @@ class Contents:
 def contents(photos: Sequence[Photo], folder: Path, settings: Settings) -> Contents:
     """What the database of photographs is to be made from."""
     features = {photo.name: feature_file(folder, photo, settings).name for photo in photos}
-    lenses = {
-        photo.name: f"{settings.lens} {photo.exif.camera} {photo.size} {photo.exif.focal_px}" for photo in photos
-    }
+    lenses = {photo.name: f"{settings.lens} {photo.exif.camera} {photo.size} {photo.exif.focal_px}" for photo in photos}
     return Contents(features, lenses, settings.seed)
 
 
@@ -69,9 +67,10 @@ def match(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, databa
         settings: How.
     """
     engine = load_engine()
-    wanted = contents(photos, features, settings)
-    if not _is_of(database, wanted):
-        _begin(engine, photos, features, database, wanted, settings)
+    try:
+        refuse_other(database, contents(photos, features, settings))
+    except BadInput:
+        _begin(photos, pairs, features, database, settings)
     file = database.with_name("pairs.txt")
     for start in range(0, len(pairs), BATCH):
         batch = pairs[start : start + BATCH]
@@ -81,6 +80,12 @@ def match(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, databa
         run("comparing photographs", lambda token: _compare(engine, database, file, settings, token))
         emit(Progress("comparing photographs", start + len(batch), len(pairs)))
     file.unlink(missing_ok=True)
+
+
+def refuse_other(database: Path, wanted: Contents) -> None:
+    """BadInput unless there is a database that was made from this."""
+    if not database.is_file() or read_json(_record(database), Contents) != wanted:
+        raise BadInput(f"{database}: of other photographs, features or settings")
 
 
 def matched(database: Path) -> dict[str, int]:
@@ -114,18 +119,10 @@ def _record(database: Path) -> Path:
     return database.with_suffix(".json")
 
 
-def _is_of(database: Path, wanted: Contents) -> bool:
-    """Whether a database was made from this."""
-    try:
-        return database.is_file() and read_json(_record(database), Contents) == wanted
-    except BadInput:
-        return False
-
-
-def _begin(
-    engine: Any, photos: Sequence[Photo], features: Path, database: Path, wanted: Contents, settings: Settings
-) -> None:
+def _begin(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, database: Path, settings: Settings) -> None:
     """Write a database of the photographs and their features, with what the one before knows of unchanged pairs."""
+    engine, wanted = load_engine(), contents(photos, features, settings)
+    named = [(photos[one].name, photos[two].name) for one, two in pairs]
     new = database.with_name("new.db")
     for rest in database.parent.glob("new.db*"):
         rest.unlink()
@@ -133,7 +130,7 @@ def _begin(
     try:
         with engine.DatabaseTransaction(opened):
             numbers = _write_photos(engine, opened, photos, features, settings)
-            _take_over(engine, opened, numbers, database, wanted)
+            _take_over(opened, numbers, named, database, wanted)
     finally:
         opened.close()
     _record(database).unlink(missing_ok=True)
@@ -179,8 +176,10 @@ def _camera(engine: Any, photo: Photo, model: str) -> Any:
     return camera
 
 
-def _take_over(engine: Any, new: Any, numbers: Mapping[str, int], database: Path, wanted: Contents) -> None:
-    """Write the matches of unchanged pairs of the database before into a new one."""
+def _take_over(
+    new: Any, numbers: Mapping[str, int], pairs: Sequence[tuple[str, str]], database: Path, wanted: Contents
+) -> None:
+    """Write the matches of those pairs that have not changed since the database before into a new one."""
     try:
         before = read_json(_record(database), Contents)
     except BadInput:
@@ -192,20 +191,14 @@ def _take_over(engine: Any, new: Any, numbers: Mapping[str, int], database: Path
         for name in numbers
         if before.features.get(name) == wanted.features[name] and before.lenses.get(name) == wanted.lenses[name]
     }
-    old = engine.Database.open(database)
+    old = load_engine().Database.open(database)
     try:
-        names = {image.image_id: unquote(image.name) for image in old.read_all_images()}
-
-        def pair(number: int) -> tuple[int, int] | None:
-            one, two = (names[image] for image in engine.pair_id_to_image_pair(number))
-            # the order of the two is that of their matches; numbers follow names in both databases
-            return (numbers[one], numbers[two]) if one in same and two in same else None
-
-        for number, rows in zip(*old.read_all_matches(), strict=True):
-            if found := pair(number):
-                new.write_matches(*found, rows)
-        for number, geometry in zip(*old.read_two_view_geometries(), strict=True):
-            if found := pair(number):
-                new.write_two_view_geometry(*found, geometry)
+        there = {unquote(image.name): image.image_id for image in old.read_all_images()}
+        for one, two in pairs:
+            if one in same and two in same and old.exists_matches(there[one], there[two]):
+                new.write_matches(numbers[one], numbers[two], old.read_matches(there[one], there[two]))
+                if old.exists_two_view_geometry(there[one], there[two]):
+                    found = old.read_two_view_geometry(there[one], there[two])
+                    new.write_two_view_geometry(numbers[one], numbers[two], found)
     finally:
         old.close()

@@ -20,7 +20,7 @@ from surfkit.sfm.features import FEWEST, feature_file, find_features, read_featu
 from surfkit.sfm.georeference import Placement, Refused, centres_of, chart_of, place
 from surfkit.sfm.level import turn_upright, up_direction
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
-from surfkit.sfm.matching import contents, match, matched
+from surfkit.sfm.matching import contents, match, matched, refuse_other
 from surfkit.sfm.pairs import Pair, choose_pairs
 from surfkit.sfm.photographs import Photo, look
 from surfkit.sfm.report import draw, model_facts, reasons
@@ -69,7 +69,12 @@ class Preparation:
         key = key_of(made_of, self.settings, [[photo.exif.position, photo.exif.taken] for photo in rich])
         pairs = stages.run("pairs", key, lambda: self._pairs(rich), self._load_pairs)
         database = self.work / "database.db"
-        stages.run("matches", key_of(key, pairs), lambda: match(rich, pairs, folder, database, self.settings))
+        stages.run(
+            "matches",
+            key_of(made_of, pairs),
+            lambda: match(rich, pairs, folder, database, self.settings),
+            lambda: refuse_other(database, made_of),
+        )
         key = key_of(made_of, pairs, self.settings.mapper, self.settings.seed)
         models = stages.run("cameras", key, lambda: self._map(database, len(rich)), self._load_models)
         matches = matched(database)
@@ -141,9 +146,7 @@ class Preparation:
         chart = chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
         return [self._place_one(number, read_model(path), chart, photos) for number, path in enumerate(models)]
 
-    def _place_one(
-        self, number: int, model: Any, chart: Any, photos: Sequence[Photo]
-    ) -> tuple[Any, Placement | None]:
+    def _place_one(self, number: int, model: Any, chart: Any, photos: Sequence[Photo]) -> tuple[Any, Placement | None]:
         engine, by_name = load_engine(), {photo.name: photo for photo in photos}
         where: Placement | Refused
         if chart is None:
@@ -159,15 +162,7 @@ class Preparation:
         adjusted = adjust(model, where, by_name, self.settings)
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
-        wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
-        if wrong:
-            far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
-            emit(
-                Warned(
-                    f"{len(wrong)} positions contradict the others and are left out, by {far.min():.0f} to "
-                    f"{far.max():.0f} m: {few(wrong)}"
-                )
-            )
+        _name_wrong(where)
         return adjusted or model, where
 
     def _report(
@@ -188,6 +183,17 @@ class Preparation:
         write_json(self.scene / REPORT, report)
         draw(self.scene / PICTURE, read_drawn(self.scene), placed[0][1])
         return report
+
+
+def _name_wrong(where: Placement) -> None:
+    """Say which positions are left out."""
+    wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
+    far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
+    if len(wrong) == 1:
+        emit(Warned(f"the position of {wrong[0]!r} is {far[0]:.0f} m from where the others put it, and is left out"))
+    elif wrong:
+        by = f"{far.min():.0f} to {far.max():.0f} m"
+        emit(Warned(f"{len(wrong)} positions are {by} from where the others put them, and are left out: {few(wrong)}"))
 
 
 def read_drawn(scene: Path) -> Any:

@@ -58,7 +58,11 @@ def model_facts(model: Any, placement: Placement | None, metres: float = 1.0) ->
         "track_length": round(model.compute_mean_track_length(), 2),
         "reprojection_error_px": round(model.compute_mean_reprojection_error(), 3),
         "cameras": [
-            {"model": camera.model.name, "size": [camera.width, camera.height], "params": list(map(float, camera.params))}
+            {
+                "model": camera.model.name,
+                "size": [camera.width, camera.height],
+                "params": list(map(float, camera.params)),
+            }
             for _, camera in sorted(model.cameras.items())
         ],
     }
@@ -70,9 +74,7 @@ def model_facts(model: Any, placement: Placement | None, metres: float = 1.0) ->
 def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
     """Residuals of the positions of a model on the map, metres: position in EXIF less camera."""
     centres, metres = centres_of(model), placement.chart.metres
-    left = np.stack(
-        [(xyz - centres[name]) * metres for name, xyz in zip(placement.names, placement.onto, strict=True)]
-    )
+    left = np.stack([(xyz - centres[name]) * metres for name, xyz in zip(placement.names, placement.onto, strict=True)])
     inside = placement.fit.inside
     lengths = np.linalg.norm(left, axis=1)
     return {
@@ -86,9 +88,7 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
             for name, length, good in zip(placement.names, lengths, inside, strict=True)
             if not good
         },
-        "residuals_m": {
-            name: row for name, row in zip(placement.names, left.round(3).tolist(), strict=True)
-        },
+        "residuals_m": {name: row for name, row in zip(placement.names, left.round(3).tolist(), strict=True)},
     }
 
 

@@ -45,7 +45,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         require_within(
-            {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000), "seed": (0, 2**31 - 1)}, self
+            {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000), "seed": (0, 2**31 - 1)},
+            self,
         )
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

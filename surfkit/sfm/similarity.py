@@ -60,7 +60,7 @@ def umeyama(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray) -> Similarit
 
 
 def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = None, seed: int = 0) -> Fit | None:
-    """The similarity on which most positions agree; None where fewer than `FEWEST` or than half of them do.
+    """The similarity on which most positions agree; None where fewer than `FEWEST` do.
 
     Args:
         xyz: (P, 3) float64.
@@ -79,7 +79,7 @@ def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = N
         length = np.linalg.norm(onto - best.points(xyz), axis=1) / spread
         unit = max(float(np.median(length)) / MEDIAN_OF_CHI3, 1e-9)
         now = length <= SIGMAS * unit
-        if now.sum() < FEWEST or 2 * now.sum() < count:
+        if now.sum() < FEWEST:
             return None
         best = umeyama(xyz, onto, weights * now)
         if (now == inside).all():
