@@ -102,8 +102,8 @@ def draw(path: Path, model: Any, placement: Placement | None) -> None:
     rgb = np.array([point.color for _, point in points], np.float64).reshape(-1, 3) / 255
     centres = centres_of(model)
     cameras = np.stack(list(centres.values()))
-    near = _box(np.concatenate([xyz, cameras]))
-    figure = Figure(figsize=(9, 9 * near.shape[0] / 2))
+    near = _box(xyz, cameras)
+    figure = Figure(figsize=(9, 9.5))
     axes = figure.add_subplot()
     axes.scatter(*xyz[:, :2].T, c=rgb, s=1.5, linewidths=0, rasterized=True)
     if placement is not None:
@@ -119,13 +119,14 @@ def draw(path: Path, model: Any, placement: Placement | None) -> None:
     if placement is not None:
         east, north, _ = placement.chart.offset
         axes.set(xlabel=f"east - {east:.0f}", ylabel=f"north - {north:.0f}", title=f"from above, {placement.chart.crs}")
-    axes.legend(loc="upper right")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3)
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=110, bbox_inches="tight")
 
 
-def _box(xyz: np.ndarray) -> np.ndarray:
-    """(2, 2) lower and upper corner of most of the positions, with a margin."""
+def _box(xyz: np.ndarray, cameras: np.ndarray) -> np.ndarray:
+    """(2, 2) lower and upper corner of all cameras and most of the points, with a margin."""
     low, high = np.percentile(xyz[:, :2], [2, 98], axis=0)
-    margin = 0.15 * max(float((high - low).max()), 1e-9)
+    low, high = np.minimum(low, cameras[:, :2].min(0)), np.maximum(high, cameras[:, :2].max(0))
+    margin = 0.05 * max(float((high - low).max()), 1e-9)
     return np.stack([low - margin, high + margin])
