@@ -139,4 +139,4 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
         write_picture(path, torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], dim=1))
 
 
-COMMAND = {"photos": Photos, "depth": Depth}
+COMMAND = {"depth": Depth, "photos": Photos}

@@ -66,7 +66,8 @@ class Preparation:
         counts = stages.run("features", "", lambda: find_features(usable, self.root, folder, self.settings))
         rich = [photo for photo in usable if counts[photo.name] >= FEWEST]
         made_of = contents(rich, folder, self.settings)
-        key = key_of(made_of, self.settings, [[photo.exif.position, photo.exif.taken] for photo in rich])
+        chosen = [self.settings.pairs, self.settings.neighbours, self.settings.seed]
+        key = key_of(made_of, chosen, [[photo.exif.position, photo.exif.taken] for photo in rich])
         pairs = stages.run("pairs", key, lambda: self._pairs(rich), self._load_pairs)
         database = self.work / "database.db"
         stages.run(
