@@ -81,6 +81,12 @@ def show(report: dict[str, Any], scene: Path) -> None:
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))
         rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north, {up:.2f} up of {place['positions']}"))
+    if ground := first.get("ground_control"):
+        rows.append(("on the map", f"{ground['crs']}, offset {' '.join(f'{value:.0f}' for value in ground['offset'])}"))
+        for what in ("control", "checkpoints"):
+            if rms := ground[f"{what}_rms_m"]:
+                said = f"{rms['e']:.2f} m east, {rms['n']:.2f} north, {rms['u']:.2f} up of {len(ground[what])}"
+                rows.append((f"{what} (RMS)", said))
     if len(models) > 1:
         others = ", ".join(f"sparse/{at} of {model['photographs']}" for at, model in enumerate(models[1:], 1))
         rows.append(("other groups", f"{others} (--model sparse/1 trains one)"))

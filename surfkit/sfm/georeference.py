@@ -21,6 +21,8 @@ MOST_TURN = 0.05
 """Standard error of the turn and the scale, as a share: beyond it positions do not determine them."""
 LINE = 0.05
 """Positions lie along a line where they spread across it by less than this share of the spread along it."""
+NEAR_M = 0.1
+"""A residual below it is not held against a position, nor half of it against a control point."""
 METRIC = 0.01
 """Units that differ from a metre by less are metres, as those of projections are."""
 
@@ -82,7 +84,11 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
             raise BadInput(f"at latitude {middle[0]:.2f} there is no UTM; name a system with --crs, such as EPSG:3995")
         zone = int((middle[1] + 180) // 6) % 60 + 1
         crs = f"EPSG:{(32700 if middle[0] < 0 else 32600) + zone}"
-    placed = to_chart(Chart(crs, (0.0, 0.0, 0.0)), middle[None])[0]
+    return chart_about(crs, to_chart(Chart(crs, (0.0, 0.0, 0.0)), middle[None])[0])
+
+
+def chart_about(crs: str, placed: np.ndarray) -> Chart:
+    """The map about (3,) a place on it, its offset near it; BadInput for one that is not of east, north and up."""
     unit = Site.at(crs, placed).unit
     metres = 1.0 if abs(unit - 1) < METRIC else unit
     east, north = (float(np.round(value / GRAIN_M) * GRAIN_M) for value in placed[:2])
@@ -117,7 +123,7 @@ def place(
     onto = to_chart(chart, np.array([photo.exif.position for photo in known], np.float64))
     stated = [photo.exif.accuracy_m for photo in known]
     sigma = None if None in stated else np.linalg.norm(np.array(stated, np.float64), axis=1) / np.sqrt(3)
-    fit = fit_robustly(xyz, onto, sigma, seed)
+    fit = fit_robustly(xyz, onto, sigma, seed, NEAR_M / chart.metres)
     if fit is None:
         return Refused(f"of {len(known)} positions fewer than {FEWEST} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)

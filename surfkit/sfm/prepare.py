@@ -12,12 +12,14 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
+from surfkit.readers.georeference import Similarity
 from surfkit.readers.placed import Placed
 from surfkit.sfm.adjust import adjust
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
-from surfkit.sfm.georeference import Placement, Refused, centres_of, chart_of, place
+from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
+from surfkit.sfm.ground_control import Control, Ground, place_by_points, read_ground
 from surfkit.sfm.level import turn_upright, up_direction
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import contents, match, matched, refuse_other
@@ -62,6 +64,7 @@ class Preparation:
         photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
+        site = self._site(usable)
         folder = self.work / "features"
         counts = stages.run("features", "", lambda: find_features(usable, self.root, folder, self.settings))
         rich = [photo for photo in usable if counts[photo.name] >= FEWEST]
@@ -81,7 +84,7 @@ class Preparation:
         matches = matched(database)
         if not models:
             raise BadInput(self._no_model(photos, reasons(photos, counts, matches, [])))
-        placed = stages.run("georeference", "", lambda: self._place(models, photos))
+        placed = stages.run("georeference", "", lambda: self._place(models, photos, site))
         by_name = {photo.name: photo for photo in photos}
         done = [(model, None if where is None else _placed(where)) for model, where in placed]
         stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
@@ -141,36 +144,47 @@ class Preparation:
             "views of each place, from positions that differ"
         )
 
-    def _place(self, models: Sequence[Path], photos: Sequence[Photo]) -> list[tuple[Any, Placement | None]]:
-        """The models, each on the map or level."""
-        known = np.array([p.exif.position for p in photos if p.usable and p.exif.position is not None], np.float64)
-        chart = chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
-        return [self._place_one(number, read_model(path), chart, photos) for number, path in enumerate(models)]
+    def _site(self, photos: Sequence[Photo]) -> Chart | Ground | None:
+        """The map that the models come to, with control points if there are some; None without either."""
+        if self.settings.gcp is not None:
+            return read_ground(self.settings.gcp, self.settings.crs, [photo.name for photo in photos])
+        known = np.array([photo.exif.position for photo in photos if photo.exif.position is not None], np.float64)
+        return chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
 
-    def _place_one(self, number: int, model: Any, chart: Any, photos: Sequence[Photo]) -> tuple[Any, Placement | None]:
-        engine, by_name = load_engine(), {photo.name: photo for photo in photos}
-        where: Placement | Refused
-        if chart is None:
-            said = "no photograph has a position in EXIF" if self.settings.gps else "--no-gps"
-            where = Refused(said)
+    def _place(
+        self, models: Sequence[Path], photos: Sequence[Photo], site: Chart | Ground | None
+    ) -> list[tuple[Any, Placement | Control | None]]:
+        """The models, each on the map or level."""
+        return [self._place_one(number, read_model(path), site, photos) for number, path in enumerate(models)]
+
+    def _place_one(
+        self, number: int, model: Any, site: Chart | Ground | None, photos: Sequence[Photo]
+    ) -> tuple[Any, Placement | Control | None]:
+        by_name = {photo.name: photo for photo in photos}
+        where: Placement | Control | Refused
+        if isinstance(site, Ground):
+            where = place_by_points(model, site, self.settings.checkpoints)
+        elif isinstance(site, Chart):
+            where = place(centres_of(model), photos, site, self.settings.seed)
         else:
-            where = place(centres_of(model), photos, chart, self.settings.seed)
+            where = Refused("no photograph has a position in EXIF" if self.settings.gps else "--no-gps")
         if isinstance(where, Refused):
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
             return _levelled(model, by_name), None
-        given = where.similarity
-        model.transform(engine.Sim3d(given.scale, engine.Rotation3d(given.turn), given.move))
+        model.transform(_sim3d(where.similarity))
+        _name_wrong(where)
+        if isinstance(where, Control):
+            return model, where
         adjusted = adjust(model, where, by_name, self.settings)
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
-        _name_wrong(where)
         return adjusted or model, where
 
     def _report(
         self,
         stages: Stages,
         photos: Sequence[Photo],
-        placed: Sequence[tuple[Any, Placement | None]],
+        placed: Sequence[tuple[Any, Placement | Control | None]],
         why: dict[str, str],
     ) -> dict[str, Any]:
         report = {
@@ -186,8 +200,13 @@ class Preparation:
         return report
 
 
-def _name_wrong(where: Placement) -> None:
-    """Say which positions are left out."""
+def _name_wrong(where: Placement | Control) -> None:
+    """Say which positions or control points are left out."""
+    if isinstance(where, Control):
+        for names, why in ((where.wrong, "contradict the others"), (where.unseen, "are in too few placed photographs")):
+            if names:
+                emit(Warned(f"{len(names)} ground control points {why} and are left out: {few(names)}"))
+        return
     wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
     far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
     if len(wrong) == 1:
@@ -202,7 +221,12 @@ def read_drawn(scene: Path) -> Any:
     return load_engine().Reconstruction(scene / "sparse" / "0")
 
 
-def _placed(where: Placement) -> Placed:
+def _sim3d(given: Similarity) -> Any:
+    engine = load_engine()
+    return engine.Sim3d(given.scale, engine.Rotation3d(given.turn), given.move)
+
+
+def _placed(where: Placement | Control) -> Placed:
     return Placed(where.chart.crs, where.chart.offset, where.chart.metres)
 
 

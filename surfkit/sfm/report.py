@@ -11,6 +11,7 @@ import numpy as np
 from surfkit.core.files import replacing
 from surfkit.sfm.features import FEWEST
 from surfkit.sfm.georeference import Placement, centres_of
+from surfkit.sfm.ground_control import Control
 from surfkit.sfm.photographs import DARK, Photo, is_blurred
 
 MOST_POINTS = 20_000
@@ -49,7 +50,7 @@ def reasons(
     return found
 
 
-def model_facts(model: Any, placement: Placement | None, metres: float = 1.0) -> dict[str, Any]:
+def model_facts(model: Any, placement: Placement | Control | None) -> dict[str, Any]:
     """Figures of a model, and its residuals on the map."""
     facts: dict[str, Any] = {
         "photographs": model.num_reg_images(),
@@ -66,7 +67,9 @@ def model_facts(model: Any, placement: Placement | None, metres: float = 1.0) ->
             for _, camera in sorted(model.cameras.items())
         ],
     }
-    if placement is not None:
+    if isinstance(placement, Control):
+        facts["ground_control"] = placement.facts()
+    elif placement is not None:
         facts["georeference"] = georeference_facts(model, placement)
     return facts
 
@@ -92,7 +95,7 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
     }
 
 
-def draw(path: Path, model: Any, placement: Placement | None) -> None:
+def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
     """A picture of cameras and points from above; of positions in EXIF too, with a line to the camera of each."""
     from matplotlib.figure import Figure
 
@@ -106,7 +109,7 @@ def draw(path: Path, model: Any, placement: Placement | None) -> None:
     figure = Figure(figsize=(9, 9.5))
     axes = figure.add_subplot()
     axes.scatter(*xyz[:, :2].T, c=rgb, s=1.5, linewidths=0, rasterized=True)
-    if placement is not None:
+    if isinstance(placement, Placement):
         onto = placement.onto
         for name, to, good in zip(placement.names, onto, placement.fit.inside, strict=True):
             colour = "tab:orange" if good else "red"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from surfkit.core.check import BadInput, require_within
@@ -40,13 +41,19 @@ class Settings:
     crs: str = "auto"
     """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is the zone of UTM."""
 
+    gcp: Path | None = None
+    """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""
+
+    checkpoints: int = 0
+    """How many of them are held back, to report how far they are off."""
+
     seed: int = 0
     """Of all that is drawn at random."""
 
     def __post_init__(self) -> None:
-        require_within(
-            {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000), "seed": (0, 2**31 - 1)},
-            self,
-        )
+        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000)}
+        require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
+        if self.checkpoints and self.gcp is None:
+            raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

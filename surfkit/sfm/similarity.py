@@ -19,6 +19,8 @@ SIGMAS = 4.0
 """A position is wrong beyond so many standard deviations of the residuals: of Gaussian ones, 1 of 900 is."""
 MEDIAN_OF_CHI3 = 1.5382
 """Median length of residuals whose three coordinates have a standard deviation of 1."""
+PARAMETERS = 7 / 3
+"""Of a similarity, in coordinates of a position."""
 FEWEST = 4
 """Positions that must agree; any three fit a similarity nearly."""
 
@@ -59,7 +61,9 @@ def umeyama(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray) -> Similarit
     return Similarity(turn, scale, there - scale * turn @ centre)
 
 
-def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = None, seed: int = 0) -> Fit | None:
+def fit_robustly(
+    xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = None, seed: int = 0, least: float = 0.0
+) -> Fit | None:
     """The similarity on which most positions agree; None where fewer than `FEWEST` do.
 
     Args:
@@ -67,6 +71,7 @@ def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = N
         onto: (P, 3) float64.
         sigma: (P,) standard deviations of `onto`, in its unit, where they are known; equal ones otherwise.
         seed: Of the draws.
+        least: A position with a shorter residual is never wrong, in the unit of `onto`.
     """
     count = len(xyz)
     if count < FEWEST:
@@ -75,10 +80,12 @@ def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = N
     weights = 1 / spread**2
     best = _consensus(xyz, onto, weights, np.random.default_rng(seed))
     inside = np.ones(count, bool)
+    small = 1 + 5 / (count - PARAMETERS)  # of few positions a fit comes too near to some (Rousseeuw and Leroy, 1987)
     for _ in range(ROUNDS):
-        length = np.linalg.norm(onto - best.points(xyz), axis=1) / spread
-        unit = max(float(np.median(length)) / MEDIAN_OF_CHI3, 1e-9)
-        now = length <= SIGMAS * unit
+        away = np.linalg.norm(onto - best.points(xyz), axis=1)
+        length = away / spread
+        unit = max(small * float(np.median(length)) / MEDIAN_OF_CHI3, 1e-9)
+        now = (length <= SIGMAS * unit) | (away <= least)
         if now.sum() < FEWEST:
             return None
         best = umeyama(xyz, onto, weights * now)
@@ -86,7 +93,7 @@ def fit_robustly(xyz: np.ndarray, onto: np.ndarray, sigma: np.ndarray | None = N
             break
         inside = now
     residuals = onto - best.points(xyz)
-    found = np.sqrt((residuals[inside] ** 2).mean(0) * inside.sum() / max(inside.sum() - 7 / 3, 1))
+    found = np.sqrt((residuals[inside] ** 2).mean(0) * inside.sum() / max(inside.sum() - PARAMETERS, 1))
     return Fit(best, inside, residuals, found)
 
 

@@ -232,3 +232,31 @@ def test_training_on_photographs_says_what_to_do(folder, tmp_path, capsys):
     shutil.copytree(folder, tmp_path / "set/images")
     assert main([*words, str(tmp_path / "set")]) == 2
     assert f"surfkit prepare photos {tmp_path / 'set/images'}" in capsys.readouterr().err
+
+
+def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared, tmp_path, monkeypatch, capsys):
+    shutil.copytree(prepared, tmp_path / "s")
+    corners = [(-7, -2, 3), (-1.5, -2, 3), (-7, 3, 3), (-1.5, 3, 3), (2, -7, 0), (6, 5, 0), (-9, 6, 0), (0, 0, 0)]
+    lines = ["WGS84 UTM 33N"]
+    for at, corner in enumerate(corners):
+        x, y, z = np.array(corner) + ORIGIN
+        for name, pose in POSES.items():
+            ray = pose[:3, :3] @ corner + pose[:3, 3]
+            across, down = 260 * ray[:2] / ray[2] + (120, 90)
+            lines.append(f"{x} {y} {z} {across} {down} {name.replace(' ', '_')} P{at}")
+    shutil.copytree(folder, tmp_path / "p")
+    for path in (tmp_path / "p").glob("view *.jpg"):  # names in a list have no spaces
+        path.rename(path.with_name(path.name.replace(" ", "_")))
+    (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
+    words = ["--gcp", str(tmp_path / "gcp_list.txt"), "--checkpoints", "3", *QUICK]
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 0
+    assert "_keep" not in seen, "features are those of the same files by other names"
+    assert "checkpoints (RMS)" in capsys.readouterr().out
+    ground = json.loads((tmp_path / "s/report.json").read_text())["models"][0]["ground_control"]
+    assert len(ground["control"]) == 5 and len(ground["checkpoints"]) == 3
+    assert max(ground["checkpoints_rms_m"].values()) < 0.05
+    scene = read(Data(tmp_path / "s"))
+    assert scene.frame.crs == "EPSG:32633"
+    for name, centre in cameras(scene).items():
+        assert np.linalg.norm(centre - CENTRES[name.replace("_", " ")] - ORIGIN) < 0.2

@@ -64,6 +64,13 @@ def test_too_few_positions_give_no_similarity():
     assert fit_robustly(xyz, onto).inside.all()
 
 
+def test_small_residuals_are_not_held_against_a_position():
+    xyz, onto, _ = known(12)
+    onto[3] += 0.01  # of others that fit to the last bit
+    assert np.flatnonzero(~fit_robustly(xyz, onto).inside).tolist() == [3]
+    assert fit_robustly(xyz, onto, least=0.05).inside.all()
+
+
 def test_the_same_draws_give_the_same_bits():
     xyz, onto, _ = known(30, noise=2.0)
     one, two = (fit_robustly(xyz, onto, seed=3) for _ in range(2))
