@@ -3,19 +3,44 @@ that is exact, against the bending of long strips."""
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.files import replacing_folder
 from surfkit.sfm.engine import load_engine, run
-from surfkit.sfm.georeference import Placement
+from surfkit.sfm.georeference import Placement, centres_of
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
 
+RECIPE = "1"
+"""Changes when the same model would be adjusted otherwise."""
 LEAST_SIGMA_M = 0.01
 """No position is trusted more."""
 WORSE = 1.1
 """An adjustment that makes the mean reprojection error larger than this many times is not kept."""
+
+
+def adjust_once(
+    model: Any, placement: Placement, photos: dict[str, Photo], settings: Settings, folder: Path
+) -> Any | None:
+    """What `adjust` gives, from the folder where an earlier call has kept it for the same model and positions."""
+    where = [list(camera.params) for camera in model.cameras.values()], model.num_points3D(), centres_of(model)
+    accuracies = [photos[name].exif.accuracy_m for name in placement.names]
+    facts = repr((where, placement.names, placement.onto.tolist(), placement.fit.inside.tolist(), accuracies))
+    key = hashlib.sha256(f"{RECIPE} {settings.seed} {placement.fit.sigma.tolist()} {facts}".encode()).hexdigest()[:24]
+    record = folder / "adjusted.json"
+    if record.is_file() and read_json(record, dict[str, Any]).get("key") == key:
+        return load_engine().Reconstruction(folder) if (folder / "images.bin").is_file() else None
+    found = adjust(model, placement, photos, settings)
+    with replacing_folder(folder) as made:
+        if found is not None:
+            found.write_binary(made)
+        write_json(made / record.name, {"key": key})
+    return found
 
 
 def adjust(model: Any, placement: Placement, photos: dict[str, Photo], settings: Settings) -> Any | None:

@@ -14,7 +14,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
 from surfkit.readers.placed import Placed
-from surfkit.sfm.adjust import adjust
+from surfkit.sfm.adjust import adjust_once
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
@@ -175,7 +175,7 @@ class Preparation:
         _name_wrong(where)
         if isinstance(where, Control):
             return model, where
-        adjusted = adjust(model, where, by_name, self.settings)
+        adjusted = adjust_once(model, where, by_name, self.settings, self.work / "adjusted" / str(number))
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
         return adjusted or model, where

@@ -30,7 +30,7 @@ def arc(count, start=0.0, step=0.16):
     """Poses on a rising arc about the scene."""
     angles = start + step * np.arange(count)
     return [
-        looking((15 * np.cos(a), 15 * np.sin(a), 11 + 1.5 * (at % 3)), (0.3 * (at % 2), 0, 0.5))
+        looking((15 * np.cos(a), 15 * np.sin(a), 10 + 2.5 * (at % 3)), (0.3 * (at % 2), 0, 0.5))
         for at, a in enumerate(angles)
     ]
 
