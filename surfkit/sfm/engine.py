@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
@@ -36,22 +37,27 @@ def run(what: str, work: Callable[[Any], T]) -> T:
     Raises:
         BadInput: pycolmap failed.
     """
-    token, result, failed = load_engine().CancellationToken(), [], []
+    token, ended = load_engine().CancellationToken(), threading.Event()
+    result, failed = [], []
 
     def body() -> None:
         try:
             result.append(work(token))
         except BaseException as error:  # handed to the main thread
             failed.append(error)
+        finally:
+            ended.set()
 
     thread = threading.Thread(target=body, name=what)
-    thread.start()
     try:
-        while thread.is_alive():
-            thread.join(POLL_S)
+        thread.start()
+        while not ended.wait(POLL_S):  # Thread.join, interrupted, takes a running thread for one that has ended
+            pass
     except BaseException:
         token.cancel()
-        thread.join()
+        while thread.ident is not None and not ended.is_set():  # a process that ends before its thread is aborted
+            with suppress(KeyboardInterrupt):
+                ended.wait()
         raise
     if failed:
         if isinstance(failed[0], (RuntimeError, ValueError, IndexError)) and not isinstance(failed[0], BadInput):
