@@ -126,7 +126,8 @@ def reader_of(data: Data) -> Reader:
         raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
     if not first and (photos := _bare_photographs(root)):
         raise BadInput(
-            f"{root}: photographs without cameras; `surfkit prepare photos {photos}` finds them and writes a data set"
+            f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
+            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set"
         )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
 

@@ -26,6 +26,8 @@ RECIPE = "1"
 """Changes when the same photograph would come out otherwise."""
 QUALITY = 95
 """Of JPEG files."""
+MOST_THREADS = 8
+"""Each holds a photograph at its full size three times."""
 RECORD = "undistorted.json"
 
 
@@ -65,7 +67,7 @@ def deliver(
         images = sorted((model.image(number) for number in model.reg_image_ids()), key=lambda image: image.name)
         cameras = {image.camera_id: _pinhole(model.cameras[image.camera_id]) for image in images}
         sights = {}
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
 
             def undistort(image: Any, model: Any = model) -> Sight:
                 key = _key(photos[image.name], model.cameras[image.camera_id])

@@ -59,11 +59,10 @@ def run(what: str, work: Callable[[Any], T]) -> T:
             with suppress(KeyboardInterrupt):
                 ended.wait()
         raise
-    if failed:
-        if isinstance(failed[0], (RuntimeError, ValueError, IndexError)) and not isinstance(failed[0], BadInput):
-            said = " ".join(str(failed[0]).split())[:300]
-            raise BadInput(f"{what} failed in pycolmap: {said}; delete the scene's prepare/ and try again") from failed[
-                0
-            ]
-        raise failed[0]
-    return result[0]
+    if not failed:
+        return result[0]
+    error = failed[0]
+    if isinstance(error, (RuntimeError, ValueError, IndexError)) and not isinstance(error, BadInput):
+        said = " ".join(str(error).split())[:300]
+        raise BadInput(f"{what} failed in pycolmap: {said}; delete the scene's prepare/ and try again") from error
+    raise error

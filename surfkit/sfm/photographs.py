@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,8 @@ OTHER = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".r
 """Photographs that Pillow does not decode."""
 DRAFT_PX = 512
 """At this size light and sharpness are measured."""
+MOST_THREADS = 8
+"""Photographs that are read at once."""
 DARK, FLAT = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
 
@@ -59,20 +62,19 @@ class Photo:
         return self.problem is None
 
 
-def look(folder: Path, known: Sequence[Photo] = (), threads: int = 2) -> list[Photo]:
+def look(folder: Path, known: Sequence[Photo] = ()) -> list[Photo]:
     """All photographs below a folder, in the order of their names.
 
     Args:
         folder: Photographs, in folders or not.
         known: What an earlier call found; photographs that have not changed are taken from it.
-        threads: How many are looked at at once.
 
     Raises:
         BadInput: There is no such folder, or no photograph that can be used.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: {'a file' if folder.exists() else 'no such folder'}; name a folder of photographs")
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder)))
     paths = [path for path in files if path.suffix.lower() in PICTURES]
     if other := [path.name for path in files if path.suffix.lower() in OTHER]:
         emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
@@ -80,7 +82,7 @@ def look(folder: Path, known: Sequence[Photo] = (), threads: int = 2) -> list[Ph
         raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
     before = {photo.name: photo for photo in known}
     found = []
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
         for photo in pool.map(lambda path: _look_unless_known(folder, path, before), paths):
             found.append(photo)
             emit(Progress("looking at photographs", len(found), len(paths)))
@@ -108,6 +110,11 @@ def lens_groups(photos: Sequence[Photo]) -> list[int]:
     keys = [(photo.exif.camera, photo.size, photo.exif.focal_px and round(photo.exif.focal_px)) for photo in photos]
     numbers = {key: number for number, key in enumerate(Counter(keys))}
     return [numbers[key] for key in keys]
+
+
+def _is_hidden(path: Path) -> bool:
+    """Whether a file, or a folder that it is in, is one that programs keep for themselves, as thumbnails."""
+    return any(part.startswith(".") for part in path.parts)
 
 
 def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Photo:

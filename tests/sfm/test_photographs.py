@@ -23,6 +23,7 @@ def folder(tmp_path):
     Image.new("RGB", (240, 180), (2, 2, 2)).save(tmp_path / "e.jpg")
     Image.new("RGB", (240, 180), (90, 90, 90)).save(tmp_path / "f.png")
     (tmp_path / "g.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:3000])
+    save(tmp_path / ".thumbs/a.jpg", first)
     (tmp_path / "h.dng").write_bytes(b"raw")
     (tmp_path / "notes.txt").write_text("x")
     return tmp_path
