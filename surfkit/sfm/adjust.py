@@ -13,6 +13,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing_folder
 from surfkit.sfm.engine import load_engine, run
 from surfkit.sfm.georeference import Placement, centres_of
+from surfkit.sfm.mapping import read_model
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
 
@@ -34,7 +35,7 @@ def adjust_once(
     key = hashlib.sha256(f"{RECIPE} {settings.seed} {placement.fit.sigma.tolist()} {facts}".encode()).hexdigest()[:24]
     record = folder / "adjusted.json"
     if record.is_file() and read_json(record, dict[str, Any]).get("key") == key:
-        return load_engine().Reconstruction(folder) if (folder / "images.bin").is_file() else None
+        return read_model(folder) if (folder / "images.bin").is_file() else None
     found = adjust(model, placement, photos, settings)
     with replacing_folder(folder) as made:
         if found is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -60,11 +61,14 @@ def deliver(
         before = read_json(work / RECORD, dict[str, str])
     except BadInput:
         before = {}
+    lenses = [(image.name, model.cameras[image.camera_id]) for model, _ in models for image in _images(model)]
+    if any(before.get(file_name(name)) != _key(photos[name], camera) for name, camera in lenses):
+        shutil.rmtree(scene / "sparse", ignore_errors=True)  # a model of other photographs would not be noticed
     total, done = sum(model.num_reg_images() for model, _ in models), 0
     kept: dict[str, str] = {}
     pinholes = []
     for model, _ in models:
-        images = sorted((model.image(number) for number in model.reg_image_ids()), key=lambda image: image.name)
+        images = _images(model)
         cameras = {image.camera_id: _pinhole(model.cameras[image.camera_id]) for image in images}
         sights = {}
         with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
@@ -97,6 +101,11 @@ def deliver(
             pinhole.write_binary(folder / str(number))
             if placed is not None:
                 write_json(folder / str(number) / FILE, placed)
+
+
+def _images(model: Any) -> list[Any]:
+    """The images with a pose, by name."""
+    return sorted((model.image(number) for number in model.reg_image_ids()), key=lambda image: image.name)
 
 
 def file_name(name: str) -> str:

@@ -37,6 +37,8 @@ def map_photographs(database: Path, folder: Path, count: int, settings: Settings
         kept = [model for model in order if model.num_reg_images() >= SMALLEST and model.num_points3D()]
         for number, model in enumerate(kept):
             (made / str(number)).mkdir()
+            for image in model.images.values():
+                image.name = unquote(image.name)
             model.write_binary(made / str(number))
         for path in sorted(scratch.rglob("*"), reverse=True):
             path.rmdir() if path.is_dir() else path.unlink()
@@ -45,15 +47,12 @@ def map_photographs(database: Path, folder: Path, count: int, settings: Settings
 
 
 def read_model(folder: Path) -> Any:
-    """The pycolmap reconstruction in a folder, its images under the names of the photographs."""
+    """The pycolmap reconstruction in a folder of `prepare/`."""
     refuse_cut_off(folder)
     try:
-        model = load_engine().Reconstruction(folder)
+        return load_engine().Reconstruction(folder)
     except (RuntimeError, ValueError) as error:
         raise BadInput(f"{folder}: damaged: {' '.join(str(error).split())}; delete it and try again") from error
-    for image in model.images.values():
-        image.name = unquote(image.name)
-    return model
 
 
 def _incremental(engine: Any, database: Path, folder: Path, count: int, settings: Settings) -> dict[int, Any]:

@@ -149,6 +149,8 @@ class Preparation:
         if self.settings.gcp is not None:
             return read_ground(self.settings.gcp, self.settings.crs, [photo.name for photo in photos])
         known = np.array([photo.exif.position for photo in photos if photo.exif.position is not None], np.float64)
+        if not len(known) and self.settings.crs != "auto":
+            raise BadInput(f"--crs {self.settings.crs} needs positions, and no photograph has one; leave it out")
         return chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
 
     def _place(

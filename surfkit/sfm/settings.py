@@ -55,5 +55,7 @@ class Settings:
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
         if self.checkpoints and self.gcp is None:
             raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
+        if self.crs != "auto" and not self.gps and self.gcp is None:
+            raise BadInput(f"--crs {self.crs} needs positions, which --no-gps leaves out; leave out one of the two")
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

@@ -23,7 +23,7 @@ class Stage:
 
     Attributes:
         key: Of all that its result depends on.
-        seconds: That it took, of the calls that were stopped too.
+        seconds: That it took, all calls with this key together.
         complete: Whether it came to its end.
     """
 

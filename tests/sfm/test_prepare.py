@@ -214,6 +214,16 @@ def test_photographs_that_do_not_overlap(folder, tmp_path, capsys):
     )
 
 
+def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path, capsys):
+    for at in range(3):
+        save(tmp_path / "p" / f"{at}.jpg", picture(arc(3)[at]))
+    words = ["prepare", "photos", str(tmp_path / "p"), "--crs", "EPSG:2180"]
+    assert main(words) == 2 and "no photograph has one" in capsys.readouterr().err
+    assert main([*words, "--no-gps"]) == 2 and "leave out one of the two" in capsys.readouterr().err
+    assert main([*words[:3], "--checkpoints", "2"]) == 2 and "--gcp FILE" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.npz"))
+
+
 def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):
     assert main(["prepare", "photos", str(folder), "--out", str(folder / "scene")]) == 2
     assert "lies in the folder of photographs" in capsys.readouterr().err
