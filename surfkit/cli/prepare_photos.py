@@ -31,7 +31,7 @@ class Photos:
     with other settings or photographs does again only what depends on them.
     """
 
-    photos: Annotated[Path, tyro.conf.Positional]
+    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folder of photographs, in folders inside it or not; nothing is written there."""
 
     out: Path | None = None
