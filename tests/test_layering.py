@@ -14,7 +14,7 @@ FLOORS = (
     "native scene cuda",
     "export",
     "readers",
-    "raster",
+    "raster sfm",
     "primitives losses depth",
     "densify appearance start",
     "train partition compress mesh evaluate execute",

@@ -34,7 +34,7 @@ COMMANDS = {
     "report": "Write a report of runs or of an ablation table as one HTML file.",
     "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "export": "Write the splats of a run or of a file in another format, for other programs.",
-    "prepare": "Estimate what a data set lacks before training: `prepare depth`.",
+    "prepare": "Find the cameras of photographs, or estimate depth: `prepare photos`, `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "tables": "List the ablation tables that `surfkit ablate` accepts, or the rows of one.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",
@@ -51,7 +51,7 @@ MEMORY_ADVICE = {
     "evaluate": "with --gt fewer --samples, a larger --voxel or a smaller --crop need less, else smaller photographs",
     "render": "a smaller --size needs less",
     "doctor": "--probe 0, --quick or smaller photographs (--longest, --scale) need less",
-    "prepare": "a lower --estimator.longest or smaller photographs (--longest, --scale) need less",
+    "prepare": "a lower --longest or --estimator.longest needs less",
 }
 """What a user can lower when a command runs out of memory."""
 

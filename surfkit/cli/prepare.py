@@ -1,4 +1,4 @@
-"""`surfkit prepare`: what a data set may need before training."""
+"""`surfkit prepare`: what photographs or a data set may need before training."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.cli.prepare_photos import Photos
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
@@ -138,4 +139,4 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
         write_picture(path, torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], dim=1))
 
 
-COMMAND = {"depth": Depth}
+COMMAND = {"depth": Depth, "photos": Photos}

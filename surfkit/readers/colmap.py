@@ -16,6 +16,7 @@ from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot, Tracks, load_pycolmap
 from surfkit.readers.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.readers.data import Data, nearest
+from surfkit.readers.placed import on_the_map, read_placed
 from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
@@ -49,13 +50,16 @@ class COLMAP(Reader):
         images, xyz, rgb, groups = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
         shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
-        return Capture(shots, xyz, rgb, groups=groups, numbered=True)
+        capture = Capture(shots, xyz, rgb, groups=groups, numbered=True)
+        placed = read_placed(folder)
+        return capture if placed is None else on_the_map(capture, placed)
 
     def model_folder(self, data: Data) -> Path:
         return _largest(data.path) if data.model is None else _named(data.path / data.model)
 
     def tracks(self, data: Data) -> Tracks:
-        model = _reconstruction(self.model_folder(data))
+        folder = self.model_folder(data)
+        model, placed = _reconstruction(folder), read_placed(folder)
         points = sorted(model.points3D.items())
         row = {number: at for at, (number, _) in enumerate(points)}
         seen = {}
@@ -64,6 +68,7 @@ class COLMAP(Reader):
             rows = np.array([row[spot.point3D_id] for spot in spots], np.int64)
             seen[image.name] = (rows, np.array([spot.xy for spot in spots], np.float64).reshape(-1, 2))
         xyz = np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3)
+        xyz += 0 if placed is None else placed.offset
         error = np.array([point.error for _, point in points], np.float64)
         cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
         return Tracks(xyz, np.where(np.isfinite(xyz).all(1), error, np.inf), seen, cameras)

@@ -76,7 +76,7 @@ def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: f
     local = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
     lines = _lines(root / FOLDER / "coords.txt")
     texts = [*lines[:1], *_lines(root / FOLDER / "proj.txt")[:1]]
-    zone = next((found for text in texts for found in [_zone(text)] if found), None)
+    zone = next((found for text in texts for found in [zone_of(text)] if found), None)
     if zone is None or abs(latitude) > POLAR:
         if texts:
             emit(
@@ -138,7 +138,7 @@ def _lines(path: Path) -> list[str]:
         raise BadInput(f"{path}: cannot be read as text; run OpenDroneMap again, or delete it") from error
 
 
-def _zone(text: str) -> tuple[int, bool] | None:
+def zone_of(text: str) -> tuple[int, bool] | None:
     """Number of a zone of UTM, and whether it is south of the equator."""
     for pattern in ZONES:
         if (found := re.match(pattern, text)) and 1 <= int(found[1]) <= 60:

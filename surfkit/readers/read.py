@@ -23,6 +23,7 @@ from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
 from surfkit.scene.groups import groups_warning
+from surfkit.scene.names import PICTURES
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
 from surfkit.scene.scene import Cloud, Frame, Scene, View
@@ -123,7 +124,20 @@ def reader_of(data: Data) -> Reader:
     first = {name: reader for name, reader in fitting.items() if reader.priority == highest}
     if len(first) > 1:
         raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
+    if not first and (photos := _bare_photographs(root)):
+        raise BadInput(
+            f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
+            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set"
+        )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
+
+
+def _bare_photographs(root: Path) -> Path | None:
+    """The folder of photographs, of a data set that has nothing else: itself, or its images/."""
+    for folder in (root / "images", root):
+        if folder.is_dir() and any(path.suffix.lower() in PICTURES for path in folder.iterdir()):
+            return folder
+    return None
 
 
 def _fitting(root: Path) -> dict[str, Reader]:

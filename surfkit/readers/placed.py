@@ -1,0 +1,57 @@
+"""A COLMAP model that lies on a map: a file beside it says on which, and what its coordinates leave out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.readers.capture import Capture
+
+FILE = "georeference.json"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Coordinates on the map are those of the model plus the offset.
+
+    Attributes:
+        crs: Coordinate reference system, such as "EPSG:32633".
+        offset: East, north and up, units of the map.
+        metres_per_unit: Of the map.
+    """
+
+    crs: str
+    offset: tuple[float, float, float]
+    metres_per_unit: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not self.crs or not np.isfinite(self.offset).all() or not 0 < self.metres_per_unit < np.inf:
+            raise BadInput("crs must name a system, offset and metres_per_unit must be finite numbers")
+
+
+def read_placed(folder: Path) -> Placed | None:
+    """Where the model in a folder lies; None if no file says so."""
+    path = folder / FILE
+    return read_json(path, Placed) if path.is_file() else None
+
+
+def on_the_map(capture: Capture, placed: Placed) -> Capture:
+    """A capture in the coordinates of the map."""
+    offset = np.array(placed.offset)
+    shots = []
+    for shot in capture.shots:
+        pose = shot.pose.copy()
+        pose[:3, 3] -= pose[:3, :3] @ offset
+        shots.append(replace(shot, pose=pose))
+    return replace(
+        capture,
+        shots=shots,
+        xyz=capture.xyz + offset,
+        metres=placed.metres_per_unit,
+        crs=placed.crs,
+        shift=placed.offset,
+    )

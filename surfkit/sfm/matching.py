@@ -1,0 +1,204 @@
+"""COLMAP's database: features, matches of pairs of photographs, and which of them one motion of the camera explains.
+
+A pair is compared once. When photographs or features change, a new database takes over the pairs that did not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, unquote
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import Progress, emit
+from surfkit.core.files import replacing
+from surfkit.sfm.engine import load_engine, run
+from surfkit.sfm.features import Features, feature_file, read_features
+from surfkit.sfm.pairs import Pair
+from surfkit.sfm.photographs import Photo, lens_groups
+from surfkit.sfm.settings import Settings
+
+BATCH = 40
+"""Pairs that are compared between two reports of progress."""
+DEFAULT_FOCAL = 1.2
+"""Focal length over the longer side, where EXIF says none."""
+EXTRA = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4}
+"""Coefficients of distortion; the last three models have two focal lengths."""
+
+
+def alias(name: str) -> str:
+    """The name of a photograph in the database: without spaces, which end a name in COLMAP's lists of pairs."""
+    return quote(name)
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a database was made from.
+
+    Attributes:
+        features: Name of the file of features of each photograph, by its name.
+        lenses: Model, camera, size and focal length of each photograph, by its name.
+        seed: Of the geometric verification.
+    """
+
+    features: dict[str, str]
+    lenses: dict[str, str]
+    seed: int
+
+
+def contents(photos: Sequence[Photo], folder: Path, settings: Settings) -> Contents:
+    """What the database of photographs is to be made from."""
+    features = {photo.name: feature_file(folder, photo, settings).name for photo in photos}
+    lenses = {photo.name: f"{settings.lens} {photo.exif.camera} {photo.size} {photo.exif.focal_px}" for photo in photos}
+    return Contents(features, lenses, settings.seed)
+
+
+def match(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, database: Path, settings: Settings) -> None:
+    """Write the database, with all pairs compared; pairs that an earlier call has compared are not again.
+
+    Args:
+        photos: With enough features.
+        pairs: Positions of those to compare.
+        features: Folder of features.
+        database: The file.
+        settings: How.
+    """
+    engine = load_engine()
+    try:
+        refuse_other(database, contents(photos, features, settings))
+    except BadInput:
+        _begin(photos, pairs, features, database, settings)
+    file = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), BATCH):
+        batch = pairs[start : start + BATCH]
+        with replacing(file) as opened:
+            lines = [f"{alias(photos[one].name)} {alias(photos[two].name)}\n" for one, two in batch]
+            opened.write("".join(lines).encode())
+        run("comparing photographs", lambda token: _compare(engine, database, file, settings, token))
+        emit(Progress("comparing photographs", start + len(batch), len(pairs)))
+    file.unlink(missing_ok=True)
+
+
+def refuse_other(database: Path, wanted: Contents) -> None:
+    """BadInput unless there is a database that was made from this."""
+    if not database.is_file() or read_json(_record(database), Contents) != wanted:
+        raise BadInput(f"{database}: of other photographs, features or settings")
+
+
+def matched(database: Path) -> dict[str, int]:
+    """How many other photographs share verified matches with each, by name."""
+    engine = load_engine()
+    opened = engine.Database.open(database)
+    try:
+        names = {image.image_id: unquote(image.name) for image in opened.read_all_images()}
+        counts = dict.fromkeys(names.values(), 0)
+        least = engine.TwoViewGeometryOptions().min_num_inliers
+        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            if len(geometry.inlier_matches) >= least:
+                for image in engine.pair_id_to_image_pair(number):
+                    counts[names[image]] += 1
+    finally:
+        opened.close()
+    return counts
+
+
+def _compare(engine: Any, database: Path, pairs: Path, settings: Settings, token: Any) -> None:
+    matching = engine.FeatureMatchingOptions()
+    matching.use_gpu = engine.has_cuda
+    pairing = engine.ImportedPairingOptions()
+    pairing.match_list_path = pairs
+    verification = engine.TwoViewGeometryOptions()
+    verification.ransac.random_seed = settings.seed
+    engine.match_image_pairs(database, matching, pairing, verification, engine.Device.auto, token)
+
+
+def _record(database: Path) -> Path:
+    return database.with_suffix(".json")
+
+
+def _begin(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, database: Path, settings: Settings) -> None:
+    """Write a database of the photographs and their features, with what the one before knows of unchanged pairs."""
+    engine, wanted = load_engine(), contents(photos, features, settings)
+    named = [(photos[one].name, photos[two].name) for one, two in pairs]
+    new = database.with_name("new.db")
+    for rest in database.parent.glob("new.db*"):
+        rest.unlink()
+    opened = engine.Database.open(new)
+    try:
+        with engine.DatabaseTransaction(opened):
+            numbers = _write_photos(engine, opened, photos, features, settings)
+            _take_over(opened, numbers, named, database, wanted)
+    finally:
+        opened.close()
+    _record(database).unlink(missing_ok=True)
+    for rest in database.parent.glob(f"{database.name}-*"):  # the journal of a database that was interrupted
+        rest.unlink()
+    new.replace(database)
+    write_json(_record(database), wanted)
+
+
+def _write_photos(
+    engine: Any, opened: Any, photos: Sequence[Photo], features: Path, settings: Settings
+) -> dict[str, int]:
+    """The number of each photograph in the database, by its name."""
+    lenses: dict[int, tuple[int, int]] = {}
+    numbers = {}
+    camera_type = engine.SensorType.CAMERA
+    for photo, group in zip(photos, lens_groups(photos), strict=True):
+        if group not in lenses:
+            number = opened.write_camera(_camera(engine, photo, settings.lens))
+            rig = engine.Rig()
+            rig.add_ref_sensor(engine.sensor_t(camera_type, number))
+            lenses[group] = (number, opened.write_rig(rig))
+        camera, rig_number = lenses[group]
+        image = opened.write_image(engine.Image(name=alias(photo.name), camera_id=camera))
+        frame = engine.Frame(rig_id=rig_number)
+        frame.add_data_id(engine.data_t(engine.sensor_t(camera_type, camera), image))
+        opened.write_frame(frame)
+        found: Features = read_features(feature_file(features, photo, settings))
+        opened.write_keypoints(image, found.keypoints)
+        sift = engine.FeatureExtractorType.SIFT
+        opened.write_descriptors(image, engine.FeatureDescriptors(sift, found.descriptors))
+        numbers[photo.name] = image
+    return numbers
+
+
+def _camera(engine: Any, photo: Photo, model: str) -> Any:
+    width, height = photo.size
+    focal = photo.exif.focal_px or DEFAULT_FOCAL * max(width, height)
+    focals = [focal] if model.endswith("RADIAL") else [focal, focal]
+    params = [*focals, width / 2, height / 2, *[0.0] * EXTRA[model]]
+    camera = engine.Camera(model=model, width=width, height=height, params=params)
+    camera.has_prior_focal_length = photo.exif.focal_px is not None
+    return camera
+
+
+def _take_over(
+    new: Any, numbers: Mapping[str, int], pairs: Sequence[tuple[str, str]], database: Path, wanted: Contents
+) -> None:
+    """Write the matches of those pairs that have not changed since the database before into a new one."""
+    try:
+        before = read_json(_record(database), Contents)
+    except BadInput:
+        return
+    if not database.is_file() or before.seed != wanted.seed:
+        return
+    same = {
+        name
+        for name in numbers
+        if before.features.get(name) == wanted.features[name] and before.lenses.get(name) == wanted.lenses[name]
+    }
+    old = load_engine().Database.open(database)
+    try:
+        there = {unquote(image.name): image.image_id for image in old.read_all_images()}
+        for one, two in pairs:
+            if one in same and two in same and old.exists_matches(there[one], there[two]):
+                new.write_matches(numbers[one], numbers[two], old.read_matches(there[one], there[two]))
+                if old.exists_two_view_geometry(there[one], there[two]):
+                    found = old.read_two_view_geometry(there[one], there[two])
+                    new.write_two_view_geometry(numbers[one], numbers[two], found)
+    finally:
+        old.close()

@@ -1,0 +1,160 @@
+"""The photographs of a folder, each looked at once: its size, EXIF, light and sharpness, and whether it can be used."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput, few
+from surfkit.core.events import Progress, Warned, emit
+from surfkit.scene.names import PICTURES
+from surfkit.scene.photos import open_picture, photo_size, read_draft
+from surfkit.sfm.exif import Exif, read_exif
+
+OTHER = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
+"""Photographs that Pillow does not decode."""
+DRAFT_PX = 512
+"""At this size light and sharpness are measured."""
+MOST_THREADS = 8
+"""Photographs that are read at once."""
+DARK, FLAT = 8.0, 3.0
+"""Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph of the folder.
+
+    Attributes:
+        name: Path below the folder, with slashes.
+        stamp: Size in bytes and time of the file: when they change, it is looked at again.
+        digest: Of all its bytes.
+        size: Width and height as stored, the rotation in EXIF not applied.
+        exif: What it says of itself.
+        pixels: Digest of the pixels of its draft, equal for copies.
+        light: Mean grey level, 0 to 255.
+        contrast: Standard deviation of grey levels.
+        sharpness: Standard deviation of the Laplacian over the contrast, of the draft.
+        problem: Why it cannot be used; None if it can.
+    """
+
+    name: str
+    stamp: tuple[int, int]
+    digest: str = ""
+    size: tuple[int, int] = (0, 0)
+    exif: Exif = Exif()
+    pixels: str = ""
+    light: float = 0.0
+    contrast: float = 0.0
+    sharpness: float = 0.0
+    problem: str | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether it goes into the reconstruction."""
+        return self.problem is None
+
+
+def look(folder: Path, known: Sequence[Photo] = ()) -> list[Photo]:
+    """All photographs below a folder, in the order of their names.
+
+    Args:
+        folder: Photographs, in folders or not.
+        known: What an earlier call found; photographs that have not changed are taken from it.
+
+    Raises:
+        BadInput: There is no such folder, or no photograph that can be used.
+    """
+    if not folder.is_dir():
+        raise BadInput(f"{folder}: {'a file' if folder.exists() else 'no such folder'}; name a folder of photographs")
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder)))
+    paths = [path for path in files if path.suffix.lower() in PICTURES]
+    if other := [path.name for path in files if path.suffix.lower() in OTHER]:
+        emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
+    if not paths:
+        raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
+    before = {photo.name: photo for photo in known}
+    found = []
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
+        for photo in pool.map(lambda path: _look_unless_known(folder, path, before), paths):
+            found.append(photo)
+            emit(Progress("looking at photographs", len(found), len(paths)))
+    return mark_copies(found)
+
+
+def mark_copies(photos: Sequence[Photo]) -> list[Photo]:
+    """The photographs, of which copies of one before them are marked as such."""
+    first: dict[str, str] = {}
+    marked = []
+    for photo in photos:
+        same = first.setdefault(photo.pixels, photo.name) if photo.usable else photo.name
+        marked.append(photo if same == photo.name else replace(photo, problem=f"a copy of {same}"))
+    return marked
+
+
+def is_blurred(photo: Photo, photos: Sequence[Photo]) -> bool:
+    """Whether a photograph is far less sharp than most of the folder."""
+    others = [other.sharpness for other in photos if other.usable]
+    return bool(others) and photo.sharpness < 0.4 * float(np.median(others))
+
+
+def lens_groups(photos: Sequence[Photo]) -> list[int]:
+    """The number of the lens of each photograph, from 0: equal for equal camera, size and focal length."""
+    keys = [(photo.exif.camera, photo.size, photo.exif.focal_px and round(photo.exif.focal_px)) for photo in photos]
+    numbers = {key: number for number, key in enumerate(Counter(keys))}
+    return [numbers[key] for key in keys]
+
+
+def _is_hidden(path: Path) -> bool:
+    """Whether a file, or a folder that it is in, is one that programs keep for themselves, as thumbnails."""
+    return any(part.startswith(".") for part in path.parts)
+
+
+def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Photo:
+    name, stat = path.relative_to(folder).as_posix(), path.stat()
+    stamp = (stat.st_size, stat.st_mtime_ns)
+    before = known.get(name)
+    if before is not None and before.stamp == stamp:
+        copy = (before.problem or "").startswith("a copy of")
+        return replace(before, problem=None) if copy else before
+    try:
+        return _look(path, Photo(name, stamp))
+    except BadInput as error:
+        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "))
+
+
+def _look(path: Path, photo: Photo) -> Photo:
+    size = photo_size(path)
+    exif = open_picture(path, lambda image: read_exif(image, size))
+    draft = read_draft(path, DRAFT_PX)
+    grey = draft.astype(np.float32).mean(2)
+    light, contrast = float(grey.mean()), float(grey.std())
+    problem = None
+    if contrast < FLAT:
+        problem = "black" if light < DARK else "of one colour"
+    return replace(
+        photo,
+        digest=hashlib.sha256(path.read_bytes()).hexdigest()[:32],
+        size=size,
+        exif=exif,
+        pixels=hashlib.sha256(draft.tobytes()).hexdigest()[:32],
+        light=light,
+        contrast=contrast,
+        sharpness=_sharpness(grey) / max(contrast, FLAT),
+        problem=problem,
+    )
+
+
+def _sharpness(grey: np.ndarray) -> float:
+    """Standard deviation of the Laplacian of (h, w) grey levels."""
+    if min(grey.shape) < 3:
+        return 0.0
+    middle = grey[1:-1, 1:-1]
+    return float((grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * middle).std())

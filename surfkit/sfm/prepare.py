@@ -1,0 +1,245 @@
+"""From a folder of photographs to a data set with cameras, from top to bottom; each stage keeps its result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput, few
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import Warned, emit
+from surfkit.readers.georeference import Similarity
+from surfkit.readers.placed import Placed
+from surfkit.sfm.adjust import adjust_once
+from surfkit.sfm.deliver import deliver
+from surfkit.sfm.engine import load_engine
+from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
+from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
+from surfkit.sfm.ground_control import Control, Ground, place_by_points, read_ground
+from surfkit.sfm.level import turn_upright, up_direction
+from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
+from surfkit.sfm.matching import contents, match, matched, refuse_other
+from surfkit.sfm.pairs import Pair, choose_pairs
+from surfkit.sfm.photographs import Photo, look
+from surfkit.sfm.report import draw, model_facts, reasons
+from surfkit.sfm.settings import Settings
+from surfkit.sfm.stages import Stages, key_of
+
+WORK = "prepare"
+"""Folder of the scene for what the stages keep."""
+REPORT, PICTURE = "report.json", "cameras.png"
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """A folder of photographs on its way to a data set.
+
+    Attributes:
+        root: Folder of the photographs; nothing is written there.
+        scene: The data set.
+        settings: How cameras are found.
+    """
+
+    root: Path
+    scene: Path
+    settings: Settings
+
+    @property
+    def work(self) -> Path:
+        """Folder of what the stages keep."""
+        return self.scene / WORK
+
+    def run(self) -> dict[str, Any]:
+        """Go through all stages that are not complete; the report.
+
+        Raises:
+            BadInput: There are too few photographs that can be used, or no cameras can be found for them.
+        """
+        load_engine()
+        stages = Stages(self.work)
+        photos = stages.run("photographs", "", self._look)
+        usable = [photo for photo in photos if photo.usable]
+        self._refuse_few(photos, usable)
+        site = self._site(usable)
+        folder = self.work / "features"
+        counts = stages.run("features", "", lambda: find_features(usable, self.root, folder, self.settings))
+        rich = [photo for photo in usable if counts[photo.name] >= FEWEST]
+        made_of = contents(rich, folder, self.settings)
+        chosen = [self.settings.pairs, self.settings.neighbours, self.settings.seed]
+        key = key_of(made_of, chosen, [[photo.exif.position, photo.exif.taken] for photo in rich])
+        pairs = stages.run("pairs", key, lambda: self._pairs(rich), self._load_pairs)
+        database = self.work / "database.db"
+        stages.run(
+            "matches",
+            key_of(made_of, pairs),
+            lambda: match(rich, pairs, folder, database, self.settings),
+            lambda: refuse_other(database, made_of),
+        )
+        key = key_of(made_of, pairs, self.settings.mapper, self.settings.seed)
+        models = stages.run("cameras", key, lambda: self._map(database, len(rich)), self._load_models)
+        matches = matched(database)
+        if not models:
+            raise BadInput(self._no_model(photos, reasons(photos, counts, matches, [])))
+        placed = stages.run("georeference", "", lambda: self._place(models, photos, site))
+        by_name = {photo.name: photo for photo in photos}
+        done = [(model, None if where is None else _placed(where)) for model, where in placed]
+        stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
+        names = [set(centres_of(model)) for model, _ in placed]
+        return self._report(stages, photos, placed, reasons(photos, counts, matches, names))
+
+    def _look(self) -> list[Photo]:
+        path = self.work / "photographs.json"
+        try:
+            known = read_json(path, tuple[Photo, ...])
+        except BadInput:
+            known = ()
+        photos = look(self.root, known)
+        write_json(path, photos)
+        return photos
+
+    def _refuse_few(self, photos: Sequence[Photo], usable: Sequence[Photo]) -> None:
+        if len(usable) >= SMALLEST:
+            return
+        wrong = [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]
+        why = f"; not usable: {few(wrong)}" if wrong else ""
+        raise BadInput(
+            f"{self.root}: {len(usable)} of {len(photos)} photographs can be used{why}; cameras are found for "
+            f"{SMALLEST} or more that show the same place from several sides"
+        )
+
+    def _pairs(self, photos: Sequence[Photo]) -> list[Pair]:
+        folder = self.work / "features"
+
+        def descriptors(at: int) -> np.ndarray:
+            return read_features(feature_file(folder, photos[at], self.settings)).descriptors
+
+        pairs = choose_pairs(photos, self.settings, descriptors)
+        write_json(self.work / "pairs.json", pairs)
+        return pairs
+
+    def _load_pairs(self) -> list[Pair]:
+        return list(read_json(self.work / "pairs.json", tuple[Pair, ...]))
+
+    def _map(self, database: Path, count: int) -> list[Path]:
+        return map_photographs(database, self.work / "models", count, self.settings) if count >= SMALLEST else []
+
+    def _load_models(self) -> list[Path]:
+        folder = self.work / "models"
+        if not folder.is_dir():
+            raise BadInput(f"{folder}: no such folder")
+        return sorted((path for path in folder.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+
+    def _no_model(self, photos: Sequence[Photo], why: dict[str, str]) -> str:
+        groups: dict[str, list[str]] = {}
+        for name, reason in why.items():
+            groups.setdefault(reason, []).append(name)
+        largest = sorted(groups.items(), key=lambda item: -len(item[1]))[:3]
+        said = "; ".join(f"{few(names, 2)}: {reason}" for reason, names in largest)
+        return (
+            f"{self.root}: no cameras could be found for {len(photos)} photographs ({said}); they must overlap, three "
+            "views of each place, from positions that differ"
+        )
+
+    def _site(self, photos: Sequence[Photo]) -> Chart | Ground | None:
+        """The map that the models come to, with control points if there are some; None without either."""
+        if self.settings.gcp is not None:
+            return read_ground(self.settings.gcp, self.settings.crs, [photo.name for photo in photos])
+        known = np.array([photo.exif.position for photo in photos if photo.exif.position is not None], np.float64)
+        if not len(known) and self.settings.crs != "auto":
+            raise BadInput(f"--crs {self.settings.crs} needs positions, and no photograph has one; leave it out")
+        return chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
+
+    def _place(
+        self, models: Sequence[Path], photos: Sequence[Photo], site: Chart | Ground | None
+    ) -> list[tuple[Any, Placement | Control | None]]:
+        """The models, each on the map or level."""
+        return [self._place_one(number, read_model(path), site, photos) for number, path in enumerate(models)]
+
+    def _place_one(
+        self, number: int, model: Any, site: Chart | Ground | None, photos: Sequence[Photo]
+    ) -> tuple[Any, Placement | Control | None]:
+        by_name = {photo.name: photo for photo in photos}
+        where: Placement | Control | Refused
+        if isinstance(site, Ground):
+            where = place_by_points(model, site, self.settings.checkpoints)
+        elif isinstance(site, Chart):
+            where = place(centres_of(model), photos, site, self.settings.seed)
+        else:
+            where = Refused("no photograph has a position in EXIF" if self.settings.gps else "--no-gps")
+        if isinstance(where, Refused):
+            emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
+            return _levelled(model, by_name), None
+        model.transform(_sim3d(where.similarity))
+        _name_wrong(where)
+        if isinstance(where, Control):
+            return model, where
+        adjusted = adjust_once(model, where, by_name, self.settings, self.work / "adjusted" / str(number))
+        if adjusted is None:
+            emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
+        return adjusted or model, where
+
+    def _report(
+        self,
+        stages: Stages,
+        photos: Sequence[Photo],
+        placed: Sequence[tuple[Any, Placement | Control | None]],
+        why: dict[str, str],
+    ) -> dict[str, Any]:
+        report = {
+            "photographs": len(photos),
+            "registered": placed[0][0].num_reg_images(),
+            "not_registered": why,
+            "models": [model_facts(model, where) for model, where in placed],
+            "seconds": stages.seconds(),
+            "settings": self.settings,
+        }
+        write_json(self.scene / REPORT, report)
+        draw(self.scene / PICTURE, read_drawn(self.scene), placed[0][1])
+        return report
+
+
+def _name_wrong(where: Placement | Control) -> None:
+    """Say which positions or control points are left out."""
+    if isinstance(where, Control):
+        for names, why in ((where.wrong, "contradict the others"), (where.unseen, "are in too few placed photographs")):
+            if names:
+                emit(Warned(f"{len(names)} ground control points {why} and are left out: {few(names)}"))
+        return
+    wrong = [name for name, good in zip(where.names, where.fit.inside, strict=True) if not good]
+    far = np.linalg.norm(where.fit.residuals, axis=1)[~where.fit.inside] * where.chart.metres
+    if len(wrong) == 1:
+        emit(Warned(f"the position of {wrong[0]!r} is {far[0]:.0f} m from where the others put it, and is left out"))
+    elif wrong:
+        by = f"{far.min():.0f} to {far.max():.0f} m"
+        emit(Warned(f"{len(wrong)} positions are {by} from where the others put them, and are left out: {few(wrong)}"))
+
+
+def read_drawn(scene: Path) -> Any:
+    """The first model as it was delivered, with colours."""
+    return load_engine().Reconstruction(scene / "sparse" / "0")
+
+
+def _sim3d(given: Similarity) -> Any:
+    engine = load_engine()
+    return engine.Sim3d(given.scale, engine.Rotation3d(given.turn), given.move)
+
+
+def _placed(where: Placement | Control) -> Placed:
+    return Placed(where.chart.crs, where.chart.offset, where.chart.metres)
+
+
+def _levelled(model: Any, photos: dict[str, Photo]) -> Any:
+    """The model turned so that z is up, its points about 0."""
+    engine = load_engine()
+    images = [model.image(number) for number in model.reg_image_ids()]
+    poses = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    up = up_direction(poses, [photos[image.name].exif.orientation for image in images], points)
+    turn = turn_upright(up)
+    middle = turn @ np.median(points, axis=0)
+    model.transform(engine.Sim3d(1.0, engine.Rotation3d(turn), -middle))
+    return model

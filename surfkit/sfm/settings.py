@@ -1,0 +1,61 @@
+"""How cameras are found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from surfkit.core.check import BadInput, require_within
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of structure from motion."""
+
+    longest: int = 1600
+    """Features are found in photographs reduced to this longer side, pixels; 3200 is more exact and takes four times as
+    long. The photographs that are written keep their size."""
+
+    features: int = 8192
+    """About how many features are kept of a photograph."""
+
+    pairs: Literal["auto", "exhaustive", "gps", "sequence", "retrieval"] = "auto"
+    """Which photographs are compared: all with all, each with its neighbours by GPS, by time or name, or by likeness
+    (sequence too). `auto` compares all of up to 60 photographs, of more those near by GPS, else those alike."""
+
+    neighbours: int = 20
+    """How many photographs each is compared with, where not with all."""
+
+    lens: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"] = "SIMPLE_RADIAL"
+    """COLMAP's model of the lens: one or two radial terms, radial and tangential terms, more of both, or a fisheye.
+    Photographs of equal camera, size and focal length share a lens."""
+
+    mapper: Literal["incremental", "global"] = "incremental"
+    """How cameras are placed: one after the other, or all at once, which is faster for thousands of photographs and
+    less robust."""
+
+    gps: bool = True
+    """Place the scene on Earth by the positions in EXIF. Without it, or without such positions, it is only levelled."""
+
+    crs: str = "auto"
+    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is the zone of UTM."""
+
+    gcp: Path | None = None
+    """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""
+
+    checkpoints: int = 0
+    """How many of them are held back, to report how far they are off."""
+
+    seed: int = 0
+    """Of all that is drawn at random."""
+
+    def __post_init__(self) -> None:
+        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000)}
+        require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
+        if self.checkpoints and self.gcp is None:
+            raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
+        if self.crs != "auto" and not self.gps and self.gcp is None:
+            raise BadInput(f"--crs {self.crs} needs positions, which --no-gps leaves out; leave out one of the two")
+        if not self.crs.strip():
+            raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

@@ -1,0 +1,41 @@
+"""Long work of pycolmap: Ctrl-C, and faults in one line."""
+
+import _thread
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from surfkit.core.check import BadInput
+from surfkit.sfm import engine
+
+
+def test_ctrl_c_cancels_the_work_and_waits_for_its_end():
+    ended = []
+
+    def work(token):
+        _thread.interrupt_main()
+        until = time.monotonic() + 20
+        while not token.is_cancelled and time.monotonic() < until:
+            time.sleep(0.01)
+        _thread.interrupt_main()  # an impatient second one
+        time.sleep(0.3)
+        ended.append(token.is_cancelled)
+
+    with pytest.raises(KeyboardInterrupt):
+        engine.run("waiting", work)
+    assert ended == [True]
+
+
+def test_what_work_returns_and_how_it_fails():
+    assert engine.run("adding", lambda _: 1 + 1) == 2
+    with pytest.raises(BadInput, match=r"adding failed in pycolmap: two lines; delete"):
+        engine.run("adding", lambda _: (_ for _ in ()).throw(RuntimeError("two\nlines")))
+    with pytest.raises(ZeroDivisionError):
+        engine.run("adding", lambda _: 1 / 0)
+
+
+def test_an_old_pycolmap_is_named(monkeypatch):
+    monkeypatch.setattr(engine, "load_pycolmap", lambda: SimpleNamespace(__version__="3.11.1"))
+    with pytest.raises(BadInput, match="needs pycolmap 4.2 or newer, this is 3.11.1"):
+        engine.load_engine()

@@ -1,0 +1,141 @@
+"""Ground control points: lists of OpenDroneMap, triangulation, similarities, checkpoints, and points that are wrong."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from needs import needs
+from scipy.spatial.transform import Rotation
+
+from surfkit.core.check import BadInput
+from surfkit.readers.capture import load_pycolmap
+from surfkit.scene.earth import utm
+from surfkit.sfm.georeference import Refused
+from surfkit.sfm.ground_control import place_by_points, read_ground, read_list, triangulate
+
+from .pictures import arc
+
+OFFSET = np.array([512_000.0, 5_800_000.0, 90.0])
+PLACES = np.random.default_rng(0).uniform(-6, 6, (9, 3)) * (1, 1, 0.2)
+TURN = Rotation.from_rotvec([0.7, -0.2, 1.1]).as_matrix()
+POSES = {f"{at}.jpg": pose for at, pose in enumerate(arc(5))}
+
+
+def lens():
+    params = [260.0, 120.0, 90.0, 0.05]
+    return load_pycolmap().Camera(model="SIMPLE_RADIAL", width=240, height=180, params=params)
+
+
+def pixels(place):
+    rays = {name: pose[:3, :3] @ place + pose[:3, 3] for name, pose in POSES.items()}
+    return {name: np.asarray(lens().img_from_cam(ray[None])).ravel() for name, ray in rays.items()}
+
+
+def model():
+    """The cameras in a frame that is turned, moved and of a tenth of the size, as pycolmap has them."""
+    engine, found = load_pycolmap(), {}
+    for at, (name, pose) in enumerate(POSES.items()):
+        turn = pose[:3, :3] @ TURN.T
+        centre = 0.1 * TURN @ (-pose[:3, :3].T @ pose[:3, 3]) + (3, 4, 5)
+        rigid = engine.Rigid3d(engine.Rotation3d(turn), -turn @ centre)
+        found[at] = SimpleNamespace(
+            name=name, camera=lens(), cam_from_world=lambda rigid=rigid: rigid, projection_center=lambda c=centre: c
+        )
+    return SimpleNamespace(reg_image_ids=lambda: list(found), image=found.get)
+
+
+def written(path, first="EPSG:32633", places=PLACES, names=True):
+    lines = [first, "# x y z px py photograph name", ""]
+    for at, place in enumerate(places):
+        x, y, z = place + OFFSET
+        for photo, (across, down) in pixels(PLACES[at]).items():
+            lines.append(f"{x:.4f}\t{y:.4f} {z:.4f} {across:.3f} {down:.3f} {photo}" + f" P{at}" * names)
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_a_list_is_read(tmp_path, names):
+    crs, points = read_list(written(tmp_path / "gcp_list.txt", names=names))
+    assert crs == "EPSG:32633" and len(points) == 9 and (points[3].name == "P3") == names
+    assert points[3].xyz == pytest.approx(PLACES[3] + OFFSET, abs=1e-4)
+    assert set(points[3].marks) == set(POSES) and points[3].marks["2.jpg"] == pytest.approx(
+        pixels(PLACES[3])["2.jpg"], abs=1e-3
+    )
+
+
+def test_rays_meet_in_the_point():
+    images = {image.name: image for image in map(model().image, model().reg_image_ids())}
+    for place in PLACES:
+        found = triangulate(images, pixels(place))
+        np.testing.assert_allclose(found, 0.1 * TURN @ place + (3, 4, 5), atol=1e-6)
+    assert triangulate(images, {"0.jpg": (10, 10), "elsewhere.jpg": (3, 3)}) is None
+
+
+@pytest.mark.parametrize("first", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
+def test_points_place_the_model_and_checkpoints_check_it(tmp_path, first):
+    ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", list(POSES))
+    found = place_by_points(model(), ground, 3)
+    assert found.chart.crs == "EPSG:32633" and found.similarity.scale == pytest.approx(10, rel=1e-4)
+    assert len(found.control) == 6 and len(found.checkpoints) == 3 and not set(found.control) & set(found.checkpoints)
+    assert max(found.rms(found.checkpoints).values()) < 0.005
+    centre = found.similarity.points(np.array([[3.0, 4, 5]]))[0] + found.chart.offset
+    np.testing.assert_allclose(centre, OFFSET, atol=0.01)
+
+
+def test_a_checkpoint_has_no_say_and_a_wrong_point_is_found(tmp_path):
+    places = PLACES.copy()
+    path = tmp_path / "gcp_list.txt"
+    held = place_by_points(model(), read_ground(written(path), "auto", list(POSES)), 1).checkpoints[0]
+    places[int(held[1:])] += (0.5, 0, -1)
+    found = place_by_points(model(), read_ground(written(path, places=places), "auto", list(POSES)), 1)
+    assert found.residuals[held] == pytest.approx((0.5, 0, -1), abs=0.01)
+    assert max(found.rms(found.control).values()) < 0.005
+    places[int(found.control[2][1:])] += (0, 40, 0)
+    wrong = place_by_points(model(), read_ground(written(path, places=places), "auto", list(POSES)), 1)
+    assert wrong.wrong == (found.control[2],) and max(wrong.rms(wrong.control).values()) < 0.005
+
+
+def test_degrees_come_to_utm(tmp_path):
+    pyproj = needs("pyproj")
+    back = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
+    lines = ["EPSG:4326"]
+    for at, place in enumerate(PLACES[:4] + OFFSET):
+        longitude, latitude = back.transform(*place[:2])
+        assert utm(latitude, longitude, 33, False) == pytest.approx(place[:2], abs=1e-3)
+        lines.append(f"{longitude:.10f} {latitude:.10f} {place[2]} 1 2 0.jpg P{at}")
+    (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
+    ground = read_ground(tmp_path / "gcp_list.txt", "auto", list(POSES))
+    np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+
+
+def test_too_few_points_and_points_on_a_line(tmp_path):
+    ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", list(POSES))
+    found = place_by_points(model(), ground, 7)
+    assert isinstance(found, Refused) and "3 are needed besides 7 checkpoints" in found.reason
+    line = [np.array([at, 2 * at, 0.1 * at]) - 3 for at in range(4)]
+    points = [type(ground.points[0])(f"P{at}", tuple(xyz), pixels(xyz)) for at, xyz in enumerate(line)]
+    found = place_by_points(model(), type(ground)(points, ground.chart, np.stack(line)), 0)
+    assert isinstance(found, Refused) and "line" in found.reason
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("", "empty"),
+        ("EPSG:32633\n1 2 3 4 5", "line 2 is '1 2 3 4 5'"),
+        ("EPSG:32633\n1 2 3 4 x a.jpg", "line 2"),
+        ("EPSG:32633\n1 2 nan 4 5 a.jpg", "not finite"),
+        ("EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 9 4 5 1.jpg P", "puts 'P' elsewhere"),
+        ("EPSG:32633\n1 2 3 4 5 a.jpg", "none of its photographs is in the folder: 'a.jpg'"),
+        ("EPSG:32633", "no points"),
+        ("EPSG:32633\n1 2 3 4 5 0.jpg", "--crs EPSG:2180"),
+    ],
+)  # fmt: skip
+def test_lists_that_will_not_do(tmp_path, text, said):
+    (tmp_path / "gcp.txt").write_text(text)
+    with pytest.raises(BadInput, match=said) as raised:
+        read_ground(tmp_path / "gcp.txt", "EPSG:2180", list(POSES))
+    assert "\n" not in str(raised.value)
+    with pytest.raises(BadInput, match="no such file"):
+        read_list(tmp_path / "no.txt")

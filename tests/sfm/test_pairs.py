@@ -1,0 +1,88 @@
+"""Which photographs are compared."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from surfkit.sfm.exif import Exif
+from surfkit.sfm.pairs import SMALL, alike, choose_pairs, in_order, near, sequence, vlad
+from surfkit.sfm.photographs import Photo
+from surfkit.sfm.settings import Settings
+
+
+def photos(count, position=lambda at: None, taken=lambda at: None):
+    return [Photo(f"{at:03d}.jpg", (0, 0), exif=Exif(position=position(at), taken=taken(at))) for at in range(count)]
+
+
+def scenes(count, groups):
+    """Descriptors of photographs, of `groups` scenes in turn: features of a scene are alike."""
+    rng = np.random.default_rng(0)
+    centres = rng.integers(0, 200, (groups, 30, 128))
+
+    def of(at):
+        noise = np.random.default_rng(at).integers(0, 20, (30, 128))
+        return (centres[at % groups] + noise).astype(np.uint8)
+
+    return of
+
+
+def test_a_small_set_is_compared_completely():
+    pairs = choose_pairs(photos(7), Settings(), lambda at: 1 / 0)
+    assert sorted(pairs) == list(itertools.combinations(range(7), 2))
+
+
+def test_neighbours_by_gps_and_a_wrong_position_by_its_neighbours_in_time():
+    grid = {at: (52 + 2e-4 * (at // 10), 16 + 3e-4 * (at % 10), 100.0) for at in range(100)}
+    grid[45] = (53.0, 16.0, 100.0)
+    given = photos(100, grid.get)
+    pairs = choose_pairs(given, Settings(neighbours=8), lambda at: 1 / 0)
+    assert len(pairs) < 100 * 11 and all(one < two for one, two in pairs) and len(set(pairs)) == len(pairs)
+    assert {(33, at) for at in (34, 42, 43, 44)} <= set(pairs)
+    assert {(44, 45), (45, 46), (42, 45)} <= set(pairs)
+
+
+def test_neighbours_are_the_nearest():
+    rng = np.random.default_rng(1)
+    at = {number: (*(rng.uniform(0, 1e-3, 2) + (10, 20)), 5.0) for number in range(12)}
+    found = near(photos(12, lambda number: None if number == 3 else at[number]), 2)
+    flat = {n: np.array(p[:2]) * (111e3, 111e3 * np.cos(np.radians(10))) for n, p in at.items() if n != 3}
+    wanted = set()
+    for one in flat:
+        nearest = sorted((n for n in flat if n != one), key=lambda n: np.linalg.norm(flat[n] - flat[one]))[:2]
+        wanted |= {(min(one, n), max(one, n)) for n in nearest}
+    assert found == wanted
+
+
+def test_likeness_finds_the_same_scene():
+    found = alike(24, 3, scenes(24, 4), seed=0)
+    assert len(found) >= 24 * 3 / 2 and all((one - two) % 4 == 0 for one, two in found)
+    assert found == alike(24, 3, scenes(24, 4), seed=0)
+
+
+def test_a_large_set_without_gps_is_compared_by_likeness_and_sequence():
+    count = SMALL + 4
+    pairs = choose_pairs(photos(count), Settings(neighbours=4), scenes(count, 8))
+    assert {(0, 1), (0, 2), (0, 3)} <= set(pairs) and len(pairs) < count * 8
+    assert sum((two - one) % 8 == 0 for one, two in pairs) > count
+
+
+def test_order_is_by_time_where_all_say_it_else_by_name():
+    late_first = photos(3, taken=lambda at: f"2024:01:01 00:00:{9 - at:02d}")
+    assert in_order(late_first) == [2, 1, 0]
+    assert in_order([*late_first, *photos(1)]) == [0, 3, 1, 2] or in_order([*late_first, *photos(1)])[0] in (0, 3)
+    assert sequence([2, 1, 0], 1) == {(1, 2), (0, 1)}
+
+
+def test_vlad_is_of_unit_length_and_knows_its_cluster():
+    words = np.array([[0.0, 0], [10, 10]])
+    found = vlad(np.array([[1.0, 0], [2, 0], [10, 12]]), words)
+    np.testing.assert_allclose(found, np.array([1, 0, 0, 1]) / np.sqrt(2), atol=1e-6)
+    assert not vlad(np.zeros((0, 2)), words).any()
+
+
+@pytest.mark.parametrize("way", ["exhaustive", "gps", "sequence", "retrieval"])
+def test_few_photographs_in_every_way(way):
+    for count in (0, 1, 2, 3):
+        pairs = choose_pairs(photos(count), Settings(pairs=way), scenes(count, 1))
+        assert set(pairs) == set(itertools.combinations(range(count), 2))

@@ -1,0 +1,79 @@
+"""What is found out about each photograph before any is compared."""
+
+import os
+
+import pytest
+from PIL import Image, ImageFilter
+
+from surfkit.core.check import BadInput
+from surfkit.run.notes import collect_notes
+from surfkit.sfm import photographs
+from surfkit.sfm.photographs import Photo, is_blurred, lens_groups, look
+
+from .pictures import arc, picture, save
+
+
+@pytest.fixture
+def folder(tmp_path):
+    first, second = (picture(pose) for pose in arc(2))
+    save(tmp_path / "a.jpg", first)
+    save(tmp_path / "deep er/b.JPG", second)
+    Image.fromarray(second).filter(ImageFilter.GaussianBlur(6)).save(tmp_path / "c.png")
+    (tmp_path / "d.jpg").write_bytes((tmp_path / "a.jpg").read_bytes())
+    Image.new("RGB", (240, 180), (2, 2, 2)).save(tmp_path / "e.jpg")
+    Image.new("RGB", (240, 180), (90, 90, 90)).save(tmp_path / "f.png")
+    (tmp_path / "g.jpg").write_bytes((tmp_path / "a.jpg").read_bytes()[:3000])
+    save(tmp_path / ".thumbs/a.jpg", first)
+    (tmp_path / "h.dng").write_bytes(b"raw")
+    (tmp_path / "notes.txt").write_text("x")
+    return tmp_path
+
+
+def test_what_each_photograph_is(folder, capsys):
+    with collect_notes():
+        found = {photo.name: photo for photo in look(folder)}
+    assert "1 files cannot be read: 'h.dng'" in capsys.readouterr().err
+    assert list(found) == ["a.jpg", "c.png", "d.jpg", "deep er/b.JPG", "e.jpg", "f.png", "g.jpg"]
+    wrong = {name: photo.problem for name, photo in found.items() if not photo.usable}
+    assert wrong.pop("g.jpg") and wrong == {"d.jpg": "a copy of a.jpg", "e.jpg": "black", "f.png": "of one colour"}
+    assert [name for name, photo in found.items() if photo.usable and is_blurred(photo, list(found.values()))] == [
+        "c.png"
+    ]
+    assert found["a.jpg"].size == (240, 180)
+
+
+def test_what_is_known_is_not_looked_at_again(folder, monkeypatch):
+    before = look(folder)
+    save(folder / "a.jpg", picture(arc(3)[2]))
+    os.utime(folder / "a.jpg", ns=(1, 1))
+    seen, plain = [], photographs._look
+    monkeypatch.setattr(photographs, "_look", lambda path, photo: seen.append(photo.name) or plain(path, photo))
+    after = {photo.name: photo for photo in look(folder, before)}
+    assert seen == ["a.jpg"]
+    assert after["d.jpg"].usable, "it was a copy of what is another photograph now"
+    assert after["c.png"] == before[1]
+
+
+def test_lenses_are_shared_by_camera_size_and_focal_length():
+    def photo(camera=None, size=(40, 30), focal=None):
+        return Photo("x", (0, 0), size=size, exif=photographs.Exif(camera=camera, focal_px=focal))
+
+    given = [
+        photo(),
+        photo(size=(30, 40)),
+        photo("A", focal=50.1),
+        photo("A", focal=49.9),
+        photo("A", focal=70.0),
+        photo(),
+    ]
+    assert lens_groups(given) == [0, 1, 2, 2, 3, 0]
+
+
+def test_folders_without_photographs(tmp_path):
+    with pytest.raises(BadInput, match="no such folder"):
+        look(tmp_path / "x")
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(BadInput, match="no photographs"):
+        look(tmp_path)
+    with pytest.raises(BadInput, match="a file"):
+        look(tmp_path / "a.txt")

@@ -1,0 +1,272 @@
+"""`surfkit prepare photos`, from a folder of photographs of a known scene to a data set on the map."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from surfkit.cli import main
+from surfkit.readers.data import Data
+from surfkit.readers.read import observations, read
+from surfkit.scene.earth import from_utm
+from surfkit.sfm import features, mapping, matching
+from surfkit.sfm.similarity import umeyama
+from surfkit.testing.exif import write_exif
+
+from .pictures import arc, picture, save
+
+ORIGIN = np.array([512_000.0, 5_800_000.0, 90.0])
+QUICK = ("--features", "1500")
+POSES = {f"view {at}.jpg": pose for at, pose in enumerate(arc(6))}
+CENTRES = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in POSES.items()}
+WRONG = "view 3.jpg"
+
+
+def position(centre):
+    latitude, longitude = from_utm(centre[:1] + ORIGIN[0], centre[1:2] + ORIGIN[1], 33, False)
+    return float(latitude[0]), float(longitude[0]), float(centre[2] + ORIGIN[2])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Six photographs with positions, one of them wrong, of a scene; three of another; a black one and a copy."""
+    root = tmp_path_factory.mktemp("flight") / "photos"
+    rng = np.random.default_rng(0)
+    for name, pose in POSES.items():
+        noise = rng.normal(0, 0.02, 3) + (500.0 * (name == WRONG), 0, 0)
+        write_exif(save(root / name, picture(pose)), position(CENTRES[name] + noise))
+    for at, pose in enumerate(arc(3, 3.0)):
+        save(root / "other" / f"{at}.jpg", picture(pose, seed=9))
+    Image.new("RGB", (240, 180)).save(root / "black.jpg")
+    shutil.copy(root / "view 0.jpg", root / "zcopy.jpg")
+    return root
+
+
+@pytest.fixture(scope="module")
+def prepared(folder):
+    assert main(["prepare", "photos", str(folder), *QUICK]) == 0
+    return folder.parent / "photos-scene"
+
+
+def cameras(scene):
+    """Centres in the coordinates of the data set, by name."""
+    views = (*scene.train, *scene.held_out)
+    poses = {view.name: scene.frame.input_pose(view.camera.world_to_camera) for view in views}
+    return {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in poses.items()}
+
+
+def test_cameras_are_found_and_placed(prepared):
+    scene = read(Data(prepared))
+    found = cameras(scene)
+    assert found.keys() == POSES.keys()
+    truth = np.stack([CENTRES[name] + ORIGIN for name in found])
+    ours = np.stack(list(found.values()))
+    best = umeyama(ours - ORIGIN, truth - ORIGIN, np.ones(6))
+    shape = np.linalg.norm(best.points(ours - ORIGIN) - (truth - ORIGIN), axis=1)
+    assert shape.max() < 0.1, "of cameras 20 m away"
+    assert np.linalg.norm(ours - truth, axis=1).max() < 0.3
+    assert scene.frame.crs == "EPSG:32633" and scene.frame.metres == 1
+    assert scene.frame.shift == (512_000, 5_800_000, 0)
+    focal = {view.camera.fx / view.camera.width for view in scene.train}
+    assert len(focal) == 1 and focal.pop() == pytest.approx(260 / 240, rel=0.03)
+    heights = scene.frame.to_input(scene.cloud.xyz.numpy())[:, 2] - ORIGIN[2]
+    assert abs(np.median(heights)) < 0.2 and 2.5 < heights.max() < 5, "ground at 0, box 3 m, ball 4.4 m"
+    assert scene.cloud.rgb.float().std() > 20
+
+
+def test_points_lie_where_photographs_show_them(prepared):
+    data = Data(prepared)
+    scene = read(data)
+    seen = observations(data, scene)
+    view = scene.train[0]
+    spots = seen.seen[view.name]
+    xyz = np.column_stack([seen.xyz[spots.points], np.ones(len(spots.points))]) @ view.camera.world_to_camera.numpy().T
+    pixels = np.column_stack([view.camera.fx, view.camera.fy]) * xyz[:, :2] / xyz[:, 2:3] + (
+        view.camera.cx,
+        view.camera.cy,
+    )
+    off = np.linalg.norm(pixels - spots.at * (view.camera.width, view.camera.height), axis=1)
+    assert len(off) > 50 and np.median(off) < 1
+
+
+def test_the_report_says_what_became_of_each(prepared):
+    report = json.loads((prepared / "report.json").read_text())
+    assert (report["photographs"], report["registered"]) == (11, 6)
+    why = report["not_registered"]
+    assert why["black.jpg"] == "black" and why["zcopy.jpg"] == "a copy of view 0.jpg"
+    assert {why[f"other/{at}.jpg"] for at in range(3)} == {
+        "in another group of photographs, without matches to the largest: sparse/1"
+    }
+    assert report["models"][1]["photographs"] == 3 and "georeference" not in report["models"][1]
+    place = report["models"][0]["georeference"]
+    assert list(place["left_out"]) == [WRONG] and place["left_out"][WRONG] == pytest.approx(500, abs=1)
+    assert max(place["rms_m"].values()) < 0.2
+    assert set(report["seconds"]) == {
+        "photographs", "features", "pairs", "matches", "cameras", "georeference", "undistortion"
+    }  # fmt: skip
+    with Image.open(prepared / "cameras.png") as drawn:
+        assert np.asarray(drawn.convert("RGB")).std() > 10
+
+
+def test_the_other_group_can_be_read_too(prepared):
+    scene = read(Data(prepared, model="sparse/1"))
+    assert scene.frame.crs is None and len(cameras(scene)) == 3
+    heights = scene.frame.to_input(scene.cloud.xyz.numpy())[:, 2]
+    assert np.mean([centre[2] for centre in cameras(scene).values()]) > np.percentile(heights, 95), "level"
+
+
+def watched(monkeypatch):
+    """Names of the stages that work."""
+    seen = []
+    for module, name in ((features, "_keep"), (matching, "_compare"), (mapping, "_incremental")):
+        plain = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, plain=plain, name=name: seen.append(name) or plain(*given))
+    return seen
+
+
+def files(scene):
+    return {path.relative_to(scene): path.read_bytes() for path in scene.rglob("*.bin")}
+
+
+def test_what_is_complete_is_not_repeated(folder, prepared, monkeypatch):
+    before, seen = files(prepared), watched(monkeypatch)
+    assert main(["prepare", "photos", str(folder), *QUICK]) == 0
+    assert seen == [] and files(prepared) == before
+
+
+def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkeypatch, capsys):
+    for module, name in ((features, "_keep"), (matching, "_compare"), (mapping, "_incremental")):
+        plain, calls = getattr(module, name), []
+
+        def stop(*given, plain=plain, calls=calls, name=name):
+            calls.append(1)
+            if len(calls) == (3 if name == "_keep" else 1):
+                raise KeyboardInterrupt
+            return plain(*given)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, stop)
+            assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 130
+        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/lock").exists()
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    assert "_keep" not in seen
+    assert files(tmp_path / "s") == files(prepared), "to the bit as without interruption"
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_without_gps_it_is_level_and_features_are_kept(folder, prepared, tmp_path, monkeypatch, capsys):
+    shutil.copytree(prepared, tmp_path / "s")
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), "--no-gps", *QUICK]) == 0
+    assert "sparse/0 is level but not on the map and of no known scale: --no-gps" in capsys.readouterr().err
+    assert seen == []
+    scene = read(Data(tmp_path / "s"))
+    assert scene.frame.crs is None
+    found = cameras(scene)
+    ours, truth = np.stack(list(found.values())), np.stack([CENTRES[name] for name in found])
+    assert umeyama(ours, truth, np.ones(6)).turn[2, 2] > np.cos(np.radians(3))
+
+
+def test_a_photograph_more_takes_over_the_others(folder, prepared, tmp_path, monkeypatch):
+    shutil.copytree(folder, tmp_path / "photos", copy_function=shutil.copy2)
+    shutil.copytree(prepared, tmp_path / "s")
+    save(tmp_path / "photos/late.jpg", picture(arc(7)[6]))
+    compared, plain = [], matching._compare
+
+    def compare(engine, database, pairs, settings, token):
+        opened = engine.Database.open(database)
+        before = opened.num_matched_image_pairs()
+        opened.close()
+        plain(engine, database, pairs, settings, token)
+        compared.append(before)
+
+    monkeypatch.setattr(matching, "_compare", compare)
+    seen = []
+    keep = features._keep
+    monkeypatch.setattr(features, "_keep", lambda *given: seen.append(given[1].name) or keep(*given))
+    assert main(["prepare", "photos", str(tmp_path / "photos"), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    assert seen == ["late.jpg"] and compared[0] == 36, "the pairs of nine photographs"
+    assert set(cameras(read(Data(tmp_path / "s")))) == {*POSES, "late.jpg"}
+
+
+@pytest.mark.parametrize(
+    "count, said", [(1, "1 of 2 photographs can be used; not usable: 'black.jpg (black)'"), (0, "0 of 1")]
+)
+def test_too_few_photographs(folder, tmp_path, capsys, count, said):
+    (tmp_path / "p").mkdir()
+    for name in ["black.jpg", "view 0.jpg"][: count + 1]:
+        shutil.copy(folder / name, tmp_path / "p" / name)
+    assert main(["prepare", "photos", str(tmp_path / "p")]) == 2
+    err = capsys.readouterr().err
+    assert said in err and "Traceback" not in err
+
+
+def test_photographs_that_do_not_overlap(folder, tmp_path, capsys):
+    for at in range(3):
+        save(tmp_path / "p" / f"{at}.jpg", picture(arc(1)[0], seed=20 + at))
+    assert main(["prepare", "photos", str(tmp_path / "p"), *QUICK]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert (
+        "no cameras could be found for 3 photographs ('0.jpg', '1.jpg' and 1 more: matches no other photograph)" in said
+    )
+
+
+def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path, capsys):
+    for at in range(3):
+        save(tmp_path / "p" / f"{at}.jpg", picture(arc(3)[at]))
+    words = ["prepare", "photos", str(tmp_path / "p"), "--crs", "EPSG:2180"]
+    assert main(words) == 2 and "no photograph has one" in capsys.readouterr().err
+    assert main([*words, "--no-gps"]) == 2 and "leave out one of the two" in capsys.readouterr().err
+    assert main([*words[:3], "--checkpoints", "2"]) == 2 and "--gcp FILE" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.npz"))
+
+
+def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):
+    assert main(["prepare", "photos", str(folder), "--out", str(folder / "scene")]) == 2
+    assert "lies in the folder of photographs" in capsys.readouterr().err
+    (tmp_path / "s/sparse").mkdir(parents=True)
+    assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s")]) == 2
+    assert "has sparse that this command did not make" in capsys.readouterr().err
+    assert main(["prepare", "photos", str(tmp_path / "no")]) == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_training_on_photographs_says_what_to_do(folder, tmp_path, capsys):
+    words = ["train", "recipe:2dgs", "--out", str(tmp_path / "run"), "--data"]
+    assert main([*words, str(folder)]) == 2
+    assert f"surfkit prepare photos {folder}" in capsys.readouterr().err
+    (tmp_path / "set").mkdir()
+    shutil.copytree(folder, tmp_path / "set/images")
+    assert main([*words, str(tmp_path / "set")]) == 2
+    assert f"surfkit prepare photos {tmp_path / 'set/images'}" in capsys.readouterr().err
+
+
+def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared, tmp_path, monkeypatch, capsys):
+    shutil.copytree(prepared, tmp_path / "s")
+    corners = [(-7, -2, 3), (-1.5, -2, 3), (-7, 3, 3), (-1.5, 3, 3), (2, -7, 0), (6, 5, 0), (-9, 6, 0), (0, 0, 0)]
+    lines = ["WGS84 UTM 33N"]
+    for at, corner in enumerate(corners):
+        x, y, z = np.array(corner) + ORIGIN
+        for name, pose in POSES.items():
+            ray = pose[:3, :3] @ corner + pose[:3, 3]
+            across, down = 260 * ray[:2] / ray[2] + (120, 90)
+            lines.append(f"{x} {y} {z} {across} {down} {name.replace(' ', '_')} P{at}")
+    shutil.copytree(folder, tmp_path / "p")
+    for path in (tmp_path / "p").glob("view *.jpg"):  # names in a list have no spaces
+        path.rename(path.with_name(path.name.replace(" ", "_")))
+    (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
+    words = ["--gcp", str(tmp_path / "gcp_list.txt"), "--checkpoints", "3", *QUICK]
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 0
+    assert "_keep" not in seen, "features are those of the same files by other names"
+    assert "checkpoints (RMS)" in capsys.readouterr().out
+    ground = json.loads((tmp_path / "s/report.json").read_text())["models"][0]["ground_control"]
+    assert len(ground["control"]) == 5 and len(ground["checkpoints"]) == 3
+    assert max(ground["checkpoints_rms_m"].values()) < 0.05
+    scene = read(Data(tmp_path / "s"))
+    assert scene.frame.crs == "EPSG:32633"
+    for name, centre in cameras(scene).items():
+        assert np.linalg.norm(centre - CENTRES[name.replace("_", " ")] - ORIGIN) < 0.2
