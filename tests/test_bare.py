@@ -16,14 +16,17 @@ from hidden import NATIVE
 
 from surfkit import native
 from surfkit.cli import main
+from surfkit.core.optional import INSTALLED_AS
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 TESTS = Path(__file__).parent
 TOOLS = {"mkdocs-material", "nvidia-cuda-nvrtc", "pre-commit", "pytest", "pytest-xdist", "ruff"}
 """Packages that no test imports."""
 EXTRAS = [line for line in importlib.metadata.requires("surfkit") if "extra ==" in line]
-OPTIONAL = sorted({re.match(r"[\w-]+", line)[0] for line in EXTRAS} - TOOLS)
-"""Packages of the extras; each is imported by the name that it is installed by."""
+IMPORTED_AS = {installed: name for name, installed in INSTALLED_AS.items()}
+INSTALLED = {re.match(r"[\w-]+", line)[0] for line in EXTRAS} - TOOLS
+OPTIONAL = sorted(IMPORTED_AS.get(name, name) for name in INSTALLED)
+"""Packages of the extras, by the names that they are imported by."""
 EVERYTHING = ",".join(OPTIONAL)
 CASES = [f"missing:{package}" for package in (*OPTIONAL, NATIVE, f"{EVERYTHING},{NATIVE}")]
 CASES += [f"ImportError:{EVERYTHING},{NATIVE}", f"OSError:{EVERYTHING}"]

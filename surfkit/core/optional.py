@@ -15,6 +15,8 @@ EXTRAS = {
     "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""
+INSTALLED_AS = {"cv2": "opencv-python-headless"}
+"""By package, the name that it is installed by, where that is another one."""
 LIBRARIES = {
     "open3d": {
         "libEGL.so.1": "libegl1", "libGL.so.1": "libgl1", "libX11.so.6": "libx11-6", "libgomp.so.1": "libgomp1",
@@ -47,7 +49,8 @@ def needed(package: str, what: str) -> Iterator[None]:
 
 
 def _reason(package: str, error: Exception) -> str:
-    pip = f"pip install 'surfkit[{EXTRAS[package]}]'" if package in EXTRAS else f"pip install {package}"
+    own_name = INSTALLED_AS.get(package, package)
+    pip = f"pip install 'surfkit[{EXTRAS[package]}]'" if package in EXTRAS else f"pip install {own_name}"
     if isinstance(error, ModuleNotFoundError):
         lacks = error.name or package
         own = "which is not installed" if lacks == package else f"which cannot be loaded without {lacks}"
@@ -59,7 +62,7 @@ def _reason(package: str, error: Exception) -> str:
         few = "libraries {} are" if len(missing) > 1 else "library {} is"
         return f"which cannot be loaded: the system {few.format(', '.join(missing))} missing ({remedy})"
     said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-    return f"which cannot be loaded ({said}): pip install --force-reinstall {package}"
+    return f"which cannot be loaded ({said}): pip install --force-reinstall {own_name}"
 
 
 def _missing(package: str, said: str) -> list[str]:

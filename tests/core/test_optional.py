@@ -7,7 +7,7 @@ import pytest
 
 from surfkit.core import optional
 from surfkit.core.check import BadInput
-from surfkit.core.optional import EXTRAS, needed
+from surfkit.core.optional import EXTRAS, INSTALLED_AS, needed
 
 LIBGL = "libGL.so.1: cannot open shared object file: No such file or directory"
 
@@ -57,4 +57,6 @@ def test_memory_that_gives_out_is_no_fault_of_the_package():
 
 def test_the_extras_bring_what_is_said():
     found = [re.match(r"([\w-]+).*extra == ['\"](\w+)['\"]", line) for line in importlib.metadata.requires("surfkit")]
-    assert {(match[1], match[2]) for match in found if match} >= {*EXTRAS.items()}
+    assert {(match[1], match[2]) for match in found if match} >= {
+        (INSTALLED_AS.get(name, name), extra) for name, extra in EXTRAS.items()
+    }
