@@ -75,8 +75,8 @@ class MapsOf:
         theirs = read(run.data).frame
         if theirs.crs != frame.crs:
             raise BadInput(
-                f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that of "
-                f"{self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
+                f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "
+                f"of {self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
             )
         if frame.crs is None:
             emit(Warned("neither run is georeferenced; their coordinates are taken to be the same"))

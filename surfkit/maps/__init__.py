@@ -1,1 +1,1 @@
-"""Maps of a surface: surface model, orthophoto, hillshade, contour lines, point cloud, and differences of two surfaces."""
+"""Maps of a surface: heights, orthophoto, hillshade, contour lines, point cloud, differences of two surfaces."""

@@ -76,8 +76,8 @@ def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> in
 
 
 def sample_evenly(surface: Surface, area: float) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
-    """Points of a mesh, one for each so large part of its area, in the order of its triangles: (n, 3) float64 positions,
-    and (n, 3) uint8 colours where the mesh has some.
+    """Points of a mesh, one for each so large part of its area, in the order of its triangles: (n, 3) float64
+    positions, and (n, 3) uint8 colours where the mesh has some.
 
     A point lies wherever the area so far passes another multiple of `area`; within a triangle the points follow a
     low-discrepancy sequence. So there are the same points however many are made at once.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import replacing
 from surfkit.maps.geotiff import NODATA, Sheet, window_of
@@ -16,6 +17,8 @@ PIXELS = 1400
 """Longest side of the map in the picture."""
 BINS = 1 << 20
 """Of the histogram that percentiles are read from."""
+SHOWN = 95
+"""Percentile of the absolute differences at the ends of the colours."""
 INCHES, DPI = (11.0, 9.0), 130
 
 
@@ -50,6 +53,9 @@ def write_difference(sheet: Sheet, heights: tuple[Path, Path], name: str, side: 
     """Write the difference of two surface models on the grid of the sheet, in tiles of so many cells.
 
     Volumes are sums over cells, each as high as its centre. Percentiles are within a millionth of the range.
+
+    Raises:
+        BadInput: No cell has both.
     """
     import rasterio
 
@@ -69,8 +75,9 @@ def write_difference(sheet: Sheet, heights: tuple[Path, Path], name: str, side: 
                 if there.any():
                     file.write(np.where(there, found, NODATA).astype(file.dtypes[0]), 1, window=window_of(window))
                 emit(Progress("comparing heights", at + 1, len(windows)))
-    percentiles = _percentiles(sheet, name, side) if cells else (np.nan,) * 3
-    return Difference(cells, cells * cell, fill, cut, *percentiles, only_here, only_other)
+            if not cells:
+                raise BadInput(f"no cell of {sheet.grid.gsd:g} has both surfaces: they do not lie in the same place")
+    return Difference(cells, cells * cell, fill, cut, *_percentiles(sheet, name, side), only_here, only_other)
 
 
 def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, float]:
@@ -116,18 +123,23 @@ def draw_difference(path: Path, raster: Path, found: Difference, unit: str) -> N
         shape = max(1, round(file.height / by)), max(1, round(file.width / by))
         shown = file.read(1, out_shape=shape, masked=True, resampling=Resampling.average)
         west, south, east, north = file.bounds
-    reach = max(float(np.percentile(np.abs(shown.compressed()), 98)), 1e-9) if shown.count() else 1.0
+    reach = max(float(np.percentile(np.abs(shown.compressed()), SHOWN)), 1e-9)
+    rows, columns = (np.flatnonzero(~np.ma.getmaskarray(shown).all(axis)) for axis in (1, 0))
+    wide, high = (east - west) / shape[1], (north - south) / shape[0]
     style = {name: value for name, value in matplotlib.rcParamsDefault.items() if name != "backend"}
     with matplotlib.rc_context(style):
         figure = Figure(INCHES, DPI, layout="constrained")
         axes = figure.add_subplot(xlabel=f"easting, {unit}", ylabel=f"northing, {unit}")
         axes.set_facecolor("0.85")
         drawn = axes.imshow(shown, "RdBu_r", vmin=-reach, vmax=reach, extent=(west, east, south, north))
+        axes.set_xlim(west + columns[0] * wide, west + (columns[-1] + 1) * wide)
+        axes.set_ylim(north - (rows[-1] + 1) * high, north - rows[0] * high)
         axes.ticklabel_format(useOffset=False, style="plain")
         bar = figure.colorbar(drawn, ax=axes, extend="both", shrink=0.8)
         bar.set_label(f"height here minus height there, {unit}; grey: no surface in one of them")
         axes.set_title(
-            f"above (fill) {found.fill:,.4g} {unit}³, below (cut) {found.cut:,.4g} {unit}³, on {found.area:,.4g} {unit}²\n"
+            f"above (fill) {found.fill:,.4g} {unit}³, below (cut) {found.cut:,.4g} {unit}³, "
+            f"on {found.area:,.4g} {unit}²\n"
             f"median {found.median:.3g} {unit}; absolute: median {found.median_absolute:.3g}, "
             f"90 % under {found.percentile_90:.3g} {unit}",
             fontsize=10,

@@ -48,8 +48,8 @@ class Sheet:
         """How rasterio creates a file."""
         west, _, _, north = self.grid.bounds
         with needed("rasterio", "surfkit maps"):
-            from rasterio.transform import from_origin
-        place = from_origin(west, north, self.grid.gsd, self.grid.gsd)
+            from rasterio import Affine
+        place = Affine(self.grid.gsd, 0, west, 0, -self.grid.gsd, north)
         size = {"width": self.grid.width, "height": self.grid.height}
         inner = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "sparse_ok": True}
         return {"driver": "GTiff", "crs": self.crs, "transform": place, "bigtiff": "IF_SAFER", **size, **inner}
@@ -85,7 +85,7 @@ class Sheet:
             "bigtiff": "IF_SAFER",
             "sparse_ok": True,
         }
-        with rasterio.Env(GDAL_CACHEMAX=CACHE, CPL_TMPDIR=str(self.folder), GDAL_TIFF_INTERNAL_MASK=True):
+        with rasterio.Env(GDAL_CACHEMAX=CACHE, CPL_TMPDIR=str(self.folder)):
             from rasterio.shutil import copy
 
             copy(draft, finished, driver="COG", **layout)

@@ -134,8 +134,8 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
         raise BadInput(f"coordinate reference system {frame.crs!r}: GDAL does not know it: {error}") from error
     if not found.is_projected:
         raise BadInput(
-            f"coordinate reference system {frame.crs!r}: maps need easting and northing in units of length; convert the "
-            "cameras to a projected system such as UTM"
+            f"coordinate reference system {frame.crs!r}: maps need easting and northing in units of length; convert "
+            "the cameras to a projected system such as UTM"
         )
     return found, f"{text}, for coordinates about a place on Earth" if place else text
 

@@ -22,7 +22,7 @@ from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_axes, map_crs
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.resolution import ground_sampling_distance
-from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
+from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.scene import Frame, View
@@ -33,6 +33,8 @@ FILES = {
     "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
     "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
 }  # fmt: skip
+COMPARED = ("other", "difference", "picture")
+"""Files of a comparison."""
 RECORD = "maps.json"
 """What the maps are; written last, so maps without it are not whole."""
 PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
@@ -57,13 +59,15 @@ class MapSettings:
     """Between contour lines, like --gsd. `auto` is 1, 2 or 5 times a power of ten that gives at most 20 levels."""
 
     spacing: Length = "auto"
-    """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is --gsd."""
+    """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is that
+    of --gsd."""
 
     up: Axis | None = None
     """Axis of the data set that points up. Default: z if it is georeferenced, else what the cameras tell."""
 
     tile: int = 2048
-    """Side of the tiles that are drawn at once, pixels; does not change rasters. Contour lines are cut where tiles meet."""
+    """Side of the tiles that are drawn at once, pixels. Rasters do not depend on it; contour lines are cut where tiles
+    meet."""
 
     def __post_init__(self) -> None:
         for name in ("gsd", "interval", "spacing"):
@@ -130,13 +134,12 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     if "orthophoto" in done and not has_colors(surface):
         emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
         done = tuple(name for name in done if name != "orthophoto")
-    files = [FILES[name] for name in done] + ([FILES["difference"], FILES["picture"]] if other is not None else [])
-    with workshop(out, (*files, FILES["other"], RECORD)) as folder:
+    files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
+    with workshop(out, (*files, RECORD)) as folder:
         (out / RECORD).unlink(missing_ok=True)
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
         colors = FILES["orthophoto"] if "orthophoto" in done else None
         drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors)
-        refuse_empty(drawn, surface, grid)
         record = {
             "mesh": str(surface.path),
             "crs": frame.crs,
@@ -145,7 +148,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "axes": grid.turn.tolist(),
             "metres_per_unit": frame.metres,
             "gsd": gsd,
-            "bounds": grid.bounds,
+            "bounds": list(grid.bounds),
             "size": [grid.width, grid.height],
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
             "heights": [drawn.lowest, drawn.highest],
@@ -169,11 +172,8 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
 
 def subtract(sheet: Sheet, other: Surface, side: int, frame: Frame) -> dict[str, Any]:
     """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
-    drawn = draw_surface(
-        other, Sheet(sheet.grid, sheet.crs, sheet.folder, sheet.folder, sheet.double), side, FILES["other"]
-    )
-    refuse_empty(drawn, other, sheet.grid)
-    heights = sheet.out / FILES["dsm"], sheet.folder / FILES["other"]
+    draw_surface(other, sheet, side, FILES["other"])
+    heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
     found = write_difference(sheet, heights, FILES["difference"], side)
     unit = "m" if frame.metres == 1 else "units"
     draw_difference(sheet.out / FILES["picture"], sheet.out / FILES["difference"], found, unit)
@@ -181,18 +181,9 @@ def subtract(sheet: Sheet, other: Surface, side: int, frame: Frame) -> dict[str,
 
 
 def bounds_of(surface: Surface, turn: np.ndarray) -> tuple[float, float, float, float]:
-    """West, south, east and north of a mesh, of the vertices that its triangles have."""
+    """West, south, east and north of the vertices of a mesh."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for block in surface.blocks():
         placed = (block @ turn.T)[:, :2] if len(block) else np.empty((0, 2))
         low, high = np.minimum(low, placed.min(0, initial=np.inf)), np.maximum(high, placed.max(0, initial=-np.inf))
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def refuse_empty(drawn: Drawn, surface: Surface, grid: Grid) -> None:
-    """BadInput if no cell has a surface."""
-    if not drawn.covered:
-        raise BadInput(
-            f"{surface.path}: none of its triangles covers the centre of a cell of {grid.gsd:g}; give a smaller --gsd, or "
-            "other --bounds"
-        )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.bins import Bins, corners_of, sort_faces
@@ -27,7 +28,7 @@ class Drawn:
 
     Attributes:
         covered: Cells with a surface.
-        lowest: Height, units of the input; NaN without any.
+        lowest: Height, units of the input.
         highest: The same.
     """
 
@@ -50,6 +51,9 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
         side: Cells of a tile, along each side; memory is about 120 bytes for each cell of a tile, and 1 GB.
         heights: File name of the surface model.
         colors: File name of the orthophoto; None for none.
+
+    Raises:
+        BadInput: No cell has a surface.
     """
     bins = sort_faces(surface, sheet.grid, side, sheet.folder / f"faces-{Path(heights).stem}")
     covered, lowest, highest = 0, np.inf, -np.inf
@@ -67,7 +71,12 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
             model.write(np.where(there, buffer.height, NODATA).astype(model.dtypes[0]), 1, window=at)
             if photo is not None:
                 photo.write(colors_of(buffer, bins), window=at)
-    return Drawn(covered, float(lowest), float(highest)) if covered else Drawn(0, np.nan, np.nan)
+        if not covered:
+            raise BadInput(
+                f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
+                "smaller --gsd, or other --bounds"
+            )
+    return Drawn(covered, float(lowest), float(highest))
 
 
 def tiles_of(bins: Bins, side: int, what: str) -> Iterator[tuple[Window, ZBuffer]]:

@@ -67,7 +67,8 @@ class ZBuffer:
         row += low[owner, 1]
         shares, inside = barycentric(corners, owner, column + 0.5, row + 0.5)
         owner = owner[inside]
-        height = (shares[inside] * corners[owner, :, 2]).sum(1)
+        shares, z = shares[inside], corners[owner, :, 2]
+        height = z[:, 0] + shares[:, 1] * (z[:, 1] - z[:, 0]) + shares[:, 2] * (z[:, 2] - z[:, 0])  # exact if level
         place = (row[inside] - self.window.top) * self.window.width + column[inside] - self.window.left
         order = np.lexsort((-height, place))  # keeps the order of the triangles where both are equal
         place, height, owner = place[order], height[order], owner[order]
