@@ -19,7 +19,6 @@ from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
 from surfkit.train.bars import bars
-from surfkit.train.faults import full_disk_in_one_line
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class MapsOf:
         run = opened(self.run_folder)
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
-        with collect_notes(), bars(), full_disk_in_one_line(out):
+        with collect_notes(), bars():
             scene, surface = read(run.data), mesh_of(run.mesh)
             frame = scene.frame
             if self.metres_per_unit is not None:

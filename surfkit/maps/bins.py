@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,8 +61,10 @@ def sort_faces(surface: Surface, grid: Grid, side: int, file: Path) -> Bins:
         emit(Progress("counting triangles", min(at + FACES, total), total))
     starts = np.concatenate([[0], np.cumsum(counts)])
     kind = np.int32 if total <= np.iinfo(np.int32).max else np.int64
-    shape = (max(1, int(starts[-1])),)
-    numbers, free = np.memmap(file, kind, "w+", shape=shape), starts[:-1].copy()
+    size = max(1, int(starts[-1]))
+    with file.open("wb") as room:  # or an OSError now, and not a bus error when a mapped page finds the disk full
+        os.posix_fallocate(room.fileno(), 0, size * np.dtype(kind).itemsize)
+    numbers, free = np.memmap(file, kind, "r+", shape=(size,)), starts[:-1].copy()
     for at in range(0, total, FACES):
         tiles, faces = _pairs(surface, grid, side, slice(at, at + FACES))
         order = np.argsort(tiles, kind="stable")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -10,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import FileWritten, emit
 from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
@@ -20,6 +23,10 @@ BLOCK = 512
 """Side of the tiles within a file, cells."""
 CACHE = 256
 """Megabytes of GDAL's own cache of blocks."""
+LEAST_FREE = 1 << 20
+"""Bytes of a disk, below which it is full."""
+NOT_WRITTEN = re.compile("write (error|failed)|no space", re.IGNORECASE)
+"""How GDAL says that a file could not be written."""
 NODATA = -9999.0
 """Height where there is no surface."""
 Kind = Literal["heights", "colors", "shades"]
@@ -75,6 +82,7 @@ class Sheet:
         options = {"dtype": dtype, "count": count, "nodata": nodata, "compress": "LZW", **more}
         with rasterio.Env(GDAL_CACHEMAX=CACHE), rasterio.open(draft, "w+", **self.profile, **options) as file:
             yield file
+        refuse_full(self.folder)
         finished = self.folder / name
         layout = {
             "blocksize": BLOCK,
@@ -94,6 +102,7 @@ class Sheet:
 
     def deliver(self, finished: Path) -> None:
         """Move a file of `folder` to `out`."""
+        refuse_full(self.folder)
         with finished.open("rb+") as file:
             os.fsync(file.fileno())
         os.replace(finished, self.out / finished.name)
@@ -108,6 +117,12 @@ def window_of(window: Window) -> Any:
     return Their(window.left, window.top, window.width, window.height)
 
 
+def refuse_full(folder: Path) -> None:
+    """OSError if the disk is full: GDAL does not always say that what it wrote last found no room."""
+    if shutil.disk_usage(folder).free < LEAST_FREE:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+
+
 @contextmanager
 def workshop(out: Path, names: tuple[str, ...]) -> Iterator[Path]:
     """Within, no other process writes maps into `out`, and there is a folder in it for files that are being written.
@@ -117,6 +132,9 @@ def workshop(out: Path, names: tuple[str, ...]) -> Iterator[Path]:
     Args:
         out: Made if it is missing.
         names: Files to be written: OSError if something else than a file has such a name.
+
+    Raises:
+        Fault: The disk is full.
     """
     for name in names:
         refuse_special(out / name)
@@ -126,6 +144,13 @@ def workshop(out: Path, names: tuple[str, ...]) -> Iterator[Path]:
         folder.mkdir()
         try:
             yield folder
+        except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
+            full = shutil.disk_usage(folder).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
+            if isinstance(error, BadInput) or not full:
+                raise
+            raise Fault(
+                f"{out}: the disk is full; the maps that are in it are whole: free some space, and give the command again"
+            ) from error
         finally:
             with suppress(OSError):
                 shutil.rmtree(folder)

@@ -168,9 +168,13 @@ def test_all_products_of_a_hill(tmp_path):
         "32633" in meta["crs"] and list(meta["fields"]) == ["elevation"] and len(levels) == record["contours"]["lines"]
     )
     assert set(levels) == {20, 25, 30, 35}
+    lengths = dict.fromkeys(levels, 0.0)
     for level, shape in zip(levels, shapes, strict=True):
         places = np.frombuffer(shape[9:], "<f8").reshape(-1, 2)
         assert np.abs(np.hypot(*(places - UTM).T) - (40 - level)).max() < 0.2, "a mesh of steps of 0.8 m"
+        lengths[level] += np.hypot(*np.diff(places, axis=0).T).sum()
+    for level in (30, 35):
+        assert lengths[level] == pytest.approx(2 * np.pi * (40 - level), rel=0.01), "tiles leave no gaps"
     with rasterio.open(tmp_path / "hillshade.tif") as file:
         shade = file.read(1)
     assert shade[[0, -1]].max() == 0 and shade[1:-1, 1:-1].min() > 0

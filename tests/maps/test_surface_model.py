@@ -10,6 +10,7 @@ from surfkit.maps.geotiff import NODATA, Sheet, workshop
 from surfkit.maps.grid import Grid, map_axes, map_crs
 from surfkit.maps.surface_model import draw_surface, needs_double
 from surfkit.maps.zbuffer import NONE
+from surfkit.scene.earth import geocentric, to_ecef
 from surfkit.scene.scene import Frame
 
 from .shapes import UTM, box, centres, drawn, grid_of, heightfield, merged, surface_of
@@ -155,14 +156,10 @@ def test_coordinate_reference_systems():
 
 def test_topocentric_coordinates_are_where_the_orthographic_projection_has_them():
     """GDAL places a point of the map where the geocentric formulas place the point of the frame."""
-    from rasterio.warp import transform
-
-    from surfkit.scene.earth import geocentric, to_ecef
-
     text = "+proj=topocentric +ellps=WGS84 +lat_0=52.5 +lon_0=16.9 +h_0=0"
     crs, _ = map_crs(Frame(np.zeros(3), 1.0, 1.0, text))
     xyz = np.array([[800.0, -600.0, 100.0]])
-    (east,), (north,) = transform(crs, "EPSG:4326", xyz[:, 0], xyz[:, 1])
+    (east,), (north,) = needs("rasterio.warp").transform(crs, "EPSG:4326", xyz[:, 0], xyz[:, 1])
     earth = to_ecef(text, xyz)
     height = np.linalg.norm(earth) - np.linalg.norm(geocentric(north, east, 0.0))
     assert np.linalg.norm(geocentric(north, east, height) - earth) < 0.03
