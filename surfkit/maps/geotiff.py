@@ -149,7 +149,7 @@ def workshop(out: Path, names: tuple[str, ...]) -> Iterator[Path]:
             if isinstance(error, BadInput) or not full:
                 raise
             raise Fault(
-                f"{out}: the disk is full; the maps that are in it are whole: free some space, and give the command again"
+                f"{out}: the disk is full; the maps that are in it are whole: free some space, then do it again"
             ) from error
         finally:
             with suppress(OSError):

@@ -98,14 +98,15 @@ def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
     seen = np.flatnonzero(faces != NONE)
     for at in range(0, len(seen), CELLS):
         cells = seen[at : at + CELLS]
-        vertices = np.asarray(bins.surface.faces[faces[cells]])
+        used, owner = np.unique(faces[cells], return_inverse=True)
         row, column = np.divmod(cells, window.width)
-        corners = corners_of(bins.surface, bins.grid, faces[cells])
         places = column + window.left + 0.5, row + window.top + 0.5
-        shares, _ = barycentric(corners, np.arange(len(cells)), *places)
-        rows = bins.surface.rows[vertices.ravel()]
+        inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
+        rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
         for channel, name in enumerate(COLORS):
-            image[channel, cells] = np.rint((shares * rows[name].reshape(-1, 3)).sum(1)).astype(np.uint8)
+            a, b, c = rows[name].reshape(-1, 3).T.astype(np.float64)
+            found = a[owner] + second * (b - a)[owner] + third * (c - a)[owner]
+            image[channel, cells[inside]] = np.rint(found).astype(np.uint8)
         image[3, cells] = 255
     return image.reshape(4, *buffer.face.shape)
 

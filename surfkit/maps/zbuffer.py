@@ -65,19 +65,16 @@ class ZBuffer:
         row = within // wide[owner]
         column = within - row * wide[owner] + low[owner, 0]
         row += low[owner, 1]
-        shares, inside = barycentric(corners, owner, column + 0.5, row + 0.5)
+        inside, second, third = barycentric(corners, owner, column + 0.5, row + 0.5)
         owner = owner[inside]
-        shares, z = shares[inside], corners[owner, :, 2]
-        height = z[:, 0] + shares[:, 1] * (z[:, 1] - z[:, 0]) + shares[:, 2] * (z[:, 2] - z[:, 0])  # exact if level
+        z, z_second, z_third = corners[:, :, 2].T
+        height = z[owner] + second * (z_second - z)[owner] + third * (z_third - z)[owner]  # exact if level
         place = (row[inside] - self.window.top) * self.window.width + column[inside] - self.window.left
-        order = np.lexsort((-height, place))  # keeps the order of the triangles where both are equal
-        place, height, owner = place[order], height[order], owner[order]
-        first = np.flatnonzero(np.diff(place, prepend=-1))
-        place, height, owner = place[first], height[first], owner[first]
-        old = self.height.reshape(-1)
-        higher = height > old[place]
-        old[place[higher]] = height[higher]
-        self.face.reshape(-1)[place[higher]] = numbers[owner[higher]]
+        highest, face = self.height.reshape(-1), self.face.reshape(-1)
+        before = highest[place]
+        np.maximum.at(highest, place, height)
+        won = np.flatnonzero((height > before) & (height == highest[place]))[::-1]
+        face[place[won]] = numbers[owner[won]]  # where several won, the last one that is assigned: the first triangle
 
 
 def boxes(corners: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +86,11 @@ def boxes(corners: np.ndarray, window: Window) -> tuple[np.ndarray, np.ndarray]:
     return low.astype(np.int64), high.astype(np.int64)
 
 
-def barycentric(corners: np.ndarray, owner: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of the corners at places, (P, 3), and whether the places lie in their triangles, borders included, (P,).
+def barycentric(
+    corners: np.ndarray, owner: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which of some places lie in their triangles, borders included: (n,) their rows; and (n,) shares of the second and
+    third corner there. Triangles that are seen edge on have none.
 
     Args:
         corners: (F, 3, 3).
@@ -98,14 +98,16 @@ def barycentric(corners: np.ndarray, owner: np.ndarray, x: np.ndarray, y: np.nda
         x: (P,) columns.
         y: (P,) rows.
     """
-    signed = np.empty((len(owner), 3))
+    signed = []
     for at in range(3):
-        a, b = corners[:, (at + 1) % 3, :2], corners[:, (at + 2) % 3, :2]
-        swapped = (b[:, 0] < a[:, 0]) | ((b[:, 0] == a[:, 0]) & (b[:, 1] < a[:, 1]))
-        a, b = np.where(swapped[:, None], b, a), np.where(swapped[:, None], a, b)
-        along = np.where(swapped[:, None], -1.0, 1.0) * (b - a)
-        signed[:, at] = along[owner, 0] * (y - a[owner, 1]) - along[owner, 1] * (x - a[owner, 0])
-    inside = (signed >= 0).all(1) | (signed <= 0).all(1)
-    total = signed.sum(1)
-    inside &= total != 0  # seen edge on
-    return np.divide(signed, total[:, None], out=np.zeros_like(signed), where=inside[:, None]), inside
+        (ax, ay), (bx, by) = corners[:, (at + 1) % 3, :2].T, corners[:, (at + 2) % 3, :2].T
+        swapped = (bx < ax) | ((bx == ax) & (by < ay))
+        sign = np.where(swapped, -1.0, 1.0)
+        fx, fy, tx, ty = (np.where(swapped, *pair) for pair in ((bx, ax), (by, ay), (ax, bx), (ay, by)))
+        across, along = sign * (ty - fy), sign * (tx - fx)
+        signed.append(along[owner] * (y - fy[owner]) - across[owner] * (x - fx[owner]))
+    first, second, third = signed
+    total = first + second + third
+    inside = (first >= 0) & (second >= 0) & (third >= 0) | (first <= 0) & (second <= 0) & (third <= 0)
+    rows = np.flatnonzero(inside & (total != 0))
+    return rows, second[rows] / total[rows], third[rows] / total[rows]
