@@ -18,7 +18,7 @@ FLOORS = (
     "primitives losses depth",
     "densify appearance start",
     "train partition compress mesh evaluate execute",
-    "refine method lod",
+    "refine method lod maps",
     "recipe",
     "run",
     "blocks",

@@ -1,0 +1,107 @@
+"""Contour lines of a surface model, as a GeoPackage."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.core.optional import needed
+from surfkit.maps.geotiff import Sheet
+from surfkit.maps.grid import Grid, Window
+from surfkit.maps.hillshade import read_heights
+
+STEPS = 20
+"""About how many levels an automatic interval gives."""
+MOST_LEVELS = 10_000
+"""Of a map."""
+LINE = 2
+"""LineString in well-known binary."""
+
+
+def even_interval(lowest: float, highest: float) -> float:
+    """1, 2 or 5 times a power of ten, so that there are 20 levels or somewhat fewer between two heights."""
+    least = max((highest - lowest) / STEPS, 1e-9 * max(abs(lowest), abs(highest), 1e-9))
+    power = 10.0 ** math.floor(math.log10(least))
+    return float(f"{next(step * power for step in (1, 2, 5, 10) if step * power >= least * (1 - 1e-9)):.1g}")
+
+
+def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side: int) -> int:
+    """Write the contour lines of a surface model of `sheet.out`, and return how many there are.
+
+    Lines are cut where tiles meet, and their ends are the same there to the last bit. They end where there is no
+    surface.
+
+    Args:
+        sheet: Where.
+        heights: File name of the surface model.
+        name: File name of the GeoPackage: a layer `contours` with a field `elevation`.
+        interval: Between levels, units of the input; levels are its multiples.
+        side: Of a tile, cells.
+    """
+    with needed("pyogrio", "contour lines"):
+        from pyogrio.raw import write
+    import rasterio
+
+    grid, path, count = sheet.grid, sheet.folder / name, 0
+    windows = list(grid.tiles(side))
+    crs = sheet.crs.to_wkt()
+    with rasterio.open(sheet.out / heights) as model:
+        for at, window in enumerate(windows):
+            wide, high = (
+                min(window.width + 1, grid.width - window.left),
+                min(window.height + 1, grid.height - window.top),
+            )
+            part = Window(window.left, window.top, wide, high)
+            lines = contour_lines(read_heights(model, part), grid, part, interval)
+            if lines or not path.exists():
+                shapes = np.array([_binary(line) for _, line in lines], object)
+                levels = np.array([level for level, _ in lines], np.float64)
+                layer = {"layer": "contours", "driver": "GPKG", "geometry_type": "LineString", "crs": crs}
+                write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
+            count += len(lines)
+            emit(Progress("contour lines", at + 1, len(windows)))
+    sheet.deliver(path)
+    return count
+
+
+def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: float) -> list[tuple[float, np.ndarray]]:
+    """Levels and lines, (n, 2) float64 easting and northing, of the heights at the centres of a window of cells.
+
+    Between centres heights are linear along the sides of the squares of four of them, as in all programs.
+
+    Args:
+        heights: (H, W) float64; NaN where there is no surface.
+        grid: The map.
+        window: Of the map.
+        interval: Between levels.
+
+    Raises:
+        BadInput: Too many levels.
+    """
+    from contourpy import contour_generator
+
+    known = np.isfinite(heights)
+    if min(heights.shape) < 2 or not known.any():
+        return []
+    first, last = math.ceil(heights[known].min() / interval), math.floor(heights[known].max() / interval)
+    if last - first > MOST_LEVELS:
+        raise BadInput(f"--interval {interval:g}: more than {MOST_LEVELS:,} levels; give a larger one")
+    columns = np.arange(window.left, window.left + window.width) + 0.5
+    rows = np.arange(window.top, window.top + window.height) + 0.5
+    tracer = contour_generator(columns, rows, np.ma.masked_array(heights, ~known))
+    found = []
+    for level in range(first, last + 1):
+        for line in tracer.lines(level * interval):
+            if len(line) > 1:
+                place = np.stack([grid.west + line[:, 0], grid.north - line[:, 1]], axis=1) * grid.gsd
+                found.append((level * interval, place))
+    return found
+
+
+def _binary(line: np.ndarray) -> bytes:
+    """Well-known binary of a line of (n, 2) float64."""
+    return struct.pack("<BII", 1, LINE, len(line)) + line.astype("<f8").tobytes()

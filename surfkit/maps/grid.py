@@ -1,0 +1,144 @@
+"""The plane that a map is drawn on: its axes, its cells, and the coordinate reference system they are written with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.optional import needed
+from surfkit.scene.earth import TOPOCENTRIC
+from surfkit.scene.scene import Frame
+
+MOST_CELLS = 4e10
+"""Of a map: twice those of 14 x 14 km at 0.1 m."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of cells: columns [left, left + width), rows [top, top + height), from the upper left of the map."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Square cells on the ground, north up.
+
+    Borders of cells lie at multiples of their size, so that maps with the same size of cells have the same grid.
+
+    Attributes:
+        turn: (3, 3) float64 unit vectors in rows: east, north and up in the frame of the input.
+        gsd: Side of a cell (ground sampling distance), units of the input.
+        west: Easting of the left border, in cells.
+        north: Northing of the upper border, in cells.
+        width: Cells.
+        height: Cells.
+    """
+
+    turn: np.ndarray
+    gsd: float
+    west: int
+    north: int
+    width: int
+    height: int
+
+    @classmethod
+    def around(cls, turn: np.ndarray, gsd: float, bounds: tuple[float, float, float, float]) -> Grid:
+        """The cells that cover bounds: least easting and northing, then greatest, units of the input.
+
+        Raises:
+            BadInput: They are empty or too many.
+        """
+        west, south, east, north = (value / gsd for value in bounds)
+        if not (west <= east and south <= north and math.isfinite(east - west + north - south)):
+            raise BadInput(f"bounds {_shown(bounds)}: nothing lies within; give west south east north of the surface")
+        left, low = math.floor(west), math.floor(south)
+        width, height = max(1, math.ceil(east) - left), max(1, math.ceil(north) - low)
+        if width * height > MOST_CELLS:
+            raise BadInput(
+                f"--gsd: {width} x {height} cells of {gsd:g} are too many for one map (at most {MOST_CELLS:.0e}); give "
+                "a larger --gsd, or --bounds, if parts of the mesh lie far away"
+            )
+        return cls(turn, gsd, left, low + height, width, height)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north: borders of the outer cells, units of the input."""
+        edges = self.west, self.north - self.height, self.west + self.width, self.north
+        west, south, east, north = (edge * self.gsd for edge in edges)
+        return west, south, east, north
+
+    def to_map(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 easting, northing and height of positions in the frame of the input."""
+        return xyz if np.array_equal(self.turn, np.eye(3)) else xyz @ self.turn.T
+
+    def to_cells(self, xyz: np.ndarray) -> np.ndarray:
+        """(..., 3) float64 column and row, counted from the upper left corner of the map, and height, of positions in
+        the frame of the input. Centres of cells are at +0.5."""
+        found = np.array(self.to_map(xyz), np.float64)
+        found[..., 0] = found[..., 0] / self.gsd - self.west
+        found[..., 1] = self.north - found[..., 1] / self.gsd
+        return found
+
+    def tiles(self, side: int) -> Iterator[Window]:
+        """Squares of so many cells that cover the map, row by row; smaller at its right and lower borders."""
+        for top in range(0, self.height, side):
+            for left in range(0, self.width, side):
+                yield Window(left, top, min(side, self.width - left), min(side, self.height - top))
+
+
+def map_axes(up: np.ndarray) -> np.ndarray:
+    """(3, 3) unit vectors in rows: east, north and up for a direction that is up. For z, the axes of the frame.
+
+    East is the x axis of the frame as far as it lies on the ground, or the y axis where x points up.
+    """
+    axis = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    east = axis - up * (up @ axis)
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(up, east), up]) + 0.0
+
+
+def map_crs(frame: Frame) -> tuple[Any, str]:
+    """The coordinate reference system (of rasterio) that files of a frame have, and a line that says what it is.
+
+    Coordinates about a place on Earth (topocentric) are written as its orthographic projection, which differs by less
+    than 2 cm where 1 km from the place and 100 m high. Without a reference the file states a local one with its unit.
+
+    Raises:
+        BadInput: rasterio is missing, or the system is unknown or has no easting and northing in units of length.
+    """
+    with needed("rasterio", "surfkit maps"):
+        from rasterio.crs import CRS
+        from rasterio.errors import CRSError
+    text = frame.crs
+    if text is None:
+        unit = "metre" if frame.metres == 1 else "unit"
+        told = f"{frame.metres:.15g} m" if frame.metres else "of unknown length"
+        local = f'LOCAL_CS["local, not georeferenced",UNIT["{unit}",{frame.metres or 1:.15g}]]'
+        return CRS.from_wkt(local), "local coordinates, not georeferenced; unit: " + (
+            "1 m" if unit == "metre" else told
+        )
+    if place := TOPOCENTRIC.fullmatch(text):
+        text = f"+proj=ortho +lat_0={place[1]} +lon_0={place[2]} +ellps=WGS84 +units=m"
+    try:
+        found = CRS.from_user_input(text)
+    except CRSError as error:
+        raise BadInput(f"coordinate reference system {frame.crs!r}: GDAL does not know it: {error}") from error
+    if not found.is_projected:
+        raise BadInput(
+            f"coordinate reference system {frame.crs!r}: maps need easting and northing in units of length; convert "
+            "the cameras to a projected system such as UTM"
+        )
+    return found, f"{text}, for coordinates about a place on Earth" if place else text
+
+
+def _shown(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)

@@ -1,0 +1,189 @@
+"""All maps of a mesh, from the settings of a user to a folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.core.events import FileWritten, Warned, emit
+from surfkit.core.optional import needed
+from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.up_direction import up_direction
+from surfkit.maps.cloud import write_cloud
+from surfkit.maps.contours import even_interval, write_contours
+from surfkit.maps.difference import draw_difference, write_difference
+from surfkit.maps.geotiff import Sheet, workshop
+from surfkit.maps.grid import Grid, map_axes, map_crs
+from surfkit.maps.hillshade import draw_hillshade
+from surfkit.maps.resolution import ground_sampling_distance
+from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
+from surfkit.scene.crop import Axis
+from surfkit.scene.lengths import Length
+from surfkit.scene.scene import Frame, View
+
+Product = Literal["orthophoto", "hillshade", "contours", "points"]
+PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
+FILES = {
+    "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
+    "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
+}  # fmt: skip
+COMPARED = ("other", "difference", "picture")
+"""Files of a comparison."""
+RECORD = "maps.json"
+"""What the maps are; written last, so maps without it are not whole."""
+PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
+"""What products need beside rasterio."""
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """What is drawn, and how."""
+
+    products: tuple[Product, ...] = PRODUCTS
+    """What to write beside the surface model (dsm.tif)."""
+
+    gsd: Length = "auto"
+    """Side of a cell (ground sampling distance), metres; in units of the data set where it does not say how long these
+    are. `auto` is what a pixel of the photographs covers at its median depth."""
+
+    bounds: tuple[float, float, float, float] | None = None
+    """Draw only this part: west south east north, in coordinates of the map. Default: the whole mesh."""
+
+    interval: Length = "auto"
+    """Between contour lines, like --gsd. `auto` is 1, 2 or 5 times a power of ten that gives at most 20 levels."""
+
+    spacing: Length = "auto"
+    """Between points of the cloud, like --gsd: one point for each square of this side on the surface. `auto` is that
+    of --gsd."""
+
+    up: Axis | None = None
+    """Axis of the data set that points up. Default: z if it is georeferenced, else what the cameras tell."""
+
+    tile: int = 2048
+    """Side of the tiles that are drawn at once, pixels. Rasters do not depend on it; contour lines are cut where tiles
+    meet."""
+
+    def __post_init__(self) -> None:
+        for name in ("gsd", "interval", "spacing"):
+            value = getattr(self, name)
+            if value != "auto" and not 0 < value < float("inf"):
+                raise BadInput(f"--{name} {value:g}: it is a length, so it must be above 0, or auto")
+        if not 16 <= self.tile <= 16384:
+            raise BadInput(f"--tile {self.tile}: give 16 to 16384 pixels")
+        if self.bounds is not None and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
+            raise BadInput("--bounds: give west south east north, with west below east and south below north")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the products, the surface model first."""
+        return ("dsm", *(name for name in PRODUCTS if name in self.products))
+
+    def refuse_missing(self) -> None:
+        """BadInput if a package is missing, before anything is done."""
+        for name in self.names:
+            for package in ("rasterio", *PACKAGES.get(name, ())):
+                with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
+                    __import__(package)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What maps are drawn of.
+
+    Attributes:
+        surface: The mesh, in the frame of the input.
+        frame: Of the data set.
+        views: Training views.
+    """
+
+    surface: Surface
+    frame: Frame
+    views: Sequence[View] = ()
+
+
+def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface | None = None) -> dict[str, Any]:
+    """Write the maps of a mesh into a folder, and return what maps.json says: lengths are in units of the input.
+
+    Args:
+        subject: What to draw.
+        settings: How.
+        out: The folder; files of other names in it stay.
+        other: A mesh in the same coordinates, to subtract.
+
+    Raises:
+        BadInput: A package is missing, there is nothing to draw, or the map would be too large.
+    """
+    settings.refuse_missing()
+    frame, surface = subject.frame, subject.surface
+    crs, told = map_crs(frame)
+    up = up_direction(settings.up, subject.views, frame, np.eye(4))
+    units = frame.metres or 1.0
+
+    def length(value: Length, automatic: float) -> float:
+        return automatic if value == "auto" else value / units
+
+    gsd = ground_sampling_distance(surface, subject.views, frame) if settings.gsd == "auto" else settings.gsd / units
+    grid = Grid.around(map_axes(up.direction), gsd, settings.bounds or bounds_of(surface, map_axes(up.direction)))
+    done = settings.names
+    if "orthophoto" in done and not has_colors(surface):
+        emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
+        done = tuple(name for name in done if name != "orthophoto")
+    files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
+    with workshop(out, (*files, RECORD)) as folder:
+        (out / RECORD).unlink(missing_ok=True)
+        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
+        colors = FILES["orthophoto"] if "orthophoto" in done else None
+        drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors)
+        record = {
+            "mesh": str(surface.path),
+            "crs": frame.crs,
+            "coordinates": told,
+            "up": up.source,
+            "axes": grid.turn.tolist(),
+            "metres_per_unit": frame.metres,
+            "gsd": gsd,
+            "bounds": list(grid.bounds),
+            "size": [grid.width, grid.height],
+            "covered": round(drawn.covered / (grid.width * grid.height), 6),
+            "heights": [drawn.lowest, drawn.highest],
+        }
+        if "hillshade" in done:
+            draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], settings.tile)
+        if "contours" in done:
+            interval = length(settings.interval, even_interval(drawn.lowest, drawn.highest))
+            count = write_contours(sheet, FILES["dsm"], FILES["contours"], interval, settings.tile)
+            record["contours"] = {"interval": interval, "lines": count}
+        if "points" in done:
+            spacing = length(settings.spacing, gsd)
+            record["points"] = {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
+        if other is not None:
+            record["difference"] = subtract(sheet, other, settings.tile, frame)
+        record["files"] = files
+        write_json(out / RECORD, record)
+        emit(FileWritten(out / RECORD, "facts of the maps"))
+    return record
+
+
+def subtract(sheet: Sheet, other: Surface, side: int, frame: Frame) -> dict[str, Any]:
+    """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
+    draw_surface(other, sheet, side, FILES["other"])
+    heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
+    found = write_difference(sheet, heights, FILES["difference"], side)
+    unit = "m" if frame.metres == 1 else "units"
+    draw_difference(sheet.out / FILES["picture"], sheet.out / FILES["difference"], found, unit)
+    return {"other": str(other.path), **asdict(found)}
+
+
+def bounds_of(surface: Surface, turn: np.ndarray) -> tuple[float, float, float, float]:
+    """West, south, east and north of the vertices of a mesh."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for block in surface.blocks():
+        placed = (block @ turn.T)[:, :2] if len(block) else np.empty((0, 2))
+        low, high = np.minimum(low, placed.min(0, initial=np.inf)), np.maximum(high, placed.max(0, initial=-np.inf))
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -1,0 +1,117 @@
+"""The digital surface model, the highest surface above each cell, and the true orthophoto, the colours of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, emit
+from surfkit.evaluate.geometry.surface import Surface
+from surfkit.maps.bins import Bins, corners_of, sort_faces
+from surfkit.maps.geotiff import NODATA, Sheet, window_of
+from surfkit.maps.grid import Grid, Window
+from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
+
+CELLS = 1 << 20
+"""Cells whose colour is computed at once."""
+COLORS = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn.
+
+    Attributes:
+        covered: Cells with a surface.
+        lowest: Height, units of the input.
+        highest: The same.
+    """
+
+    covered: int
+    lowest: float
+    highest: float
+
+
+def has_colors(surface: Surface) -> bool:
+    """Whether the vertices of a mesh have colours."""
+    return set(COLORS) <= set(surface.rows.dtype.names or ())
+
+
+def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors: str | None = None) -> Drawn:
+    """Write the surface model, and the orthophoto, of a mesh.
+
+    Args:
+        surface: The mesh, in the frame of the input.
+        sheet: Where.
+        side: Cells of a tile, along each side; memory is about 120 bytes for each cell of a tile, and 1 GB.
+        heights: File name of the surface model.
+        colors: File name of the orthophoto; None for none.
+
+    Raises:
+        BadInput: No cell has a surface.
+    """
+    bins = sort_faces(surface, sheet.grid, side, sheet.folder / f"faces-{Path(heights).stem}")
+    covered, lowest, highest = 0, np.inf, -np.inf
+    with ExitStack() as files:
+        model = files.enter_context(sheet.raster(heights, "heights"))
+        photo = None if colors is None else files.enter_context(sheet.raster(colors, "colors"))
+        for window, buffer in tiles_of(bins, side, f"drawing {Path(heights).stem}"):
+            there = buffer.face != NONE
+            if not there.any():
+                continue  # is nodata, and takes no room
+            found = buffer.height[there]
+            covered += len(found)
+            lowest, highest = min(lowest, found.min()), max(highest, found.max())
+            at = window_of(window)
+            model.write(np.where(there, buffer.height, NODATA).astype(model.dtypes[0]), 1, window=at)
+            if photo is not None:
+                photo.write(colors_of(buffer, bins), window=at)
+        if not covered:
+            raise BadInput(
+                f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
+                "smaller --gsd, or other --bounds"
+            )
+    return Drawn(covered, float(lowest), float(highest))
+
+
+def tiles_of(bins: Bins, side: int, what: str) -> Iterator[tuple[Window, ZBuffer]]:
+    """Each tile of the map with the highest triangles on it; progress under the name `what`."""
+    windows = list(bins.grid.tiles(side))
+    for at, window in enumerate(windows):
+        buffer = ZBuffer(window)
+        for numbers in bins.of(at):
+            buffer.draw(corners_of(bins.surface, bins.grid, numbers), numbers)
+        yield window, buffer
+        emit(Progress(what, at + 1, len(windows)))
+
+
+def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
+    """(4, H, W) uint8 colours of the highest triangles at the centres of cells, between those of their corners, and
+    255; 0 0 0 0 where there is none."""
+    window, faces = buffer.window, buffer.face.reshape(-1)
+    image = np.zeros((4, faces.size), np.uint8)
+    seen = np.flatnonzero(faces != NONE)
+    for at in range(0, len(seen), CELLS):
+        cells = seen[at : at + CELLS]
+        used, owner = np.unique(faces[cells], return_inverse=True)
+        row, column = np.divmod(cells, window.width)
+        places = column + window.left + 0.5, row + window.top + 0.5
+        inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
+        rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
+        for channel, name in enumerate(COLORS):
+            a, b, c = rows[name].reshape(-1, 3).T.astype(np.float64)
+            found = a[owner] + second * (b - a)[owner] + third * (c - a)[owner]
+            image[channel, cells[inside]] = np.rint(found).astype(np.uint8)
+        image[3, cells] = 255
+    return image.reshape(4, *buffer.face.shape)
+
+
+def needs_double(surface: Surface, grid: Grid) -> bool:
+    """Whether heights of a mesh, in 32 bits, would be coarser than a hundredth of a cell."""
+    highest = max((float(np.abs(grid.to_map(block)[:, 2]).max(initial=0)) for block in surface.blocks()), default=0.0)
+    return float(np.spacing(np.float32(highest))) > grid.gsd / 100
