@@ -5,8 +5,8 @@
 
 Reads dsm.tif, dsm-other.tif (the exact heights) and orthophoto.tif. Corners are found in the exact heights: a vertex
 of the truth with a roof in one quarter around it and ground 4 m lower in the rest. The orthophoto is compared there
-with an exact one: the mean of the photographs that look down, at the exact heights, where the exact mesh hides nothing. The
-shift with the best correlation of 25 x 25 cells is the error. Frames are level, z up.
+with an exact one: the mean of the photographs that look down, at the exact heights, where the exact mesh hides
+nothing. The shift with the best correlation of 25 x 25 cells is the error. Frames are level, z up.
 """
 
 from __future__ import annotations
