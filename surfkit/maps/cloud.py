@@ -51,8 +51,8 @@ def write_cloud(surface: Surface, sheet: Sheet, name: str, spacing: float) -> in
     header.file_source_id = SOURCE
     step = 10.0 ** math.floor(math.log10(spacing) - math.log10(FINEST) + 0.5)
     header.scales = np.full(3, step)
-    middle = np.round([(west + east) / 2, (south + north) / 2, 0.0])
-    header.offsets = middle
+    first = next(block for block in surface.blocks() if len(block))
+    header.offsets = np.round([(west + east) / 2, (south + north) / 2, sheet.grid.to_map(first)[:, 2].mean()])
     if max(east - west, north - south) / 2 / step >= 2**31 - 1:
         raise BadInput(f"--spacing {spacing:g}: too fine for a LAZ file of this width; give a larger one")
     header.vlrs.append(WktCoordinateSystemVlr(sheet.crs.to_wkt(version="WKT1_GDAL")))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from surfkit.core.check import BadInput, Fault
-from surfkit.core.events import FileWritten, emit
+from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
 from surfkit.core.optional import needed
@@ -83,6 +83,7 @@ class Sheet:
         with rasterio.Env(GDAL_CACHEMAX=CACHE), rasterio.open(draft, "w+", **self.profile, **options) as file:
             yield file
         refuse_full(self.folder)
+        emit(Progress(f"compressing {name}", 0, 1))
         finished = self.folder / name
         layout = {
             "blocksize": BLOCK,
@@ -99,6 +100,7 @@ class Sheet:
             copy(draft, finished, driver="COG", **layout)
         draft.unlink()
         self.deliver(finished)
+        emit(Progress(f"compressing {name}", 1, 1))
 
     def deliver(self, finished: Path) -> None:
         """Move a file of `folder` to `out`."""

@@ -113,7 +113,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     Args:
         subject: What to draw.
         settings: How.
-        out: The folder; files of other names in it stay.
+        out: The folder; maps in it are replaced, files of other names stay.
         other: A mesh in the same coordinates, to subtract.
 
     Raises:
@@ -136,7 +136,10 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         done = tuple(name for name in done if name != "orthophoto")
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     with workshop(out, (*files, RECORD)) as folder:
-        (out / RECORD).unlink(missing_ok=True)
+        if (out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
+            (out / RECORD).unlink()
+            for name in {*FILES.values()} - {*files}:
+                (out / name).unlink(missing_ok=True)
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
         colors = FILES["orthophoto"] if "orthophoto" in done else None
         drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors)

@@ -48,7 +48,7 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
     Args:
         surface: The mesh, in the frame of the input.
         sheet: Where.
-        side: Cells of a tile, along each side; memory is about 120 bytes for each cell of a tile, and 1 GB.
+        side: Cells of a tile, along each side, on which memory depends.
         heights: File name of the surface model.
         colors: File name of the orthophoto; None for none.
 

@@ -53,6 +53,10 @@ def test_cells_are_as_large_as_pixels_and_the_cameras_say_what_is_up(run, capsys
     record = json.loads((run / "maps" / "maps.json").read_text())
     assert record["up"] == "cameras" and record["axes"] == np.eye(3).tolist() and 0.01 < record["gsd"] < 2
     assert (run / "maps" / "hillshade.tif").exists()
+    (run / "maps" / "notes.txt").write_text("of a user")
+    assert main(["maps", str(run), "--products", "orthophoto", "--gsd", "1"]) == 0
+    names = sorted(path.name for path in (run / "maps").iterdir())
+    assert names == ["dsm.tif", "maps.json", "notes.txt", "orthophoto.tif"], "no map of before beside new ones"
 
 
 @pytest.mark.parametrize(

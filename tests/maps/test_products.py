@@ -181,6 +181,17 @@ def test_all_products_of_a_hill(tmp_path):
     assert shade[20:40, 20:40].mean() > shade[80:100, 80:100].mean() + 100, "light from the north-west"
 
 
+def test_level_ground_and_heights_in_millions(tmp_path):
+    read = needs("pyogrio.raw").read
+    laspy = needs("laspy")
+    flat = heightfield(lambda x, y: 0 * x + 6_371_000.125, UTM, (UTM[0] + 5, UTM[1] + 5))
+    record = make_maps(Subject(flat, FRAME), MapSettings(("contours", "points"), 0.1), tmp_path)
+    assert record["contours"]["lines"] == 0 and len(read(tmp_path / "contours.gpkg")[2]) == 0
+    assert np.abs(laspy.read(tmp_path / "points.laz").z - 6_371_000.125).max() < 1e-3
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        assert file.dtypes == ("float64",) and (file.read(1) == 6_371_000.125).all()
+
+
 def view_from(height, focal, place=(0.0, 0.0)):
     """A camera in the local frame that looks down from so many units of the input above UTM."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])

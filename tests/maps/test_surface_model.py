@@ -162,7 +162,7 @@ def test_topocentric_coordinates_are_where_the_orthographic_projection_has_them(
     (east,), (north,) = needs("rasterio.warp").transform(crs, "EPSG:4326", xyz[:, 0], xyz[:, 1])
     earth = to_ecef(text, xyz)
     height = np.linalg.norm(earth) - np.linalg.norm(geocentric(north, east, 0.0))
-    assert np.linalg.norm(geocentric(north, east, height) - earth) < 0.03
+    assert np.linalg.norm(geocentric(north, east, height) - earth) < 0.02
 
 
 def test_heights_in_millions_have_64_bits():
