@@ -1,6 +1,7 @@
 """Long work of pycolmap: Ctrl-C, and faults in one line."""
 
 import _thread
+import signal
 import time
 from types import SimpleNamespace
 
@@ -10,7 +11,15 @@ from surfkit.core.check import BadInput
 from surfkit.sfm import engine
 
 
-def test_ctrl_c_cancels_the_work_and_waits_for_its_end():
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises here, also where a shell has started the tests in the background, and so without it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_cancels_the_work_and_waits_for_its_end(interruptible):
     ended = []
 
     def work(token):
