@@ -20,7 +20,6 @@ from surfkit.raster.select import Device
 from surfkit.render.frames import Show, draw_frames
 from surfkit.render.path import LONGEST, MOST_FRAMES, Flight, flyover, from_file, lens_of, orbit
 from surfkit.render.video import is_video, require_video, write_video
-from surfkit.run.folder import Run
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene
@@ -114,7 +113,8 @@ class Render:
             flight = self.flight(ctx.scene)
             fps = self.fps or flight.fps or FPS
             with locked(folder), full_disk_in_one_line(folder):
-                frames = draw_frames(folder, flight.cameras, draw, self.show, identity(ctx.run), replace=film)
+                model = identity(self.run_folder, self.compressed)
+                frames = draw_frames(folder, flight.cameras, draw, self.show, model, replace=film)
                 if film:
                     write_video(out, frames, fps)
                     if not self.keep_frames:
@@ -138,11 +138,12 @@ class Render:
         return from_file(Path(self.path), scene, lens, self.frames)
 
 
-def identity(run: Run) -> str:
-    """A text that differs between models: of the files that describe them, and of what they hold."""
+def identity(run: Path, compressed: bool) -> str:
+    """A text that differs between models of run folders: of the files that describe them, and of what they hold."""
+    model = "compressed/model.surfkit" if compressed else "point_cloud.ply"
     found = hashlib.sha256()
-    for name in ("recipe.json", "run.json", "point_cloud.ply", "model.surfkit"):
-        path = run.out / name
+    for name in ("recipe.json", "run.json", "result/result.json", model):
+        path = run / name
         if path.exists():
             facts = path.stat()
             found.update(f"{name} {facts.st_size} {facts.st_mtime_ns}\n".encode())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,7 +87,7 @@ def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, floa
 
     with rasterio.open(sheet.out / name) as file:
 
-        def differences() -> list[np.ndarray]:
+        def differences() -> Iterator[np.ndarray]:
             for window in sheet.grid.tiles(side):
                 values = read_heights(file, window)
                 yield values[np.isfinite(values)]

@@ -13,6 +13,7 @@ from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
+from surfkit.cli.render import identity
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.core.registry import hookimpl, plugins
@@ -306,6 +307,18 @@ def test_the_command(trained, tmp_path, capsys):
 def test_words_that_cannot_be(tmp_path, capsys, words, said):
     assert main(["render", str(tmp_path), *words]) == 2
     assert said in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_models_are_told_apart(tmp_path):
+    for name in ("run.json", "point_cloud.ply", "compressed/model.surfkit"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("a")
+    whole, packed = identity(tmp_path, False), identity(tmp_path, True)
+    assert whole != packed
+    (tmp_path / "compressed" / "model.surfkit").write_text("another")
+    assert identity(tmp_path, False) == whole and identity(tmp_path, True) != packed
+    (tmp_path / "run.json").write_text("another")
+    assert identity(tmp_path, False) != whole, "trained again"
 
 
 def test_no_run(tmp_path, capsys):
