@@ -48,6 +48,7 @@ class MeshInput:
         splats: Activated values, local frame.
         views: Training views, with cameras in the local frame.
         draw: Maps of a view, geometry included: color, alpha, depth, median, normal.
+        draw_of: Draws given splats as `draw` does all of them; None where `draw` does not draw splats.
         rasterizer: For what `draw` does not give.
         near: Local units, of the stage that trained the splats.
         frame: From the local frame back to the input's; knows metres if the data set does.
@@ -71,6 +72,7 @@ class MeshInput:
     keep: Callable[[int], Tensor | None] = lambda at: None
     priors: Sequence[DepthPrior | None] | None = None
     photo: Callable[[int], Tensor] | None = None
+    draw_of: Callable[[Splats], Callable[[View], Maps]] | None = None
 
 
 class Mesher(Component):

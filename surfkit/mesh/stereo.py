@@ -62,7 +62,7 @@ class Stereo(Mesher):
                 f"none of {len(subject.views)} views has a depth prior of confidence {self.min_confidence:g} or more; "
                 "lower --mesh.min-confidence, or look at the maps"
             )
-        return self.fusion.mesh(replace(subject, draw=draw, splats=splats))
+        return self.fusion.mesh(replace(subject, draw=draw, draw_of=None, splats=splats))
 
 
 def seen(view: View, prior: DepthPrior | None, photo: Tensor | None, least: float) -> Maps:

@@ -17,6 +17,7 @@ from surfkit.mesh.cuda import grid as gpu
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
 from surfkit.mesh.lengths import Lengths, resolve, with_unit
+from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
@@ -58,6 +59,10 @@ class TSDF(Mesher):
     """Sum of the weights of the views that must have seen a voxel; a view at a grazing angle or from far away weighs
     less than one."""
 
+    largest_px: float = 0.0
+    """Leave out splats with a larger standard deviation, in pixels at the median depth: they paint places that few
+    views see, and hide the surface behind them. 0 keeps all."""
+
     floaters: float = 0.0
     """Drop connected components that views see through more than this many times as often as they see them; 0 keeps
     all. Without `trust` every view is rendered once more for it."""
@@ -70,6 +75,8 @@ class TSDF(Mesher):
             check_length(f"mesh.{name}", getattr(self, name))
         if not 2 <= self.truncation_voxels <= 100:
             raise BadInput(f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from 2 to 100")
+        if not 0 <= self.largest_px < float("inf"):
+            raise BadInput(f"mesh.largest_px is {self.largest_px:g}; it must be 0 or more")
         if not 0 <= self.floaters <= 1000:
             raise BadInput(f"mesh.floaters is {self.floaters:g}; it must be from 0 to 1000")
         if not 0 < self.least_views <= 1000:
@@ -94,6 +101,9 @@ class TSDF(Mesher):
                 f"{subject.budget_bytes / 1e6:.0f} MB are too little to mesh in; give --memory "
                 f"{LEAST_BYTES // 10**6}MB or more"
             )
+        given = len(subject.splats)
+        if self.largest_px:
+            subject = without_oversized(subject, self.largest_px, self.depth)
         lengths, found = self._lengths(subject)
         device = subject.rasterizer.where()
         most_blocks = max(int(SHARE * subject.budget_bytes / GRID_BYTES), 64)
@@ -108,12 +118,13 @@ class TSDF(Mesher):
         how = lengths.limit, self.carve, least, subject.scratch, label, compare, self.floaters
         task = Task(lattice, cameras, see, *how, device=device)
         (vertices, faces, colors), counts = fuse(task, plan(found, most_blocks))
+        left_out = {"oversized_splats": given - len(subject.splats)} if self.largest_px else {}
         if not len(faces):
             raise BadInput(
                 f"no surface: with {describe_lengths(lengths, subject)}, no voxel beside one was seen by "
                 f"{self.least_views:g} views; lower --mesh.least-views, or train for more steps"
             )
-        return Mesh(vertices, faces, colors, facts(lengths, subject) | counts)
+        return Mesh(vertices, faces, colors, facts(lengths, subject) | counts | left_out)
 
     def _eyes(self, subject: MeshInput, lengths: Lengths) -> Callable[[int], Picture]:
         """What gives what the view at a position sees."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from surfkit.core.registry import Component
 from surfkit.mesh.base import Mesh
 from surfkit.primitives.model import SplatModel
-from surfkit.raster.api import Maps, Rasterizer
+from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Scene, View
 
@@ -31,6 +31,7 @@ class Reconstruction:
             `median` and, where there is one, `normal`.
         draw_there: The same, with maps that stay on the device that draws; None for `draw`.
         draw_color: The same as `draw_there` with colours alone, whose speed is measured; None for `draw`.
+        draw_of: Draws given splats as `draw` does all of `splats`; None where `draw` is the method's own.
         facts: Plain values for metrics.json, under "method".
         steps: Optimisation steps that were made, of all stages; 0 for a method without any.
         last_steps: Those of the last stage, where there are several.
@@ -46,6 +47,7 @@ class Reconstruction:
     draw: Callable[[View], Maps] | None = None
     draw_there: Callable[[View], Maps] | None = None
     draw_color: Callable[[View], Maps] | None = None
+    draw_of: Callable[[Splats], Callable[[View], Maps]] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 0
     last_steps: int = 0

@@ -37,14 +37,15 @@ SURFACE = Recipe(
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
     ),
-    # Depth that other views confirm is averaged over less: neither side of a wall takes from the other.
-    mesh=TSDF(truncation_voxels=2.5, least_views=0.1, trust=Agreement(alone=0.1)),
+    # Depth that other views confirm is averaged over less: neither side of a wall takes from the other. Splats begin
+    # two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface.
+    mesh=TSDF(truncation_voxels=2.5, least_views=0.1, largest_px=12.0, trust=Agreement(alone=0.1)),
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference.
 STEREO = Recipe(
     about="Stereo depth maps alone, fused as recipe:surface fuses: no splats, the baseline of any surface",
-    method=StereoFusion(mesher=Stereo(fusion=SURFACE.mesh)),
+    method=StereoFusion(mesher=Stereo(fusion=replace(SURFACE.mesh, largest_px=0.0))),
     depth=SURFACE.depth,
 )
 

@@ -146,7 +146,7 @@ def decompressed(ctx: RunContext, made: Reconstruction) -> tuple[RunContext, Rec
     if not run.compressed_record.exists() or not run.compressed_model.exists():
         raise BadInput(f"{run.out}: there is no compressed model; make one with surfkit compress {run.out}")
     model, _ = ModelFile(run.compressed_model).read()
-    small = replace(made, splats=model, mesh=None, draw=None, draw_there=None, draw_color=None)
+    small = replace(made, splats=model, mesh=None, draw=None, draw_there=None, draw_color=None, draw_of=None)
     return replace(ctx, run=replace(run, out=run.compressed)), with_drawing(small, ctx.rasterizer)
 
 

@@ -122,6 +122,7 @@ def mesh_input(
         keep=lambda at: None if masks is None else masks[at],
         priors=priors,
         photo=lambda at: view_photo(scene.train[at]),
+        draw_of=made.draw_of,
     )
 
 

@@ -276,13 +276,23 @@ def with_drawing(made: Reconstruction, rasterizer: Rasterizer) -> Reconstruction
     def there() -> Splats:
         return made.splats.splats.to(rasterizer.where())
 
-    def maps(view: View, geometry: bool) -> Maps:
-        return draws.render(there(), view.camera, near, geometry, distortion=False).maps
+    def maps(splats: Splats, view: View, geometry: bool = True) -> Maps:
+        return draws.render(splats, view.camera, near, geometry, distortion=False).maps
 
-    def here(view: View) -> Maps:
-        return Maps(**{name: value.cpu() for name, value in maps(view, True).present().items()})
+    def on_cpu(found: Maps) -> Maps:
+        return Maps(**{name: value.cpu() for name, value in found.present().items()})
 
-    return replace(made, draw=here, draw_there=lambda view: maps(view, True), draw_color=lambda view: maps(view, False))
+    def of(splats: Splats) -> Callable[[View], Maps]:
+        moved = splats.to(rasterizer.where())
+        return lambda view: on_cpu(maps(moved, view))
+
+    return replace(
+        made,
+        draw=lambda view: on_cpu(maps(there(), view)),
+        draw_there=lambda view: maps(there(), view),
+        draw_color=lambda view: maps(there(), view, geometry=False),
+        draw_of=of,
+    )
 
 
 def splats_of(run: Run, made: Reconstruction) -> SplatModel:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -242,15 +242,17 @@ def mesh_input(kind: str = "surfel", count: int = 900, views: int = 14, **change
     rasterizer, _ = select("cpu")
     seen = tuple(View(f"{i}", _towards_origin(2.0 * at), path=None) for i, at in enumerate(_evenly(views)))
 
-    def draw(view: View) -> Maps:
-        return rasterizer.render(ball, view.camera, 0.01, True, False).maps
+    def draw_of(splats: Splats) -> Callable[[View], Maps]:
+        return lambda view: rasterizer.render(splats, view.camera, 0.01, True, False).maps
 
+    draw = draw_of(ball)
     drawn = [draw(view) for view in seen]
     inverses = [torch.where(m.median > 0, 1 / m.median.clamp_min(1e-9), 0.0) for m in drawn]
     priors = [DepthPrior(i, (i > 0).float(), 1.0, m.normal) for i, m in zip(inverses, drawn, strict=True)]
     photos = [(m.color.clamp(0, 1) * 255).round().to(torch.uint8) for m in drawn]
     given = MeshInput(ball, seen, draw, rasterizer, 0.01, Frame(np.zeros(3), 1.0), 1 << 30)
-    return replace(given, **({"priors": priors, "photo": photos.__getitem__} | changes))
+    known = {"priors": priors, "photo": photos.__getitem__, "draw_of": draw_of}
+    return replace(given, **(known | changes))
 
 
 def _evenly(count: int) -> Tensor:

@@ -90,7 +90,7 @@ class RenderedStereo(Mesher):
             def draw(view: View) -> Maps:
                 return stored(folder / f"{places[view.name]}.npz")
 
-            seen = replace(subject, draw=draw, splats=points(subject.views, draw))
+            seen = replace(subject, draw=draw, draw_of=None, splats=points(subject.views, draw))
             mesh = self.fusion.mesh(seen)
         return replace(mesh, facts={**mesh.facts, "share_with_stereo_depth": float(np.mean(kept))})
 

@@ -37,7 +37,7 @@ class MaxAngleTSDF(Mesher):
         def draw(view: View) -> Maps:
             return within(subject.draw(view), view.camera, self.angle)
 
-        return self.fusion.mesh(replace(subject, draw=draw))
+        return self.fusion.mesh(replace(subject, draw=draw, draw_of=None))
 
 
 def within(maps: Maps, camera: Camera, angle: float) -> Maps:
