@@ -143,8 +143,6 @@ def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
     if best.find("f") is None:
         raise BadInput(f"{where}: no f in its calibration; open the project in Metashape, and export the cameras again")
     value = {name: float(numbers(f"{where}: {name}", best.findtext(name) or "0", 1)[0]) for name in COEFFICIENTS}
-    if value["b1"] <= -value["f"]:
-        raise BadInput(f"{where}: b1 is {value['b1']:g}, with f of {value['f']:g}; export the cameras again")
     return Brown(
         size=(int(width), int(height)),
         focal=(value["f"] + value["b1"], value["f"]),

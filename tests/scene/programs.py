@@ -27,7 +27,11 @@ COLORS = np.arange(3 * len(DOTS)).reshape(-1, 3) * 4
 def axes(heading, pitch, roll):
     """(3, 3) right, down in the picture, and ahead of a camera in an aircraft that looks down, its top to the nose."""
     h, p, r = np.radians([heading, pitch, roll])
-    forward, right, up = np.array([np.sin(h), np.cos(h), 0]), np.array([np.cos(h), -np.sin(h), 0]), np.array([0, 0, 1.0])
+    forward, right, up = (
+        np.array([np.sin(h), np.cos(h), 0]),
+        np.array([np.cos(h), -np.sin(h), 0]),
+        np.array([0, 0, 1.0]),
+    )
     nose, belly = np.cos(p) * forward + np.sin(p) * up, np.sin(p) * forward - np.cos(p) * up
     return np.stack([np.cos(r) * right + np.sin(r) * belly, -nose, np.cos(r) * belly - np.sin(r) * right])
 
@@ -54,7 +58,10 @@ def photographs(folder, project):
     return project
 
 
-def metashape(folder, kind="frame", head="", tail="", change=lambda text: text, place=None, **given):
+CHUNK = (np.eye(3), np.zeros(3), 1.0)
+
+
+def metashape(folder, kind="frame", head="", tail="", change=lambda text: text, place=CHUNK, **given):
     """Metashape manual, appendix "Camera models": u = w/2 + cx + x' f + x' B1 + y' B2, P1 with r^2 + 2 x^2."""
     zero = dict.fromkeys(("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"), 0.0)
     c = {**zero, "f": F, **given}
@@ -73,13 +80,15 @@ def metashape(folder, kind="frame", head="", tail="", change=lambda text: text, 
         u = WIDTH * 0.5 + c["cx"] + a * c["f"] + a * c["b1"] + b * c["b2"]
         return np.stack([u, HEIGHT * 0.5 + c["cy"] + b * c["f"]], 1)
 
-    matrix = np.eye(4) if place is None else place  # from the world of the dots to the frame of the chunk
+    onto, move, scale = place  # from the frame of the chunk to the world of the dots: scale * onto @ q + move
     cameras = ""
     for at, (name, (turn, centre)) in enumerate(POSES.items()):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = matrix[:3, :3] @ turn.T, matrix[:3, :3] @ centre + matrix[:3, 3]
+        pose[:3, :3], pose[:3, 3] = onto.T @ turn.T, onto.T @ (centre - move) / scale
         numbers = " ".join(repr(float(value)) for value in pose.ravel())
-        cameras += f'<camera id="{at}" sensor_id="0" component_id="0" label="{name[:-4]}"><transform>{numbers}</transform>'
+        cameras += (
+            f'<camera id="{at}" sensor_id="0" component_id="0" label="{name[:-4]}"><transform>{numbers}</transform>'
+        )
         cameras += "<orientation>1</orientation></camera>\n"
     values = "".join(f"<{key}>{value!r}</{key}>" for key, value in c.items() if value)
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
@@ -159,7 +168,7 @@ OPENMVG = {
 
 
 def openmvg(folder, kind="pinhole_radial_k3", change=lambda contents: None, centre=(WIDTH / 2 + 3, HEIGHT / 2 - 2)):
-    """openMVG's cameras: x_d = x (1 + K1 r^2 + ...) + (T2 (r^2 + 2 x^2) + 2 T1 x y); whole numbers are pixel centres."""
+    """openMVG: x_d = x (1 + K1 r^2 + ...) + (T2 (r^2 + 2 x^2) + 2 T1 x y); pixel centres are whole numbers."""
     given = OPENMVG[kind]
     values = given[1] if given else ()
     k1, k2, k3, t1, t2 = [*values[:3], *(0,) * (3 - len(values[:3])), *(values[3:] if len(values) == 5 else (0, 0))]
@@ -181,7 +190,10 @@ def openmvg(folder, kind="pinhole_radial_k3", change=lambda contents: None, cent
     def view(at, name, posed=True):
         data = {"local_path": "/", "filename": name, "width": WIDTH, "height": HEIGHT, "id_view": at}
         data |= {"id_intrinsic": 0, "id_pose": at if posed else 4294967295}
-        return {"key": at, "value": {"polymorphic_id": 1073741824, "ptr_wrapper": {"id": 2147483649 + at, "data": data}}}
+        return {
+            "key": at,
+            "value": {"polymorphic_id": 1073741824, "ptr_wrapper": {"id": 2147483649 + at, "data": data}},
+        }
 
     lens = {"width": WIDTH, "height": HEIGHT, "focal_length": F, "principal_point": list(centre)}
     lens |= {given[0]: list(values)} if given else {}
