@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from . import splats
+from . import programs, splats
 from .data import arrays, blender, colmap, lenses, matrixcity, nerfstudio, odm, pictures
 
 OUTPUT, MEMORY = "the output", "the memory"
@@ -133,6 +133,11 @@ TARGETS = {
     "blender": Target(blender, (TRAIN,), ("data/*.json",)),
     "matrixcity": Target(matrixcity, (TRAIN,), ("data/*/*/*.json",)),
     "odm": Target(odm, (TRAIN,), ("data/opensfm/*",)),
+    "bundler": Target(programs.bundler, (TRAIN, DEEP), ("data/bundle.out", "data/bundle.out", "data/list.txt")),
+    "metashape": Target(programs.metashape, (TRAIN,), ("data/cameras.xml",)),
+    "openmvg": Target(programs.openmvg, (TRAIN, DEEP), ("data/sfm_data.json",)),
+    "pix4d": Target(programs.pix4d, (TRAIN,), ("data/params/*",)),
+    "realitycapture": Target(programs.realitycapture, (TRAIN,), ("data/cameras.csv",)),
     "recipe": Target(recipe_file, (TRAIN.replace("recipe:2dgs", "recipe:{here}/r.json"),), ("r.json",)),
     "run": Target(run_folder, COMMANDS, ("out/*", "out/*", "out/pretrain/*", "out/pretrain/*")),
     "stopped-run": Target(lambda here: run_folder(here, stop="pretrain"), COMMANDS[::3], ("out/*", "out/pretrain/*")),
