@@ -125,7 +125,9 @@ TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
     "photographs": Target(colmap, (TRAIN,), ("data/images/*",)),
-    "lenses-and-masks": Target(lenses, (TRAIN, DEEP), ("data/masks/*", "data/images/*1.png", "data/sparse/0/cameras.txt")),
+    "lenses-and-masks": Target(
+        lenses, (TRAIN, DEEP), ("data/masks/*", "data/images/*1.png", "data/sparse/0/cameras.txt")
+    ),
     "depth-arrays": Target(arrays, (DEEP,), ("data/estimated_depths/*",)),
     "depth-pictures": Target(pictures, (DEEP,), ("data/sparse/0/depth_params.json", "data/depths/*")),
     "nerfstudio": Target(nerfstudio, (DEEP,), ("data/*.json", "data/*.json", "data/*.ply", "data/depth/*1.png")),

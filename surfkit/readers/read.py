@@ -253,7 +253,8 @@ def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
     emit(
         Warned(
             f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
-            "cameras and of what lies before them, which takes longer and leaves more floaters"
+            "cameras and of what lies before them, which takes longer and leaves more floaters; `surfkit prepare "
+            "points` makes a data set with points"
         )
     )
     local = np.stack([frame.local_pose(pose).numpy() for pose in poses])
