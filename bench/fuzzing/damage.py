@@ -145,7 +145,7 @@ def token(text: list[str], at: int, damage: Damage) -> None:
 
 def cell(text: list[str], at: int, damage: Damage) -> None:
     """Another value in a line with commas between, or in an element of XML."""
-    words = re.split(r"([,<>\"])", text[at])
+    words = re.split(r"([,<>\"\t])", text[at])
     words[damage.what % len(words)] = WORDS[damage.what // 7 % len(WORDS)]
     text[at] = "".join(words)
 

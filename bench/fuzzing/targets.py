@@ -134,7 +134,7 @@ TARGETS = {
     "points-as-text": Target(lambda here: nerfstudio(here, text=True), (TRAIN,), ("data/*.ply",)),
     "blender": Target(blender, (TRAIN,), ("data/*.json",)),
     "matrixcity": Target(matrixcity, (TRAIN,), ("data/*/*/*.json",)),
-    "odm": Target(odm, (TRAIN,), ("data/opensfm/*",)),
+    "odm": Target(odm, (TRAIN, DEEP), ("data/opensfm/*",)),
     "bundler": Target(programs.bundler, (TRAIN, DEEP), ("data/bundle.out", "data/bundle.out", "data/list.txt")),
     "metashape": Target(programs.metashape, (TRAIN,), ("data/cameras.xml",)),
     "openmvg": Target(programs.openmvg, (TRAIN, DEEP), ("data/sfm_data.json",)),

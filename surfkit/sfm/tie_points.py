@@ -6,7 +6,7 @@ What comes out is a COLMAP model of the same cameras, in the same coordinates, w
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,10 @@ from surfkit.readers.read import check_size, read_capture, reader_of
 from surfkit.readers.undistort import check_camera
 from surfkit.scene.photos import photo_size
 from surfkit.scene.scene import Frame
+from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine, run
-from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
 from surfkit.sfm.mapping import SMALLEST, read_model
-from surfkit.sfm.matching import contents, match, refuse_other
-from surfkit.sfm.pairs import Pair, choose_pairs
 from surfkit.sfm.photographs import Photo, look
 from surfkit.sfm.report import model_facts
 from surfkit.sfm.settings import Settings
@@ -74,24 +72,14 @@ class TiePoints:
         stages = Stages(self.work)
         photos = stages.run("photographs", "", lambda: self._look(root, shots))
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
-        folder, database = self.work / "features", self.work / "database.db"
-        counts = stages.run("features", "", lambda: find_features(photos, root, folder, self.settings))
-        rich = [photo for photo in photos if counts[photo.name] >= FEWEST]
-        made_of = contents(rich, folder, self.settings, cameras)
-        chosen = [self.settings.pairs, self.settings.neighbours, self.settings.seed]
-        key = key_of(made_of, chosen, [[photo.exif.position, photo.exif.taken] for photo in rich])
-        pairs = stages.run("pairs", key, lambda: self._pairs(rich), self._load_pairs)
-        stages.run(
-            "matches",
-            key_of(made_of, pairs),
-            lambda: match(rich, pairs, folder, database, self.settings, cameras),
-            lambda: refuse_other(database, made_of),
-        )
+        found = compare(stages, photos, root, self.work, self.settings, cameras)
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
-        key = key_of(made_of, pairs, [pose.tolist() for pose in poses.values()])
+        key = key_of(found.key, [pose.tolist() for pose in poses.values()])
         models = self.work / "points"
-        model = stages.run("points", key, lambda: self._triangulate(database, poses), lambda: read_model(models / "0"))
+        model = stages.run(
+            "points", key, lambda: self._triangulate(found.database, poses), lambda: read_model(models / "0")
+        )
         if model.num_points3D() == 0:
             raise BadInput(
                 f"{self.data.path}: not one point could be triangulated: the photographs share no features that fit "
@@ -138,19 +126,6 @@ class TiePoints:
                 f"{root}: {len(usable)} of {len(shots)} photographs can be used; {SMALLEST} or more are needed"
             )
         return usable
-
-    def _pairs(self, photos: Sequence[Photo]) -> list[Pair]:
-        folder = self.work / "features"
-
-        def descriptors(at: int) -> np.ndarray:
-            return read_features(feature_file(folder, photos[at], self.settings)).descriptors
-
-        pairs = choose_pairs(photos, self.settings, descriptors)
-        write_json(self.work / "pairs.json", pairs)
-        return pairs
-
-    def _load_pairs(self) -> list[Pair]:
-        return list(read_json(self.work / "pairs.json", tuple[Pair, ...]))
 
     def _triangulate(self, database: Path, poses: Mapping[str, np.ndarray]) -> Any:
         """The model with points between the cameras, kept in `points/`."""

@@ -311,6 +311,7 @@ def entry(*path, value):
         (partial(bundler, change=words("5 20", "50 20")), "cut off: numbers of"),
         (partial(bundler, change=words("190 -0.1", "x -0.1")), "something that is no number lies among the numbers"),
         (partial(bundler, change=words("190 -0.1", "nan -0.1")), "camera of 'IMG 1.png': focal length nan"),
+        (partial(bundler, change=words("190 -0.1", "1e-320 -0.1")), "camera .* of IMG 1.png has size 220 x 160"),
         (partial(bundler, listed=lambda name: "" if "9" in name else name), "names 4 photographs, bundle.out has 5"),
         (partial(openmvg, change=entry("extrinsics", value=[])), "sfm_data.json: no extrinsics in it; reconstruct"),
         (partial(openmvg, change=entry("views", 0, "value", value=[])), "damaged, or not of OpenMVG: TypeError"),
