@@ -1,7 +1,5 @@
 """`surfkit prepare points`: points between cameras that are known, of a scene of known shape."""
 
-import json
-
 import numpy as np
 import pytest
 from needs import needs_native
@@ -9,7 +7,6 @@ from needs import needs_native
 from surfkit.cli import main
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
-from surfkit.run.notes import collect_notes
 from surfkit.sfm import features, matching, tie_points
 from surfkit.testing.synthetic import SURFACES
 
@@ -113,10 +110,46 @@ def test_cameras_of_other_photographs_are_noticed(tmp_path, capsys):
     assert "are these the cameras of these photographs?" in capsys.readouterr().err
 
 
-def test_what_is_not_taken_over_is_told(prepared, tmp_path, capsys):
+def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, capsys):
+    """Cameras of Bundler without points, of photographs through a lens, with masks."""
+    from scipy.ndimage import map_coordinates
+
+    k1, folder, lines = -0.12, tmp_path / "data", ["# Bundle file v0.3", f"{len(POSES)} 0"]
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    away = np.hypot(x, y) / FOCAL  # of a pixel in the photograph; the ray that it shows is found by iteration
+    ray = away.copy()
+    for _ in range(50):
+        ray = away / (1 + k1 * ray**2)
+    factor = ray / np.maximum(away, 1e-9)
+    for name, pose in POSES.items():
+        wide = picture(pose, width=WIDTH + 40, height=HEIGHT + 40).astype(float)[..., 0]
+        at = np.stack([y * factor + HEIGHT / 2 + 20 - 0.5, x * factor + WIDTH / 2 + 20 - 0.5])
+        bent = map_coordinates(wide, at, order=1).round().astype(np.uint8)
+        save(folder / "images" / name, np.repeat(bent[..., None], 3, 2))
+        turn = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3]
+        move = np.diag([1.0, -1.0, -1.0]) @ pose[:3, 3] - turn @ OFFSET
+        rows = [(FOCAL, k1, 0.0), *turn, move]
+        lines += [" ".join(repr(float(value)) for value in row) for row in rows]
+    save(folder / "masks/view 0.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+    (folder / "bundle.out").write_text("\n".join(lines) + "\n")
+    (folder / "list.txt").write_text("".join(f"{name}\n" for name in POSES))
+    assert main(["prepare", "points", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    assert "1 masks are not taken over" in capsys.readouterr().err
+    scene = read(Data(tmp_path / "s", test_every=0))
+    assert (scene.frame.crs, scene.frame.metres) == (None, None)
+    for view in scene.train:
+        pose, true = scene.frame.input_pose(view.camera.world_to_camera), POSES[view.name]
+        np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], OFFSET - true[:3, :3].T @ true[:3, 3], atol=1e-4)
+    xyz = scene.frame.to_input(scene.cloud.xyz.numpy()) - OFFSET
+    off = np.min([surface.distance(xyz) for surface in SURFACES], axis=0)
+    assert len(xyz) > 200 and np.median(off) < 0.04 and np.percentile(off, 90) < 0.3
+
+
+def test_what_is_refused(prepared, tmp_path, capsys):
     assert main(["prepare", "points", str(prepared), "--out", str(prepared / "s")]) == 2
     assert "lies in the data set" in capsys.readouterr().err
     assert main(["prepare", "points", str(tmp_path)]) == 2
     assert "the folder is empty" in capsys.readouterr().err
-    assert json.loads((prepared.parent / "data-scene/report.json").read_text())["registered"] == 5
-    assert collect_notes
+    save(tmp_path / "a.jpg", picture(arc(1)[0]))
+    assert main(["prepare", "points", str(tmp_path)]) == 2
+    assert f"`surfkit prepare photos {tmp_path}` finds the cameras" in capsys.readouterr().err
