@@ -82,12 +82,10 @@ class _Bundle:
         """The files of a data set, or BadInput."""
         files = _files(data.path)
         if len(files) != 1:
-            what = (
-                f"several bundle files: {', '.join(file.name for file in files)}; leave one"
-                if files
-                else "no bundle.out"
+            names = ", ".join(file.name for file in files)
+            raise BadInput(
+                f"{data.path}: " + (f"several bundle files: {names}; leave one" if files else "no bundle.out")
             )
-            raise BadInput(f"{data.path}: {what}")
         path = files[0]
         values = _values(path)
         cameras, points = (_count(path, value, len(values)) for value in values[:2])
@@ -109,12 +107,13 @@ class _Bundle:
 
     def shots(self, data: Data) -> list[Shot]:
         """The photographs with a camera."""
-        placed = [name for name, camera in zip(self.names, self.cameras, strict=True) if camera[0, 0] != 0]
-        without = [name for name in self.names if name not in set(placed)]
+        has = self.cameras[:, 0, 0] != 0
+        placed = [name for name, there in zip(self.names, has, strict=True) if there]
+        without = [name for name, there in zip(self.names, has, strict=True) if not there]
         leave_out(self.path, without, len(self.names), "have no camera (focal length 0)")
         found, shots = photographs(data, placed), []
-        for name, camera in zip(self.names, self.cameras, strict=True):
-            if name in found:
+        for name, camera, there in zip(self.names, self.cameras, has, strict=True):
+            if there and name in found:
                 with leaving_out():
                     shots.append(self._shot(name, camera, found[name]))
         return shots

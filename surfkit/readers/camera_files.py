@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -69,8 +70,7 @@ def photographs(data: Data, names: Sequence[str]) -> dict[str, Path]:
     """
     own = data.images or Path("images")
     folder = data.path / own if data.images or (data.path / own).is_dir() else data.path
-    if len(set(names)) < len(names):
-        twice = sorted({name for name in names if names.count(name) > 1})
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         reject(
             BadInput(f"{data.path}: {few(twice)} stand for two photographs each; give photographs names of their own")
         )

@@ -8,6 +8,7 @@ Lenses are those of the Metashape manual, appendix "Camera models".
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -63,8 +64,6 @@ class Metashape(Reader):
                 lens = lenses.camera(f"{path}: sensor {number}", known[number])
                 shots.append(Shot(label, _pose(f"{path}: camera {label!r}", camera), lens, found[label]))
         lenses.tell()
-        if any("rolling_shutter" in part.tag for part in chunk.iter()):
-            emit(Warned(f"{path}: it has been compensated for a rolling shutter, which is not modelled here"))
         return _placed(path, chunk, cameras[0].get("component_id"), Capture(shots, *points(data.path, {})))
 
 
@@ -104,20 +103,22 @@ def _chunk(path: Path) -> ElementTree.Element:
 
 def _cameras(path: Path, chunk: ElementTree.Element) -> list[ElementTree.Element]:
     """Those of the largest component that are enabled and have a pose."""
+
+    def keep(
+        cameras: list[ElementTree.Element], good: Callable[[ElementTree.Element], bool], why: str
+    ) -> list[ElementTree.Element]:
+        leave_out(path, [camera.get("label", "") for camera in cameras if not good(camera)], len(cameras), why)
+        return [camera for camera in cameras if good(camera)]
+
     listed = chunk.findall("cameras//camera")
-    enabled = [camera for camera in listed if camera.get("enabled", "true").lower() not in NO]
-    posed = [camera for camera in enabled if camera.find("transform") is not None]
-    off = [camera.get("label", "") for camera in listed if camera not in enabled]
-    leave_out(path, off, len(listed), "are disabled")
-    lost = [camera.get("label", "") for camera in enabled if camera.find("transform") is None]
-    leave_out(path, lost, len(enabled), "have no pose of their own (not aligned, or slaves of another camera)")
+    enabled = keep(listed, lambda camera: camera.get("enabled", "true").lower() not in NO, "are disabled")
+    why = "have no pose of their own (not aligned, or slaves of another camera)"
+    posed = keep(enabled, lambda camera: camera.find("transform") is not None, why)
     if not posed:
         raise BadInput(f"{path}: no camera in it; align the photographs, and export the cameras again")
-    parts = Counter(camera.get("component_id") for camera in posed)
-    largest = parts.most_common(1)[0][0]
-    apart = [camera.get("label", "") for camera in posed if camera.get("component_id") != largest]
-    leave_out(path, apart, len(posed), "are in another component, not aligned with the largest")
-    return [camera for camera in posed if camera.get("component_id") == largest]
+    largest = Counter(camera.get("component_id") for camera in posed).most_common(1)[0][0]
+    why = "are in another component, not aligned with the largest"
+    return keep(posed, lambda camera: camera.get("component_id") == largest, why)
 
 
 def _pose(where: str, camera: ElementTree.Element) -> np.ndarray:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -30,7 +30,7 @@ from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine, run
 from surfkit.sfm.mapping import SMALLEST, read_model
-from surfkit.sfm.photographs import Photo, look
+from surfkit.sfm.photographs import Photo, is_copy, look, mark_copies
 from surfkit.sfm.report import model_facts
 from surfkit.sfm.settings import Settings
 from surfkit.sfm.stages import Stages, key_of
@@ -66,8 +66,9 @@ class TiePoints:
         """
         load_engine()
         capture = read_capture(self.data, reader_of(self.data))
-        root = Path(os.path.commonpath([shot.path.resolve().parent for shot in capture.shots]))
-        shots = {shot.path.resolve().relative_to(root).as_posix(): shot for shot in capture.shots}
+        paths = [Path(os.path.abspath(shot.path)) for shot in capture.shots]
+        root = Path(os.path.commonpath([path.parent for path in paths]))
+        shots = {path.relative_to(root).as_posix(): shot for path, shot in zip(paths, capture.shots, strict=True)}
         self._warn(capture, root)
         stages = Stages(self.work)
         photos = stages.run("photographs", "", lambda: self._look(root, shots))
@@ -95,6 +96,7 @@ class TiePoints:
             "registered": model.num_reg_images(),
             "models": [model_facts(model, None)],
             "seconds": stages.seconds(),
+            "settings": self.settings,
         }
         write_json(self.scene / REPORT, report)
         return report
@@ -116,7 +118,8 @@ class TiePoints:
             known = read_json(path, tuple[Photo, ...])
         except BadInput:
             known = ()
-        photos = [photo for photo in look(root, known) if photo.name in shots]
+        found = [photo for photo in look(root, known) if photo.name in shots]
+        photos = mark_copies([replace(photo, problem=None) if is_copy(photo) else photo for photo in found])
         write_json(path, photos)
         if wrong := [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]:
             emit(Warned(f"{len(wrong)} of {len(photos)} photographs cannot be used, and are left out: {few(wrong)}"))

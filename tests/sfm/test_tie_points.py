@@ -1,5 +1,7 @@
 """`surfkit prepare points`: points between cameras that are known, of a scene of known shape."""
 
+import shutil
+
 import numpy as np
 import pytest
 from needs import needs_native
@@ -130,6 +132,7 @@ def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, capsys):
         move = np.diag([1.0, -1.0, -1.0]) @ pose[:3, 3] - turn @ OFFSET
         rows = [(FOCAL, k1, 0.0), *turn, move]
         lines += [" ".join(repr(float(value)) for value in row) for row in rows]
+    shutil.copy(folder / "images/view 0.jpg", folder / "images/a copy.jpg")  # without a camera
     save(folder / "masks/view 0.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
     (folder / "bundle.out").write_text("\n".join(lines) + "\n")
     (folder / "list.txt").write_text("".join(f"{name}\n" for name in POSES))
@@ -137,6 +140,7 @@ def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, capsys):
     assert "1 masks are not taken over" in capsys.readouterr().err
     scene = read(Data(tmp_path / "s", test_every=0))
     assert (scene.frame.crs, scene.frame.metres) == (None, None)
+    assert [view.name for view in scene.train] == list(POSES)
     for view in scene.train:
         pose, true = scene.frame.input_pose(view.camera.world_to_camera), POSES[view.name]
         np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], OFFSET - true[:3, :3].T @ true[:3, 3], atol=1e-4)
