@@ -359,3 +359,16 @@ def test_photographs_beside_the_cameras_or_elsewhere(tmp_path):
     for path in (tmp_path / "flight").iterdir():
         path.rename(tmp_path / path.name)
     assert len(read(Data(tmp_path, test_every=0)).train) == 4
+
+
+def test_where_a_bundle_file_and_its_list_may_lie(tmp_path):
+    bundler(tmp_path)
+    (tmp_path / "bundle.out").rename(tmp_path / "flight.bundle.out")  # as COLMAP names them
+    (tmp_path / "list.txt").rename(tmp_path / "flight.list.txt")
+    assert len(read(Data(tmp_path, test_every=0)).train) == 4
+    (tmp_path / "bundle").mkdir()
+    (tmp_path / "flight.bundle.out").rename(tmp_path / "bundle/bundle.out")  # as Bundler does
+    with pytest.raises(BadInput, match="no list of the photographs beside it; put list.txt there"):
+        read(Data(tmp_path))
+    (tmp_path / "flight.list.txt").rename(tmp_path / "list.txt")
+    assert len(read(Data(tmp_path, test_every=0)).train) == 4
