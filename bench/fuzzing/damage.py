@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import struct
 import zlib
@@ -140,6 +141,13 @@ def token(text: list[str], at: int, damage: Damage) -> None:
     words = text[at].split(" ")
     words[damage.what % len(words)] = WORDS[damage.what // 7 % len(WORDS)]
     text[at] = " ".join(words)
+
+
+def cell(text: list[str], at: int, damage: Damage) -> None:
+    """Another value in a line with commas between, or in an element of XML."""
+    words = re.split(r"([,<>\"\t])", text[at])
+    words[damage.what % len(words)] = WORDS[damage.what // 7 % len(WORDS)]
+    text[at] = "".join(words)
 
 
 def node(data: Any, damage: Damage) -> Any:
@@ -314,6 +322,11 @@ BY_ENDING = {
         *[splats.inside_surfkit(somewhere)] * 12,
     ),
     ".txt": TEXT,
+    ".out": TEXT,
+    ".xyz": TEXT,
+    ".csv": (*TEXT, *[lines(cell)] * 6),
+    ".prj": (*TEXT, *[lines(cell)] * 6),
+    ".xml": (*TEXT, *[lines(cell)] * 6),
     ".ply": TEXT,
     ".jsonl": (*TEXT, *[event] * 6),
     ".json": (*[tree] * 12, *[shape] * 3, lines(token)),

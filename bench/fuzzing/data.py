@@ -179,3 +179,11 @@ def odm(here: Path) -> None:
     (data / "opensfm").mkdir()
     model = [{"cameras": {"c": camera}, "shots": shots, "points": points}]
     (data / "opensfm" / "reconstruction.json").write_text(json.dumps(model))
+    lines = ["OPENSFM_TRACKS_VERSION_v2"]
+    for view in [*made.scene.train, *made.scene.held_out]:
+        pose = made.scene.frame.input_pose(view.camera.world_to_camera)
+        x, y, z = (np.array(xyz) @ pose[:3, :3].T + pose[:3, 3]).T
+        for at, (u, v) in enumerate(zip((lens.fx * x / z).tolist(), (lens.fy * y / z).tolist(), strict=True)):
+            place = ((u + lens.cx - 12) / 24, (v + lens.cy - 9) / 24)
+            lines.append("\t".join([view.name, str(at), "0", *map(repr, place), "0.001", "1", "2", "3", "-1", "-1"]))
+    (data / "opensfm" / "tracks.csv").write_text("\n".join(lines) + "\n")

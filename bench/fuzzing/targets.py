@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from . import splats
+from . import programs, splats
 from .data import arrays, blender, colmap, lenses, matrixcity, nerfstudio, odm, pictures
 
 OUTPUT, MEMORY = "the output", "the memory"
@@ -125,14 +125,21 @@ TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
     "photographs": Target(colmap, (TRAIN,), ("data/images/*",)),
-    "lenses-and-masks": Target(lenses, (TRAIN,), ("data/masks/*", "data/images/*1.png", "data/sparse/0/cameras.txt")),
+    "lenses-and-masks": Target(
+        lenses, (TRAIN, DEEP), ("data/masks/*", "data/images/*1.png", "data/sparse/0/cameras.txt")
+    ),
     "depth-arrays": Target(arrays, (DEEP,), ("data/estimated_depths/*",)),
     "depth-pictures": Target(pictures, (DEEP,), ("data/sparse/0/depth_params.json", "data/depths/*")),
     "nerfstudio": Target(nerfstudio, (DEEP,), ("data/*.json", "data/*.json", "data/*.ply", "data/depth/*1.png")),
     "points-as-text": Target(lambda here: nerfstudio(here, text=True), (TRAIN,), ("data/*.ply",)),
     "blender": Target(blender, (TRAIN,), ("data/*.json",)),
     "matrixcity": Target(matrixcity, (TRAIN,), ("data/*/*/*.json",)),
-    "odm": Target(odm, (TRAIN,), ("data/opensfm/*",)),
+    "odm": Target(odm, (TRAIN, DEEP), ("data/opensfm/*",)),
+    "bundler": Target(programs.bundler, (TRAIN, DEEP), ("data/bundle.out", "data/bundle.out", "data/list.txt")),
+    "metashape": Target(programs.metashape, (TRAIN,), ("data/cameras.xml",)),
+    "openmvg": Target(programs.openmvg, (TRAIN, DEEP), ("data/sfm_data.json",)),
+    "pix4d": Target(programs.pix4d, (TRAIN,), ("data/params/*",)),
+    "realitycapture": Target(programs.realitycapture, (TRAIN,), ("data/cameras.csv",)),
     "recipe": Target(recipe_file, (TRAIN.replace("recipe:2dgs", "recipe:{here}/r.json"),), ("r.json",)),
     "run": Target(run_folder, COMMANDS, ("out/*", "out/*", "out/pretrain/*", "out/pretrain/*")),
     "stopped-run": Target(lambda here: run_folder(here, stop="pretrain"), COMMANDS[::3], ("out/*", "out/pretrain/*")),

@@ -35,7 +35,7 @@ COMMANDS = {
     "report": "Write a report of runs or of an ablation table as one HTML file.",
     "import": "Take splats from a file of any program, to measure, mesh or export them like those of a run.",
     "export": "Write the splats of a run or of a file in another format, for other programs.",
-    "prepare": "Find the cameras of photographs, or estimate depth: `prepare photos`, `prepare depth`.",
+    "prepare": "Find cameras, points or depth: `prepare photos`, `prepare points`, `prepare depth`.",
     "ablate": "Train every row of an ablation table, and compare the rows.",
     "tables": "List the ablation tables that `surfkit ablate` accepts, or the rows of one.",
     "recipes": "List the recipes that `surfkit train recipe:NAME` accepts.",

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.prepare_photos import Photos
+from surfkit.cli.prepare_points import Points
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
@@ -139,4 +140,4 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
         write_picture(path, torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], dim=1))
 
 
-COMMAND = {"depth": Depth, "photos": Photos}
+COMMAND = {"depth": Depth, "photos": Photos, "points": Points}

@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
+from surfkit.core.codec import load, read_json
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.run.notes import collect_notes
@@ -40,10 +41,14 @@ class Photos:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
     """How cameras are found."""
 
+    @property
+    def scene(self) -> Path:
+        """The folder of the data set."""
+        return self.out or self.photos.resolve().with_name(f"{self.photos.resolve().name}-scene")
+
     def run(self) -> None:
         """Prepare, and print the results."""
-        root = self.photos
-        scene = self.out or root.resolve().with_name(f"{root.resolve().name}-scene")
+        root, scene = self.photos, self.scene
         if not root.is_dir():
             raise BadInput(f"{root}: {'a file' if root.exists() else 'no such folder'}; name a folder of photographs")
         refuse_overlap(root, scene)
@@ -52,6 +57,17 @@ class Photos:
             sweep(scene)
             report = Preparation(root, scene, self.settings).run()
         show(report, scene)
+
+
+def settings_of(scene: Path) -> Settings:
+    """The settings that a scene was prepared with; the usual ones where none is complete."""
+    report = scene / REPORT
+    if not (scene / WORK).is_dir() or not report.is_file():
+        return Settings()
+    try:
+        return load(Settings, read_json(report, dict[str, Any])["settings"])
+    except (BadInput, KeyError) as error:
+        raise BadInput(f"{report}: damaged, or of another version; delete it to prepare the scene again") from error
 
 
 def refuse_overlap(root: Path, scene: Path) -> None:

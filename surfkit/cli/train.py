@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,7 @@ import tyro
 
 import surfkit
 from surfkit.blocks.schedule import Compute
+from surfkit.cli.prepare_photos import Photos, settings_of
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -21,6 +22,7 @@ from surfkit.execute.base import Executor, Inline
 from surfkit.pipeline import run, with_steps
 from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
+from surfkit.readers.read import bare_photographs
 from surfkit.recipe import Recipe, unused
 from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run
@@ -97,9 +99,13 @@ class Train:
     """Also keep photographs that do not fit into the cache on disk, decoded and resized, in DATA/resized. It saves time
     when large photographs are used at a much smaller size. It does not change the result."""
 
-    prepare: bool = True
-    """Estimate depth maps automatically if the recipe uses them and the data set has none. They are kept in
-    $SURFKIT_CACHE, or ~/.cache/surfkit, for later runs."""
+    prepare: tyro.conf.FlagCreatePairsOff[bool] = False
+    """If --data is a folder of photographs without cameras, find their cameras first, as `surfkit prepare photos` does,
+    and train on the data set that this writes beside the folder."""
+
+    no_prepare: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Estimate no depth maps. Otherwise they are estimated if the recipe uses them and the data set has none, and kept
+    in $SURFKIT_CACHE, or ~/.cache/surfkit, for later runs."""
 
     prepare_cache: str = "20GB"
     """Disk space for these depth maps, of all data sets together; when they take more, the least recently used are
@@ -111,6 +117,8 @@ class Train:
         object.__setattr__(self, "recipe", settled(self.recipe))
         if self.pictures_every and not self.recipe.has_stages:
             raise BadInput(unused(self.recipe, f"--pictures-every {self.pictures_every}"))
+        if self.prepare and self.no_prepare:
+            raise BadInput("--prepare makes what is missing, and --no-prepare makes no depth maps; give one")
         if self.checkpoint_every < 1:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         if self.pictures_every is not None and self.pictures_every < 0:
@@ -125,16 +133,28 @@ class Train:
 
     def run(self) -> None:
         """Train, and print the results."""
-        data = self.reading.of(self._data())
+        data = self.reading.of(self._with_cameras(self._data()))
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with tensorboard(out) if self.tensorboard else nullcontext():
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
             caches = CacheSettings(
-                self.cache, self.resized_copies, self.prepare_cache if self.prepare else None, self.gpu_cache
+                self.cache, self.resized_copies, None if self.no_prepare else self.prepare_cache, self.gpu_cache
             )
             metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
+
+    def _with_cameras(self, data: Path) -> Path:
+        """The data set; with --prepare, that of a folder of photographs, made now or taken up where it was left."""
+        photos = bare_photographs(data) if self.prepare and self.reading.layout is None else None
+        if photos is None:
+            return data
+        if self.reading.images is not None:
+            raise BadInput(f"--images {self.reading.images} with --prepare: name the folder of photographs with --data")
+        preparation = Photos(photos)
+        preparation = replace(preparation, settings=settings_of(preparation.scene))
+        preparation.run()
+        return preparation.scene
 
     def _data(self) -> Path:
         if self.data is not None:

@@ -96,7 +96,7 @@ class Preparation:
         if self.estimator.matched and not any(len(seen.points) for seen in tracks.seen.values()):
             raise BadInput(
                 f"{self.data.path}: no photograph of the sparse model observes any point, which says what to compare; "
-                "triangulate it in COLMAP"
+                f"`surfkit prepare points {self.data.path}` makes a data set with such points"
             )
 
     def begin(self, scene: Scene, again: bool) -> list[int]:

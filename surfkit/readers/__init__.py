@@ -5,13 +5,29 @@ from surfkit.core.registry import hookimpl
 
 @hookimpl
 def surfkit_components():
+    from surfkit.readers.bundler import Bundler
     from surfkit.readers.colmap import COLMAP
     from surfkit.readers.depth_layouts import EstimatedDepths, HierarchicalDepths, MatrixCityDepths, NerfstudioDepths
+    from surfkit.readers.metashape import Metashape
+    from surfkit.readers.openmvg import OpenMVG
     from surfkit.readers.opensfm import ODM
+    from surfkit.readers.pix4d import Pix4D
+    from surfkit.readers.realitycapture import RealityCapture
     from surfkit.readers.split import GauUScene
     from surfkit.readers.transforms import Blender, MatrixCity, Nerfstudio
 
-    readers = {"blender": Blender, "colmap": COLMAP, "matrixcity": MatrixCity, "nerfstudio": Nerfstudio, "odm": ODM}
+    readers = {
+        "blender": Blender,
+        "bundler": Bundler,
+        "colmap": COLMAP,
+        "matrixcity": MatrixCity,
+        "metashape": Metashape,
+        "nerfstudio": Nerfstudio,
+        "odm": ODM,
+        "openmvg": OpenMVG,
+        "pix4d": Pix4D,
+        "realitycapture": RealityCapture,
+    }
     depths = {
         "estimated-depths": EstimatedDepths,
         "hierarchical-3dgs": HierarchicalDepths,

@@ -13,7 +13,8 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
-from surfkit.readers.capture import Capture, Shot, camera_of
+from surfkit.readers.camera_files import read_text, tracks_of
+from surfkit.readers.capture import Capture, Shot, Tracks, camera_of
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
 from surfkit.scene.names import find_files
@@ -21,6 +22,8 @@ from surfkit.scene.names import find_files
 PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
 """Where the reconstruction may lie, the first that is there wins. OpenDroneMap puts one on the map in the place of the
 second, by an affine map that no pose can follow: cameras and points no longer fit. So the topocentric one is moved."""
+TRACKS = "tracks.csv"
+"""Beside the reconstruction: which photograph shows which point where."""
 LENSES = {
     "perspective": ("RADIAL", ("k1", "k2")),
     "simple_radial": ("SIMPLE_RADIAL", ("k1",)),
@@ -40,29 +43,69 @@ class ODM(Reader):
         return any((root / place).is_file() for place in PLACES)
 
     def read(self, data: Data) -> Capture:
-        path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[1])
-        model = _largest(path, read_json(path, Any))
-        names = sorted(model["shots"])
-        folder = data.path / (data.images or "images")
-        found = find_files(folder, names)
-        if missing := [name for name in names if name not in found]:
-            text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}; put them there"
-            reject(BadInput(text))
+        return _read(data)[0]
+
+    def tracks(self, data: Data) -> Tracks | None:
+        capture, rows, folder = _read(data)
+        path = folder / TRACKS
+        return tracks_of(capture.shots, capture.xyz, _seen(path, capture, rows)) if path.is_file() else None
+
+
+def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
+    """What is in a project, the row of each point by its number, and the folder of the reconstruction."""
+    path = next((data.path / place for place in PLACES if (data.path / place).is_file()), data.path / PLACES[1])
+    model = _largest(path, read_json(path, Any))
+    names = sorted(model["shots"])
+    folder = data.path / (data.images or "images")
+    found = find_files(folder, names)
+    if missing := [name for name in names if name not in found]:
+        text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}; put them there"
+        reject(BadInput(text))
+    try:
+        cameras = {name: _camera(f"{path}: camera {name!r}", lens) for name, lens in model["cameras"].items()}
+        shots = []
+        for name in names:
+            with leaving_out():
+                shots.append(_shot(name, model["shots"][name], cameras, found.get(name, folder / name)))
+        listed = model.get("points", {})
+        points = list(listed.values())
+        xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
+        rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
+    except BadInput:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
+    good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+    rows = {number: row for row, number in enumerate(number for number, fine in zip(listed, good, strict=True) if fine)}
+    capture = Capture(shots, xyz[good], rgb[good].astype(np.uint8))
+    return _on_earth(capture, data.path, path.parent, model), rows, path.parent
+
+
+def _seen(path: Path, capture: Capture, rows: Mapping[str, int]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Rows of the points of each photograph, and their pixels, from OpenSfM's table of tracks.
+
+    Its columns are photograph, track, feature, x and y, with tabs between; x and y are counted from the middle, as
+    shares of the longer side.
+    """
+    sizes = {shot.name: (shot.camera.width, shot.camera.height) for shot in capture.shots}
+    seen: dict[str, tuple[list[int], list[tuple[str, str]]]] = {name: ([], []) for name in sizes}
+    for line in read_text(path).splitlines():
+        words = line.split("\t", 5)
+        if len(words) > 4 and words[0] in seen and words[1] in rows:
+            seen[words[0]][0].append(rows[words[1]])
+            seen[words[0]][1].append((words[3], words[4]))
+    found = {}
+    for name, (at, places) in seen.items():
         try:
-            cameras = {name: _camera(f"{path}: camera {name!r}", lens) for name, lens in model["cameras"].items()}
-            shots = []
-            for name in names:
-                with leaving_out():
-                    shots.append(_shot(name, model["shots"][name], cameras, found.get(name, folder / name)))
-            points = list(model.get("points", {}).values())
-            xyz = np.array([point["coordinates"] for point in points], np.float64).reshape(-1, 3)
-            rgb = np.array([point["color"] for point in points], np.float64).reshape(-1, 3).clip(0, 255)
-        except BadInput:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
-        good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
-        return _on_earth(Capture(shots, xyz[good], rgb[good].astype(np.uint8)), data.path, path.parent, model)
+            shares = np.array(places, np.float64).reshape(-1, 2)
+        except ValueError as error:
+            raise BadInput(
+                f"{path}: a place in {name!r} is no number; run OpenSfM again, or delete the file"
+            ) from error
+        good = np.isfinite(shares).all(1)
+        pixels = shares * max(sizes[name]) + np.array(sizes[name]) / 2
+        found[name] = (np.array(at, np.int64)[good], pixels[good])
+    return found
 
 
 def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, Any]) -> Capture:

@@ -124,18 +124,21 @@ def reader_of(data: Data) -> Reader:
     first = {name: reader for name, reader in fitting.items() if reader.priority == highest}
     if len(first) > 1:
         raise BadInput(f"{root}: could be of layout {' or '.join(first)}; choose one with --layout")
-    if not first and (photos := _bare_photographs(root)):
+    if not first and (photos := bare_photographs(root)):
         raise BadInput(
             f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
-            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set"
+            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, "
+            "as `surfkit train --prepare` does first"
         )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
 
 
-def _bare_photographs(root: Path) -> Path | None:
-    """The folder of photographs, of a data set that has nothing else: itself, or its images/."""
+def bare_photographs(root: Path) -> Path | None:
+    """The folder of photographs, where no reader recognises `root` and it has some: its images/, or itself."""
+    if not root.is_dir() or _fitting(root):
+        return None
     for folder in (root / "images", root):
-        if folder.is_dir() and any(path.suffix.lower() in PICTURES for path in folder.iterdir()):
+        if folder.is_dir() and any(path.suffix.lower() in PICTURES for path in folder.rglob("*")):
             return folder
     return None
 
@@ -250,7 +253,8 @@ def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
     emit(
         Warned(
             f"the data set has no sparse points: training starts from {RANDOM_POINTS} random ones in the box of the "
-            "cameras and of what lies before them, which takes longer and leaves more floaters"
+            "cameras and of what lies before them, which takes longer and leaves more floaters; `surfkit prepare "
+            "points` makes a data set with points"
         )
     )
     local = np.stack([frame.local_pose(pose).numpy() for pose in poses])

@@ -24,6 +24,8 @@ FOLDER = "undistorted"
 RECIPE = "1"
 """Changes when the same photograph would come out otherwise: what is on disk is then made again."""
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+SHORTEST_PX = 1e-6
+"""Shorter focal lengths are a mistake."""
 POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are pinholes when all their coefficients are 0."""
 
@@ -62,7 +64,7 @@ def check_camera(camera: Any, name: str) -> None:
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
     if not len(camera.focal_length_idxs()):
         raise BadInput(f"{where} has model {camera.model.name}, a panorama; cut it into perspective photographs")
-    if not all(camera.params[i] > 0 for i in camera.focal_length_idxs()):
+    if not all(camera.params[i] > SHORTEST_PX for i in camera.focal_length_idxs()):
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
 
 

@@ -8,6 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.readers.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
+from surfkit.readers.read import observations
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.start.base import InitialModel, StartInput
@@ -73,4 +74,6 @@ def remedy(run: Run, scene: Scene) -> str:
         return "see whether photographs and cameras belong together, and which points they share"
     if prior_files(run.data, scene):
         return f"make others with `surfkit prepare depth {run.data.path} {WITH_NORMALS} --again`"
+    if observations(run.data, scene).is_empty:
+        return f"`surfkit prepare points {run.data.path}` makes a data set with the points that stereo needs"
     return f"make some with `surfkit prepare depth {run.data.path}`, let the run make them with depth:patch-match"

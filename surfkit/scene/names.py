@@ -12,7 +12,7 @@ T = TypeVar("T")
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"})
 SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
     lambda path: str(path).lower(),
-    lambda path: str(path.with_suffix("")).lower(),
+    lambda path: str(path).removesuffix(path.suffix).lower(),
     lambda path: path.name.lower(),
     lambda path: path.stem.lower(),
 )

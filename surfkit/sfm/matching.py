@@ -49,14 +49,25 @@ class Contents:
     seed: int
 
 
-def contents(photos: Sequence[Photo], folder: Path, settings: Settings) -> Contents:
-    """What the database of photographs is to be made from."""
+def contents(
+    photos: Sequence[Photo], folder: Path, settings: Settings, cameras: Mapping[str, Any] | None = None
+) -> Contents:
+    """What the database of photographs is to be made from; `cameras` as for `match`."""
     features = {photo.name: feature_file(folder, photo, settings).name for photo in photos}
     lenses = {photo.name: f"{settings.lens} {photo.exif.camera} {photo.size} {photo.exif.focal_px}" for photo in photos}
+    if cameras is not None:
+        lenses = {photo.name: str(cameras[photo.name]) for photo in photos}
     return Contents(features, lenses, settings.seed)
 
 
-def match(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, database: Path, settings: Settings) -> None:
+def match(
+    photos: Sequence[Photo],
+    pairs: Sequence[Pair],
+    features: Path,
+    database: Path,
+    settings: Settings,
+    cameras: Mapping[str, Any] | None = None,
+) -> None:
     """Write the database, with all pairs compared; pairs that an earlier call has compared are not again.
 
     Args:
@@ -65,12 +76,13 @@ def match(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, databa
         features: Folder of features.
         database: The file.
         settings: How.
+        cameras: pycolmap.Camera of each photograph, by its name; None where they are still to be found.
     """
-    engine = load_engine()
+    engine, wanted = load_engine(), contents(photos, features, settings, cameras)
     try:
-        refuse_other(database, contents(photos, features, settings))
+        refuse_other(database, wanted)
     except BadInput:
-        _begin(photos, pairs, features, database, settings)
+        _begin(photos, pairs, features, database, settings, cameras)
     file = database.with_name("pairs.txt")
     for start in range(0, len(pairs), BATCH):
         batch = pairs[start : start + BATCH]
@@ -119,9 +131,16 @@ def _record(database: Path) -> Path:
     return database.with_suffix(".json")
 
 
-def _begin(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, database: Path, settings: Settings) -> None:
+def _begin(
+    photos: Sequence[Photo],
+    pairs: Sequence[Pair],
+    features: Path,
+    database: Path,
+    settings: Settings,
+    cameras: Mapping[str, Any] | None,
+) -> None:
     """Write a database of the photographs and their features, with what the one before knows of unchanged pairs."""
-    engine, wanted = load_engine(), contents(photos, features, settings)
+    engine, wanted = load_engine(), contents(photos, features, settings, cameras)
     named = [(photos[one].name, photos[two].name) for one, two in pairs]
     new = database.with_name("new.db")
     for rest in database.parent.glob("new.db*"):
@@ -129,7 +148,7 @@ def _begin(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, datab
     opened = engine.Database.open(new)
     try:
         with engine.DatabaseTransaction(opened):
-            numbers = _write_photos(engine, opened, photos, features, settings)
+            numbers = _write_photos(engine, opened, photos, features, settings, cameras)
             _take_over(opened, numbers, named, database, wanted)
     finally:
         opened.close()
@@ -141,15 +160,22 @@ def _begin(photos: Sequence[Photo], pairs: Sequence[Pair], features: Path, datab
 
 
 def _write_photos(
-    engine: Any, opened: Any, photos: Sequence[Photo], features: Path, settings: Settings
+    engine: Any,
+    opened: Any,
+    photos: Sequence[Photo],
+    features: Path,
+    settings: Settings,
+    cameras: Mapping[str, Any] | None,
 ) -> dict[str, int]:
     """The number of each photograph in the database, by its name."""
-    lenses: dict[int, tuple[int, int]] = {}
+    lenses: dict[int | str, tuple[int, int]] = {}
     numbers = {}
     camera_type = engine.SensorType.CAMERA
-    for photo, group in zip(photos, lens_groups(photos), strict=True):
+    groups = lens_groups(photos) if cameras is None else [str(cameras[photo.name]) for photo in photos]
+    for photo, group in zip(photos, groups, strict=True):
         if group not in lenses:
-            number = opened.write_camera(_camera(engine, photo, settings.lens))
+            camera = _camera(engine, photo, settings.lens) if cameras is None else cameras[photo.name]
+            number = opened.write_camera(camera)
             rig = engine.Rig()
             rig.add_ref_sensor(engine.sensor_t(camera_type, number))
             lenses[group] = (number, opened.write_rig(rig))

@@ -99,6 +99,11 @@ def mark_copies(photos: Sequence[Photo]) -> list[Photo]:
     return marked
 
 
+def is_copy(photo: Photo) -> bool:
+    """Whether a photograph is left out as a copy of another of its folder."""
+    return (photo.problem or "").startswith("a copy of")
+
+
 def is_blurred(photo: Photo, photos: Sequence[Photo]) -> bool:
     """Whether a photograph is far less sharp than most of the folder."""
     others = [other.sharpness for other in photos if other.usable]
@@ -122,8 +127,7 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     stamp = (stat.st_size, stat.st_mtime_ns)
     before = known.get(name)
     if before is not None and before.stamp == stamp:
-        copy = (before.problem or "").startswith("a copy of")
-        return replace(before, problem=None) if copy else before
+        return replace(before, problem=None) if is_copy(before) else before
     try:
         return _look(path, Photo(name, stamp))
     except BadInput as error:

@@ -15,15 +15,14 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
 from surfkit.readers.placed import Placed
 from surfkit.sfm.adjust import adjust_once
+from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine
-from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
 from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
 from surfkit.sfm.ground_control import Control, Ground, place_by_points, read_ground
 from surfkit.sfm.level import turn_upright, up_direction
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
-from surfkit.sfm.matching import contents, match, matched, refuse_other
-from surfkit.sfm.pairs import Pair, choose_pairs
+from surfkit.sfm.matching import matched
 from surfkit.sfm.photographs import Photo, look
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import Settings
@@ -65,31 +64,18 @@ class Preparation:
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
         site = self._site(usable)
-        folder = self.work / "features"
-        counts = stages.run("features", "", lambda: find_features(usable, self.root, folder, self.settings))
-        rich = [photo for photo in usable if counts[photo.name] >= FEWEST]
-        made_of = contents(rich, folder, self.settings)
-        chosen = [self.settings.pairs, self.settings.neighbours, self.settings.seed]
-        key = key_of(made_of, chosen, [[photo.exif.position, photo.exif.taken] for photo in rich])
-        pairs = stages.run("pairs", key, lambda: self._pairs(rich), self._load_pairs)
-        database = self.work / "database.db"
-        stages.run(
-            "matches",
-            key_of(made_of, pairs),
-            lambda: match(rich, pairs, folder, database, self.settings),
-            lambda: refuse_other(database, made_of),
-        )
-        key = key_of(made_of, pairs, self.settings.mapper, self.settings.seed)
-        models = stages.run("cameras", key, lambda: self._map(database, len(rich)), self._load_models)
-        matches = matched(database)
+        found = compare(stages, usable, self.root, self.work, self.settings)
+        key = key_of(found.key, self.settings.mapper, self.settings.seed)
+        models = stages.run("cameras", key, lambda: self._map(found.database, len(found.rich)), self._load_models)
+        matches = matched(found.database)
         if not models:
-            raise BadInput(self._no_model(photos, reasons(photos, counts, matches, [])))
+            raise BadInput(self._no_model(photos, reasons(photos, found.counts, matches, [])))
         placed = stages.run("georeference", "", lambda: self._place(models, photos, site))
         by_name = {photo.name: photo for photo in photos}
         done = [(model, None if where is None else _placed(where)) for model, where in placed]
         stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
         names = [set(centres_of(model)) for model, _ in placed]
-        return self._report(stages, photos, placed, reasons(photos, counts, matches, names))
+        return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
     def _look(self) -> list[Photo]:
         path = self.work / "photographs.json"
@@ -110,19 +96,6 @@ class Preparation:
             f"{self.root}: {len(usable)} of {len(photos)} photographs can be used{why}; cameras are found for "
             f"{SMALLEST} or more that show the same place from several sides"
         )
-
-    def _pairs(self, photos: Sequence[Photo]) -> list[Pair]:
-        folder = self.work / "features"
-
-        def descriptors(at: int) -> np.ndarray:
-            return read_features(feature_file(folder, photos[at], self.settings)).descriptors
-
-        pairs = choose_pairs(photos, self.settings, descriptors)
-        write_json(self.work / "pairs.json", pairs)
-        return pairs
-
-    def _load_pairs(self) -> list[Pair]:
-        return list(read_json(self.work / "pairs.json", tuple[Pair, ...]))
 
     def _map(self, database: Path, count: int) -> list[Path]:
         return map_photographs(database, self.work / "models", count, self.settings) if count >= SMALLEST else []

@@ -329,7 +329,8 @@ class Trainer:
         if terms is None:
             total = gradient(list(values.values()), leaves)
             return numbers, total, total if self.stage.signal.absolute else None, by_look
-        chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared=look is not None)
+        shared = look is not None or target.mask is not None  # what shows or hides pixels is before all losses
+        chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
         others = gradient([value for name, value in values.items() if name not in terms], leaves)
         return numbers, added(chosen, others), chosen, by_look
 

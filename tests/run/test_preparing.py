@@ -250,7 +250,7 @@ def test_a_model_without_tracks_trains_without_maps(tmp_path, recipe, own_cache)
         run(recipe, Data(tmp_path / "farm"), tmp_path / "a")
     run(replace(recipe, start=Recipe().start), Data(tmp_path / "farm"), tmp_path / "b")
     notes = record(tmp_path / "b")["notes"]
-    assert any(note.startswith("depth maps cannot be made: ") and "triangulate" in note for note in notes)
+    assert any(note.startswith("depth maps cannot be made: ") and "`surfkit prepare points" in note for note in notes)
     assert not (own_cache / "depth").exists()
 
 

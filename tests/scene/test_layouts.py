@@ -9,7 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
-from surfkit.readers.read import RANDOM_POINTS, observations, read
+from surfkit.readers.read import RANDOM_POINTS, observations, read, reader_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import photograph
@@ -125,6 +125,40 @@ def test_opendronemap(tmp_path, truth):
     for kind, extra in {"brown": {"k1": -0.1, "k3": 0.01}, "fisheye_opencv": {"k1": 0.01}}.items():
         scene = read(Data(odm(tmp_path, truth, kind, **extra)))
         assert all(view.path.parent == tmp_path / "undistorted" for view in scene.train)
+
+
+def test_opendronemap_with_tracks(tmp_path, truth):
+    """OpenSfM's tracks.csv: from the middle of the picture, in shares of the longer side."""
+    folder, lines = odm(tmp_path, truth), ["OPENSFM_TRACKS_VERSION_v2"]
+    assert reader_of(Data(folder)).tracks(Data(folder)) is None
+    xyz, wanted = sparse(truth)[0], {}
+    for view in views_of(truth):
+        pose, c = truth.scene.frame.input_pose(view.camera.world_to_camera), view.camera
+        local = xyz @ pose[:3, :3].T + pose[:3, 3]
+        pixels = local[:, :2] / local[:, 2:] * (c.fx, c.fy) + (c.cx, c.cy)
+        shown = np.flatnonzero(((pixels > 0) & (pixels < (40, 30))).all(1))
+        wanted[view.name] = (shown, pixels[shown])
+        for row, (x, y) in zip(shown, (pixels[shown] - (20, 15)) / 40, strict=True):
+            lines.append(
+                "\t".join(
+                    [view.name, str(row), "7", repr(float(x)), repr(float(y)), "0.001", "1", "2", "3", "-1", "-1"]
+                )
+            )
+    lines.append("gone.png\t1\t7\t0\t0\t0.001\t1\t2\t3")
+    (folder / "opensfm/tracks.csv").write_text("\n".join(lines) + "\n")
+    (folder / "opensfm/reference_lla.json").write_text(json.dumps(dict(latitude=47.5, longitude=8.9, altitude=430.0)))
+    (folder / "odm_georeferencing").mkdir()
+    (folder / "odm_georeferencing/coords.txt").write_text("WGS84 UTM 32N\n492000 5260000\n")
+    tracks = reader_of(Data(folder)).tracks(Data(folder))
+    for name, (rows, pixels) in wanted.items():
+        np.testing.assert_array_equal(tracks.seen[name][0], rows)
+        np.testing.assert_allclose(tracks.seen[name][1], pixels, atol=1e-9)
+    seen = np.unique(np.concatenate([rows for rows, _ in wanted.values()]))
+    assert tracks.error_px[seen].max() < 1e-3, "on the map, too"
+    assert not observations(Data(folder), read(Data(folder))).is_empty
+    (folder / "opensfm/tracks.csv").write_text("\n".join(lines).replace("0.001", "x").replace("\t7\t", "\t7\tx"))
+    with pytest.raises(BadInput, match="tracks.csv: a place in 'view_000.png' is no number"):
+        reader_of(Data(folder)).tracks(Data(folder))
 
 
 def damage(key, value):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scene import programs
 from scene.folders import FLIGHT, blender, city, nerfstudio, odm
 
 from surfkit.core.registry import components
@@ -12,12 +13,24 @@ from surfkit.readers.colmap import COLMAP
 from surfkit.testing import check, check_reader
 from surfkit.testing.synthetic import photograph, write_colmap
 
+PROGRAMS = ("bundler", "metashape", "openmvg", "pix4d", "realitycapture")
+"""Written with a scene of their own: `scene/test_programs.py` compares their cameras with formulas."""
+
+
+def program(name):
+    def write(folder, truth):
+        getattr(programs, name)(folder)
+
+    return write
+
+
 WRITE = {
     "blender": blender,
     "colmap": write_colmap,
     "matrixcity": lambda folder, truth: city(folder, truth, "aerial"),
     "nerfstudio": nerfstudio,
     "odm": odm,
+    **{name: program(name) for name in PROGRAMS},
 }
 
 
@@ -48,6 +61,7 @@ def test_every_reader(name, truth, tmp_path):
     """A reader of a new layout needs a function above that writes it."""
     folder = WRITE[name](tmp_path, truth) or tmp_path
     known = {"blender": square(truth), "matrixcity": None}  # the latter gives the photographs other names
+    known |= dict.fromkeys(PROGRAMS)
     check(components(Reader)[name](), folder, known.get(name, truth))
 
 

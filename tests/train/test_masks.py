@@ -48,7 +48,9 @@ def test_what_is_under_a_mask_makes_no_difference(name):
     assert loss(*ignoring(Maps(color=color), right)) < 1e-6, "all that counts is right"
 
 
-def test_training_with_a_mask_does_not_depend_on_what_it_covers(tiny, begin):
+@pytest.mark.parametrize("terms", [None, ("ssim",)])
+def test_training_with_a_mask_does_not_depend_on_what_it_covers(tiny, begin, terms):
+    from surfkit.densify.signal import LossGradient
     from surfkit.train.stage import Stage
 
     mask = torch.ones(22, 28, dtype=torch.bool)
@@ -56,7 +58,7 @@ def test_training_with_a_mask_does_not_depend_on_what_it_covers(tiny, begin):
     results = []
     for value in (0, 255):
         photos = [torch.where(mask, photo, torch.tensor(value, dtype=torch.uint8)) for photo in tiny.photos]
-        trainer, state = begin(Stage(steps=12, densify=None))
+        trainer, state = begin(Stage(steps=12, densify=None, signal=LossGradient(terms=terms)))
         trainer = replace(trainer, photos=photos, masks=[mask] * len(photos))
         for _ in trainer.run(state):
             pass

@@ -1,0 +1,87 @@
+"""`surfkit prepare points`: from cameras without points to a data set with points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from surfkit.cli.prepare_photos import refuse_foreign
+from surfkit.cli.table import print_table
+from surfkit.core.check import BadInput
+from surfkit.core.files import sweep
+from surfkit.core.lock import locked
+from surfkit.readers.data import Data
+from surfkit.readers.read import reader_of
+from surfkit.run.notes import collect_notes
+from surfkit.sfm.settings import Settings
+from surfkit.sfm.tie_points import WORK, TiePoints
+from surfkit.train.bars import bars
+
+
+@dataclass(frozen=True)
+class Points:
+    """Match the photographs of a data set whose cameras are known, and triangulate points, which stereo and training
+    start from: for cameras of Metashape, Pix4D, RealityCapture or NeRF programs, whose files have none.
+
+    SCENE gets undistorted photographs in images/ and a COLMAP model in sparse/0, of the same cameras in the same
+    coordinates. An interrupted command continues when it is given again.
+    """
+
+    data: Annotated[Path, tyro.conf.Positional]
+    """Data set of any layout."""
+
+    out: Path | None = None
+    """SCENE, the folder of the new data set; by default DATA-scene beside DATA."""
+
+    longest: int = 1600
+    """Features are found in photographs reduced to this longer side, pixels."""
+
+    features: int = 8192
+    """About how many features are kept of a photograph."""
+
+    neighbours: int = 20
+    """How many photographs each is compared with, where there are more than 60: those nearest by GPS, else those that
+    look most like it."""
+
+    seed: int = 0
+    """Of all that is drawn at random."""
+
+    layout: str | None = None
+    """Layout of the data set, such as metashape (`surfkit components reader` lists them); recognised if left out."""
+
+    images: Path | None = None
+    """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    @property
+    def scene(self) -> Path:
+        """The folder of the new data set."""
+        return self.out or self.data.resolve().with_name(f"{self.data.resolve().name}-scene")
+
+    def run(self) -> None:
+        """Triangulate, and print the results."""
+        data, scene = Data(self.data, layout=self.layout, images=self.images), self.scene
+        settings = Settings(longest=self.longest, features=self.features, neighbours=self.neighbours, seed=self.seed)
+        reader_of(data)  # or one line that says what is wrong
+        if scene.resolve().is_relative_to(self.data.resolve()):
+            raise BadInput(f"--out {scene} lies in the data set {self.data}; name a folder outside")
+        refuse_foreign(scene)
+        with collect_notes(), bars(), locked(scene / WORK):
+            sweep(scene)
+            report = TiePoints(data, scene, settings).run()
+        show(report, scene)
+
+
+def show(report: dict[str, Any], scene: Path) -> None:
+    """Print what came of it, and where it lies."""
+    model = report["models"][0]
+    rows = [
+        ("photographs", f"{report['registered']} of {report['photographs']}, with the cameras that they had"),
+        ("points", f"{model['points']:,}, each in {model['track_length']:.1f} photographs on average"),
+        ("reprojection error", f"{model['reprojection_error_px']:.2f} px"),
+        ("seconds", ", ".join(f"{name} {value:.0f}" for name, value in report["seconds"].items())),
+    ]
+    print_table(("points", "value"), rows)
+    print(f"data set in {scene}")

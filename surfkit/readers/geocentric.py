@@ -1,0 +1,150 @@
+"""Coordinates about the Earth's centre, brought to a map by a similarity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
+from surfkit.core.optional import needed
+from surfkit.readers.georeference import POLAR, Similarity, zone_of
+from surfkit.readers.wkt import Node, parse_wkt
+from surfkit.scene.earth import AXIS, FLATTENING, utm
+
+GEOGRAPHIC, PROJECTED = ("GEOGCS", "GEOGCRS", "BASEGEOGCRS", "GEODCRS", "BASEGEODCRS"), ("PROJCS", "PROJCRS")
+VERTICAL, LOCAL = ("VERT_CS", "VERTCRS"), ("LOCAL_CS", "ENGCRS")
+WGS84 = ("EPSG:4326", "EPSG:4979")
+RADIUS_M = (6.2e6, 6.5e6)
+"""Distances from the Earth's centre at which there are photographs."""
+OnMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(P, 2) east and north of (P,) latitudes and longitudes, degrees."""
+STEP_M = 100.0
+"""Over which the directions of the axes are measured."""
+
+
+@dataclass(frozen=True)
+class MapPlace:
+    """Where on a map coordinates about the Earth's centre lie.
+
+    Attributes:
+        move: To the map.
+        crs: Coordinate reference system of the map.
+        metres: Per unit of it.
+    """
+
+    move: Similarity
+    crs: str
+    metres: float
+
+
+def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
+    """The map of a coordinate reference system; None for local coordinates.
+
+    A projected one is the map itself. For degrees it is the zone of UTM. Heights are those above the ellipsoid. As no
+    pose follows a map exactly, lengths are scaled as they are on the map at the mean camera, heights too.
+
+    Args:
+        where: The text is from, for messages.
+        text: Well-known text; its datum is that of the coordinates.
+        centres: (V, 3) of the cameras, metres from the Earth's centre.
+
+    Raises:
+        BadInput: It is no such text, or pyproj is needed and does not know it.
+    """
+    whole = parse_wkt(where, text)
+    if whole.keyword in LOCAL:
+        return None
+    flat = whole if whole.keyword in (*GEOGRAPHIC, *PROJECTED) else whole.child(*PROJECTED, *GEOGRAPHIC)
+    if flat is None:
+        raise BadInput(f"{where}: {whole.keyword} is no projected, geographic or local coordinate reference system")
+    middle = centres.mean(0)
+    if not RADIUS_M[0] < np.linalg.norm(middle) < RADIUS_M[1]:
+        emit(
+            Warned(
+                f"{where}: {flat.name!r}, but the cameras are not on the Earth: their coordinates are taken as local"
+            )
+        )
+        return None
+    if (vertical := whole.child(*VERTICAL)) is not None:
+        emit(Warned(f"{where}: heights are those above the ellipsoid, not {vertical.name!r}"))
+    geographic = flat if flat.keyword in GEOGRAPHIC else flat.child(*GEOGRAPHIC)
+    axis, flattening = _ellipsoid(where, geographic)
+    degrees = geodetic(middle[None], axis, flattening)[0]
+    crs, unit, on_map = _projection(where, text, flat, degrees)
+
+    def convert(xyz: np.ndarray) -> np.ndarray:
+        latitude, longitude, height = geodetic(xyz, axis, flattening).T
+        return np.column_stack([on_map(latitude, longitude), height / unit])
+
+    return MapPlace(_similarity(where, convert, middle), crs, unit)
+
+
+def geodetic(xyz: np.ndarray, axis: float = AXIS, flattening: float = FLATTENING) -> np.ndarray:
+    """(P, 3) latitude and longitude, degrees, and height, of (P, 3) metres from the centre of an ellipsoid."""
+    squared = flattening * (2 - flattening)
+    away = np.hypot(xyz[:, 0], xyz[:, 1])
+    phi = np.arctan2(xyz[:, 2], away * (1 - squared))
+    for _ in range(6):  # converges by a factor of some 300 a round
+        across = axis / np.sqrt(1 - squared * np.sin(phi) ** 2)
+        phi = np.arctan2(xyz[:, 2] + squared * across * np.sin(phi), away)
+    height = away * np.cos(phi) + xyz[:, 2] * np.sin(phi) - axis * np.sqrt(1 - squared * np.sin(phi) ** 2)
+    return np.column_stack([np.degrees(phi), np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])), height])
+
+
+def _similarity(where: str, convert: Callable[[np.ndarray], np.ndarray], middle: np.ndarray) -> Similarity:
+    """From coordinates about the Earth's centre to the map, exact in a point and in the directions there."""
+    steps = STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
+    around = convert(middle + steps)
+    east, north, up = ((around[:3] - around[3:]) / (2 * STEP_M)).T
+    if not np.isfinite([east, north, up]).all() or not np.cross(east, north) @ up > 0:
+        raise BadInput(f"{where}: its axes are not east, north and up at the cameras; export in another system")
+    scale = float(np.sqrt(np.linalg.norm(east) * np.linalg.norm(north)))
+    up = up / np.linalg.norm(up)
+    north = north - up * (up @ north)
+    north /= np.linalg.norm(north)
+    turn = np.stack([np.cross(north, up), north, up])
+    return Similarity(turn, scale, convert(middle[None])[0] - scale * turn @ middle)
+
+
+def _ellipsoid(where: str, geographic: Node | None) -> tuple[float, float]:
+    """Its semi-major axis, metres, and flattening."""
+    datum = geographic.child("DATUM", "ENSEMBLE", "TRF") if geographic is not None else None
+    found = datum.child("SPHEROID", "ELLIPSOID") if datum is not None else None
+    axis, inverse = (found.number(1), found.number(2)) if found is not None else (None, None)
+    if axis is None or inverse is None or not (6e6 < axis < 7e6 and (inverse == 0 or 100 < inverse < 1000)):
+        raise BadInput(f"{where}: no ellipsoid in its coordinate reference system; choose another, and export again")
+    return axis, 1 / inverse if inverse else 0.0
+
+
+def _projection(where: str, text: str, flat: Node, at: np.ndarray) -> tuple[str, float, OnMap]:
+    """The coordinate reference system of the map, metres per unit of it, and what brings degrees to it."""
+    code, zone = flat.code, zone_of(flat.code or "")
+    if flat.keyword in GEOGRAPHIC:
+        if abs(at[0]) > POLAR:
+            raise BadInput(f"{where}: degrees at latitude {at[0]:.1f}, where UTM ends; choose a projected system")
+        zone = (int((at[1] + 180) // 6) % 60 + 1, bool(at[0] < 0))
+    utm_crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}" if zone is not None else None
+    if utm_crs and (flat.keyword in PROJECTED or code in WGS84):
+        return utm_crs, 1.0, lambda lat, lon: np.array([utm(*pair, *zone) for pair in zip(lat, lon, strict=True)])
+    return _by_pyproj(where, text, code, utm_crs)
+
+
+def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tuple[str, float, OnMap]:
+    """The same, of degrees on the datum of a text, or of the code in it, onto another system or its own."""
+    with needed("pyproj", f"the coordinate reference system {code or 'of ' + where}"):
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError, ProjError
+    try:
+        given = CRS(code or text)
+        given = given.sub_crs_list[0] if given.is_compound else given
+        target = (CRS(onto) if onto else given).to_2d()
+        known = Transformer.from_crs(given.geodetic_crs.to_2d(), target, always_xy=True)
+        unit = float(target.axis_info[0].unit_conversion_factor)
+    except (CRSError, ProjError, AttributeError, IndexError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise BadInput(f"{where}: pyproj does not know its coordinate reference system: {said}") from error
+    name = onto or code or " ".join(target.to_wkt().split())
+    return name, unit, lambda lat, lon: np.column_stack(known.transform(lon, lat))

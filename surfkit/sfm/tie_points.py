@@ -1,0 +1,194 @@
+"""Points for cameras that are known but came without: features are matched, and triangulated between the cameras.
+
+What comes out is a COLMAP model of the same cameras, in the same coordinates, with points and with who sees them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from surfkit.core.check import BadInput, few
+from surfkit.core.codec import read_json, write_json
+from surfkit.core.events import Warned, emit
+from surfkit.core.files import replacing_folder
+from surfkit.readers.capture import Capture, Shot
+from surfkit.readers.data import Data
+from surfkit.readers.masks import find_masks
+from surfkit.readers.placed import Placed
+from surfkit.readers.read import check_size, read_capture, reader_of
+from surfkit.readers.undistort import check_camera
+from surfkit.scene.photos import photo_size
+from surfkit.scene.scene import Frame
+from surfkit.sfm.compare import compare
+from surfkit.sfm.deliver import deliver
+from surfkit.sfm.engine import load_engine, run
+from surfkit.sfm.mapping import SMALLEST, read_model
+from surfkit.sfm.photographs import Photo, is_copy, look, mark_copies
+from surfkit.sfm.report import model_facts
+from surfkit.sfm.settings import Settings
+from surfkit.sfm.stages import Stages, key_of
+
+WORK, REPORT = "prepare", "report.json"
+"""Folder of the scene for what the stages keep, and what is told of it."""
+
+
+@dataclass(frozen=True)
+class TiePoints:
+    """A data set with cameras on its way to one with points.
+
+    Attributes:
+        data: The data set, and how it is read; nothing is written there.
+        scene: The new one.
+        settings: How features are found and compared.
+    """
+
+    data: Data
+    scene: Path
+    settings: Settings
+
+    @property
+    def work(self) -> Path:
+        """Folder of what the stages keep."""
+        return self.scene / WORK
+
+    def run(self) -> dict[str, Any]:
+        """Go through all stages that are not complete; the report.
+
+        Raises:
+            BadInput: The data set cannot be read, or its photographs share too few features.
+        """
+        load_engine()
+        capture = read_capture(self.data, reader_of(self.data))
+        paths = [Path(os.path.abspath(shot.path)) for shot in capture.shots]
+        root = Path(os.path.commonpath([path.parent for path in paths]))
+        shots = {path.relative_to(root).as_posix(): shot for path, shot in zip(paths, capture.shots, strict=True)}
+        self._warn(capture, root)
+        stages = Stages(self.work)
+        photos = stages.run("photographs", "", lambda: self._look(root, shots))
+        cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
+        found = compare(stages, photos, root, self.work, self.settings, cameras)
+        offset = _offset(capture)
+        poses = {name: _moved(shots[name].pose, offset) for name in cameras}
+        key = key_of(found.key, [pose.tolist() for pose in poses.values()])
+        models = self.work / "points"
+        model = stages.run(
+            "points", key, lambda: self._triangulate(found.database, poses), lambda: read_model(models / "0")
+        )
+        if model.num_points3D() == 0:
+            raise BadInput(
+                f"{self.data.path}: not one point could be triangulated: the photographs share no features that fit "
+                "their cameras; are these the cameras of these photographs?"
+            )
+        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres or 1.0)
+        if placed is None:  # no file to keep an offset in
+            model.transform(load_engine().Sim3d(1.0, load_engine().Rotation3d(), offset))
+        by_name = {photo.name: photo for photo in photos}
+        stages.run("undistortion", "", lambda: deliver([(model, placed)], by_name, root, self.scene, self.work))
+        report = {
+            "photographs": len(capture.shots),
+            "registered": model.num_reg_images(),
+            "models": [model_facts(model, None)],
+            "seconds": stages.seconds(),
+            "settings": self.settings,
+        }
+        write_json(self.scene / REPORT, report)
+        return report
+
+    def _warn(self, capture: Capture, root: Path) -> None:
+        """Say what of the data set the new one has not."""
+        if masks := find_masks(self.data.path, self.data.masks, capture.shots):
+            emit(Warned(f"{len(masks)} masks are not taken over: photographs of {self.scene} have other pixels"))
+        if capture.held_out:
+            named = few(sorted(capture.held_out))
+            emit(Warned(f"which photographs the data set keeps from training is not taken over: {named} (--test-list)"))
+        if capture.metres and capture.crs is None and capture.metres != 1:
+            emit(Warned(f"the unit is not taken over: give --metres-per-unit {capture.metres:g} when you train"))
+
+    def _look(self, root: Path, shots: Mapping[str, Shot]) -> list[Photo]:
+        """The photographs of the data set that can be used."""
+        path = self.work / "photographs.json"
+        try:
+            known = read_json(path, tuple[Photo, ...])
+        except BadInput:
+            known = ()
+        found = [photo for photo in look(root, known) if photo.name in shots]
+        photos = mark_copies([replace(photo, problem=None) if is_copy(photo) else photo for photo in found])
+        write_json(path, photos)
+        if wrong := [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]:
+            emit(Warned(f"{len(wrong)} of {len(photos)} photographs cannot be used, and are left out: {few(wrong)}"))
+        usable = [photo for photo in photos if photo.usable]
+        if len(usable) < SMALLEST:
+            raise BadInput(
+                f"{root}: {len(usable)} of {len(shots)} photographs can be used; {SMALLEST} or more are needed"
+            )
+        return usable
+
+    def _triangulate(self, database: Path, poses: Mapping[str, np.ndarray]) -> Any:
+        """The model with points between the cameras, kept in `points/`."""
+        engine = load_engine()
+        with replacing_folder(self.work / "points") as folder:
+            (folder / "0").mkdir()
+            model = _without_points(engine, database, poses)
+            options = engine.IncrementalPipelineOptions()
+            options.random_seed = self.settings.seed
+            options.extract_colors = False  # photographs are read once, when they are undistorted
+
+            def work(token: Any) -> Any:
+                return engine.triangulate_points(
+                    model, database, self.work, folder / "0", True, options, False, cancellation_token=token
+                )
+
+            made = run("triangulating points", work)
+            for image in made.images.values():
+                image.name = unquote(image.name)
+            made.write_binary(folder / "0")
+        return read_model(self.work / "points" / "0")
+
+
+def _without_points(engine: Any, database: Path, poses: Mapping[str, np.ndarray]) -> Any:
+    """A model of the photographs of a database, where their cameras are known to stand."""
+    model = engine.Reconstruction()
+    opened = engine.Database.open(database)
+    try:
+        for camera in opened.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = engine.Rigid3d(np.ascontiguousarray(poses[unquote(image.name)][:3]))
+            new = engine.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(new, pose)
+    finally:
+        opened.close()
+    return model
+
+
+def _camera(shot: Shot, size: tuple[int, int]) -> Any:
+    """The camera of a photograph of a size, or BadInput where these do not fit."""
+    check_camera(shot.camera, shot.name)
+    check_size(shot, photo_size(shot.path))
+    lens = shot.camera
+    made = load_engine().Camera(model=lens.model.name, width=lens.width, height=lens.height, params=list(lens.params))
+    made.rescale(*size)
+    made.has_prior_focal_length = True
+    return made
+
+
+def _offset(capture: Capture) -> np.ndarray:
+    """(3,) what coordinates of the model leave out."""
+    if capture.shift is not None:
+        return np.array(capture.shift, np.float64)
+    frame = Frame.around(np.stack([shot.pose for shot in capture.shots]), capture.xyz)
+    return np.array(frame.shift, np.float64)
+
+
+def _moved(pose: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """(4, 4) world_to_camera in coordinates that leave an offset out."""
+    new = pose.copy()
+    new[:3, 3] += new[:3, :3] @ offset
+    return new
