@@ -1,0 +1,59 @@
+"""The page of a subject: one for each browser that has come through the gate."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from surfkit.render.path import beside
+from surfkit.view.layers import WORLD, Layers
+from surfkit.view.server import Served
+from surfkit.view.shelf import Shelf
+from surfkit.view.subject import Subject
+
+if TYPE_CHECKING:
+    import viser
+
+HELP = """
+**Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
+
+**Keys.** W A S D: fly; Q E: down, up; arrows: turn. **R**: back to the first view.
+
+**Click.** On a camera: its photograph. On the surface: its coordinates; a point of the line, while *measure* is on.
+"""
+
+
+def show(subject: Subject, served: Served, folder: Path) -> None:
+    """Show a subject to every browser that comes.
+
+    Args:
+        subject: What to look at.
+        served: A server with an empty scene.
+        folder: For the files that a user writes.
+    """
+    shelf = Shelf(subject)
+    server = served.viser
+    up, at, middle = first_view(subject)
+    server.scene.set_up_direction(up)
+    server.initial_camera.up = up
+    server.initial_camera.position = at * WORLD
+    server.initial_camera.look_at = middle * WORLD
+    if subject.mesh is not None:  # so that the first click need not wait
+        threading.Thread(target=lambda: shelf.triangles, daemon=True).start()
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+        Layers(shelf, client)
+
+
+def first_view(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Up, where the camera stands and what it looks at, local frame: from the side, half from above."""
+    positions = subject.positions()
+    rows = positions[:: max(1, len(positions) // 100_000)].astype(np.float64)
+    middle = np.median(rows, axis=0)
+    reach = float(np.quantile(np.linalg.norm(rows - middle, axis=1), 0.8)) or 1.0
+    east, north = beside(subject.up)
+    return subject.up, middle + 1.6 * reach * (0.3 * east - north + 0.8 * subject.up), middle
