@@ -43,7 +43,7 @@ class Gate:
 
     @property
     def cookie(self) -> str:
-        """The Set-Cookie header that replaces the token in the address. Scripts cannot read it, nor other sites use it."""
+        """The Set-Cookie header that replaces the token in the address: for no script and no other site."""
         return f"{COOKIE}-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Lax"
 
     def brings_token(self, asked: Asked) -> bool:

@@ -111,11 +111,9 @@ class Layers:
         budget.on_update(telling(self.client, Latest(draw)))
 
     def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
-        count = len(mesh.faces)
+        count, most = len(mesh.faces), _rounded(len(mesh.faces))
         shown = gui.add_checkbox("mesh", self.shows_mesh)
-        budget = gui.add_slider(
-            "most triangles", min(STEP, count), _rounded(count), STEP, min(TRIANGLES, _rounded(count))
-        )
+        budget = gui.add_slider("most triangles", min(STEP, count), most, STEP, min(TRIANGLES, most))
         plain = gui.add_checkbox("mesh in grey", mesh.colors is None, disabled=mesh.colors is None)
         note = gui.add_markdown("")
 

@@ -47,10 +47,8 @@ def outline(
     x1, y1 = (end if value is None else value for value, end in zip(box[2:], ends[1], strict=True))
     steps = np.arange(SIDE) / SIDE
     corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    pieces = [
-        start + steps[:, None] * (end - start) for start, end in zip(corners, np.roll(corners, -1, 0), strict=True)
-    ]
-    ring = np.concatenate(pieces)
+    sides = np.roll(corners, -1, axis=0) - corners
+    ring = (corners[:, None] + steps[:, None] * sides[:, None]).reshape(-1, 2)
     return np.clip(ring if contraction is None else spread_out(contraction, ring), low, high)
 
 

@@ -199,7 +199,7 @@ def _never_share(server: viser.ViserServer) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Within, rich prints nothing: viser shows its address on the terminal, without the token, and that it has ended."""
+    """Within, rich prints nothing: viser would show its address, without the token, and that it has ended."""
     import rich
 
     console = rich.get_console()
