@@ -66,7 +66,8 @@ class Layers:
         """Build the switches, and draw."""
         self.shelf, self.client, self.subject = shelf, client, shelf.subject
         self.shows_mesh = self.subject.splats is None
-        self.camera_size = self._typical_size()
+        self.typical_size = self._typical_size()
+        self.camera_size = self.typical_size if self.subject.views else 0.0
         gui = client.gui
         with gui.add_folder("Layers"):
             if self.subject.splats is not None:
@@ -182,10 +183,9 @@ class Layers:
     def _camera_switches(self, gui: viser.GuiApi) -> None:
         shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")
         size = gui.add_slider("size of cameras", 0.2, 5.0, 0.1, 1.0)
-        typical = self.camera_size
 
         def draw() -> None:
-            self.camera_size = typical * size.value if shown.value else 0.0
+            self.camera_size = self.typical_size * size.value if shown.value else 0.0
             if not shown.value:
                 self.client.scene.remove_by_name("/cameras")
                 return

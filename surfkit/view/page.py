@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfkit.render.path import beside
-from surfkit.view.layers import WORLD, Layers
+from surfkit.view.layers import WORLD, Layers, telling
+from surfkit.view.photographs import Photographs
+from surfkit.view.screen import ray_of
 from surfkit.view.server import Served
 from surfkit.view.shelf import Shelf
 from surfkit.view.subject import Subject
+from surfkit.view.tools import CropTool, Measure, PathTool
 
 if TYPE_CHECKING:
     import viser
@@ -46,7 +49,32 @@ def show(subject: Subject, served: Served, folder: Path) -> None:
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        Layers(shelf, client)
+        telling(client, lambda _: Page(shelf, client, folder))(None)
+
+
+class Page:
+    """What one browser shows; another has its own layers, measures, box and path."""
+
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path) -> None:
+        """Build the page."""
+        self.shelf = shelf
+        with client.gui.add_folder("Help", expand_by_default=False):
+            client.gui.add_markdown(HELP)
+        self.layers = Layers(shelf, client)
+        self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
+        self.measure = Measure(shelf, client)
+        CropTool(shelf, client, folder)
+        PathTool(shelf, client, folder)
+        client.scene.on_click()(telling(client, self._click))
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = ray_of(event)
+        if self.photographs is not None and not self.measure.on.value:
+            camera = self.photographs.hit(origin, direction)
+            if camera is not None:
+                self.photographs.choose(camera, stand=self.photographs.follow.value)
+                return
+        self.measure.click(self.shelf.pick(origin, direction, mesh=self.layers.shows_mesh))
 
 
 def first_view(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
