@@ -11,6 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.view.display import PALETTE, Colors, some
+from surfkit.view.glb import unlit_glb
 from surfkit.view.outlines import block_outlines
 from surfkit.view.picking import corners_of
 from surfkit.view.shelf import Shelf
@@ -25,7 +26,7 @@ SPLATS, TRIANGLES, POINTS = 1_000_000, 1_000_000, 500_000
 STEP = 10_000
 REST_S = 0.4
 """A slider or a camera that has not moved for so long is at rest."""
-TRAINED, HELD_OUT = (70, 90, 130), (230, 130, 20)
+TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
 MOST_LABELS = 400
 """Blocks that get a label."""
@@ -105,6 +106,8 @@ class Layers:
 
         def show(_event: Any) -> None:
             self.splats.visible = shown.value
+            for part in (colors, budget, note):
+                part.visible = shown.value
 
         draw()
         shown.on_update(show)
@@ -120,9 +123,10 @@ class Layers:
 
         def draw() -> None:
             self.shows_mesh = shown.value
+            for part in (budget, plain, note):
+                part.visible = shown.value
             if not shown.value:
                 self.client.scene.remove_by_name("/mesh")
-                note.content = ""
                 return
             found = self.shelf.mesh(budget.value)
             self._add_mesh(found, plain.value)
@@ -138,15 +142,12 @@ class Layers:
         budget.on_update(telling(self.client, Latest(draw)))
 
     def _add_mesh(self, mesh: Mesh, plain: bool) -> None:
-        import trimesh
-
         if plain or mesh.colors is None:
             self.client.scene.add_mesh_simple(
                 "/mesh", mesh.vertices, mesh.faces, color=(190, 190, 190), side="double", scale=WORLD
             )
             return
-        found = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colors, process=False)
-        self.client.scene.add_mesh_trimesh("/mesh", found, scale=WORLD)
+        self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
 
     def _point_switches(self, gui: viser.GuiApi) -> None:
         points = self.subject.points
@@ -156,13 +157,14 @@ class Layers:
         shown = gui.add_checkbox("points" if alone else "sparse points", alone)
         size = gui.add_slider("size of points", 1, 10, 1, 3)
         most = _rounded(count)
-        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(POINTS, most), visible=alone)
+        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(POINTS, most))
         note = gui.add_markdown("")
 
         def draw() -> None:
+            for part in (size, budget, note):
+                part.visible = shown.value
             if not shown.value:
                 self.client.scene.remove_by_name("/points")
-                note.content = ""
                 return
             rows = some(count, budget.value)
             self.client.scene.add_point_cloud(
@@ -186,6 +188,7 @@ class Layers:
 
         def draw() -> None:
             self.camera_size = self.typical_size * size.value if shown.value else 0.0
+            size.visible = shown.value
             if not shown.value:
                 self.client.scene.remove_by_name("/cameras")
                 return

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 HELP = """
 **Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
 
-**Keys.** W A S D: fly; Q E: down, up; arrows: turn. **R**: back to the first view.
+**Keys.** W A S D: fly; Q E: down, up; arrows: turn. They work after a click into the picture.
 
 **Click.** On a camera: its photograph. On the surface: its coordinates; a point of the line, while *measure* is on.
 """
@@ -57,15 +57,23 @@ class Page:
 
     def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path) -> None:
         """Build the page."""
-        self.shelf = shelf
-        with client.gui.add_folder("Help", expand_by_default=False):
-            client.gui.add_markdown(HELP)
+        self.shelf, self.client, self.fov = shelf, client, client.camera.fov
+        client.gui.add_button("show all").on_click(lambda _: self._show_all())
         self.layers = Layers(shelf, client)
-        self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         self.measure = Measure(shelf, client)
+        self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
         PathTool(shelf, client, folder)
+        with client.gui.add_folder("Help", expand_by_default=False):
+            client.gui.add_markdown(HELP)
         client.scene.on_click()(telling(client, self._click))
+
+    def _show_all(self) -> None:
+        """Back to the first view."""
+        up, at, middle = first_view(self.shelf.subject)
+        camera = self.client.camera
+        camera.position, camera.look_at = at * WORLD, middle * WORLD
+        camera.up_direction, camera.fov = up, self.fov
 
     def _click(self, event: viser.SceneClickEvent) -> None:
         origin, direction = ray_of(event)

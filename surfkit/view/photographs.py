@@ -37,7 +37,7 @@ class Photographs:
         self.near: dict[int, Any] = {}
         self.moved = 0.0
         gui = client.gui
-        with gui.add_folder("Photographs", expand_by_default=False):
+        with gui.add_folder("Photographs"):
             self.number = gui.add_number("camera", 1, min=1, max=len(self.views), step=1)
             step = gui.add_button_group("go to", ("previous", "next", "stand there"))
             self.kind = gui.add_dropdown("show", KINDS)

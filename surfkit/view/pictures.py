@@ -39,7 +39,7 @@ def picture(view: View, kind: Kind, draw: Callable[[View], Maps] | None, frame: 
     """
     view = replace(view, camera=view.camera.fitted(LONGEST))
     if kind == "photograph":
-        return _bytes(view_photo(view).float() / 255), f"{view.name}, {view.camera.width} × {view.camera.height}"
+        return _bytes(view_photo(view).float() / 255), f"{view.camera.width} × {view.camera.height} pixels"
     if draw is None:
         raise BadInput(f"{kind}: this model cannot be drawn, as its splats are unknown")
     maps = draw(view)

@@ -243,14 +243,8 @@ def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, dict[str, str]]:
     A GLB of surfkit has its offset, unit and coordinate reference system in NAME.glb.json.
     """
     surface, notes = read_surface(path), {}
-    with needed("trimesh", f"{path}: a file that is not binary PLY"):
-        import trimesh
-    loaded_mesh: Any = trimesh.load(path, process=False)
-    loaded_mesh = loaded_mesh.to_geometry() if isinstance(loaded_mesh, trimesh.Scene) else loaded_mesh
-    visual = getattr(loaded_mesh, "visual", None)
-    colors = None
-    if visual is not None and visual.kind in ("vertex", "texture"):
-        colors = np.asarray((visual.to_color() if visual.kind == "texture" else visual).vertex_colors)[:, :3]
+    colors = vertex_colors(path)
+    colors = colors if colors is not None and len(colors) == len(surface) else None
     beside = Path(f"{path}.json")
     if path.suffix.lower() == ".glb" and beside.exists():
         told = read_json(beside, dict[str, Any])
@@ -261,3 +255,26 @@ def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, dict[str, str]]:
         notes = {"crs": told.get("crs"), "metres per unit": told.get("metres_per_unit")}
         notes = {name: str(value) for name, value in notes.items() if value is not None}
     return surface, colors, notes
+
+
+def vertex_colors(path: Path) -> np.ndarray | None:
+    """(V, 3) uint8 of a file with one mesh that trimesh reads; None where it has none, or several parts."""
+    with needed("trimesh", f"{path}: a file that is not binary PLY"):
+        import trimesh
+    found: Any = trimesh.load(path, process=False)
+    if isinstance(found, trimesh.Scene):
+        if len(found.geometry) != 1:
+            return None
+        found = next(iter(found.geometry.values()))
+    visual = getattr(found, "visual", None)
+    if visual is None or not visual.defined:
+        return None
+    if visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[:, :3]
+    if visual.kind != "texture":
+        return None
+    if "color" in visual.vertex_attributes:  # of a GLB with a material
+        colors = np.asarray(visual.vertex_attributes["color"])[:, :3]
+        whole = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
+        return np.round(colors / whole * 255).astype(np.uint8)
+    return None if visual.uv is None else np.asarray(visual.to_color().vertex_colors)[:, :3]
