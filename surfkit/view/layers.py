@@ -28,6 +28,8 @@ REST_S = 0.4
 """A slider or a camera that has not moved for so long is at rest."""
 TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
+DOT = 1.5
+"""Size of splats that are drawn as points, thousandths of a local unit."""
 MOST_LABELS = 400
 """Blocks that get a label."""
 
@@ -85,6 +87,7 @@ class Layers:
 
     def _splat_switches(self, gui: viser.GuiApi, count: int) -> None:
         shown = gui.add_checkbox("splats", True)
+        form = gui.add_dropdown("draw as", ("splats", "points"), hint="Points are far less work for a slow machine.")
         colors = gui.add_dropdown("colours", self.shelf.colors)
         budget = gui.add_slider("most splats", min(STEP, count), _rounded(count), STEP, min(SPLATS, _rounded(count)))
         note = gui.add_markdown("")
@@ -92,26 +95,31 @@ class Layers:
         def draw() -> None:
             chosen: Colors = colors.value
             found, told = self.shelf.splats(budget.value, chosen)
-            self.splats = self.client.scene.add_gaussian_splats(
-                "/splats",
-                found.means / found.unit,
-                found.covariances,
-                found.rgb,
-                found.opacities[:, None],
-                scale=WORLD * found.unit,
-                visible=shown.value,
-            )
+            self.client.scene.remove_by_name("/splats")
+            if form.value == "points":
+                self.splats = self._add_points("/splats", found.means, found.rgb, DOT)
+            else:
+                self.splats = self.client.scene.add_gaussian_splats(
+                    "/splats",
+                    found.means / found.unit,
+                    found.covariances,
+                    found.rgb,
+                    found.opacities[:, None],
+                    scale=WORLD * found.unit,
+                )
+            self.splats.visible = shown.value
             legend = {"height": f"; {self.shelf.height_words()}", "normal": "; red east, green north, blue up"}
             note.content = told + legend.get(chosen, "")
 
         def show(_event: Any) -> None:
             self.splats.visible = shown.value
-            for part in (colors, budget, note):
+            for part in (form, colors, budget, note):
                 part.visible = shown.value
 
         draw()
         shown.on_update(show)
-        colors.on_update(telling(self.client, lambda _: draw()))
+        for choice in (form, colors):
+            choice.on_update(telling(self.client, lambda _: draw()))
         budget.on_update(telling(self.client, Latest(draw)))
 
     def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
@@ -155,7 +163,7 @@ class Layers:
         alone = self.subject.splats is None and self.subject.mesh is None
         count = len(points.xyz)
         shown = gui.add_checkbox("points" if alone else "sparse points", alone)
-        size = gui.add_slider("size of points", 1, 10, 1, 3)
+        size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
         most = _rounded(count)
         budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(POINTS, most))
         note = gui.add_markdown("")
@@ -167,20 +175,19 @@ class Layers:
                 self.client.scene.remove_by_name("/points")
                 return
             rows = some(count, budget.value)
-            self.client.scene.add_point_cloud(
-                "/points",
-                points.xyz[rows] * WORLD,
-                points.rgb[rows],
-                point_size=size.value * WORLD / 1500,
-                precision="float32",
-                point_shading="flat",
-            )
+            self._add_points("/points", points.xyz[rows], points.rgb[rows], size.value)
             note.content = f"{len(rows):,} of {count:,} points are shown"
 
         draw()
         shown.on_update(telling(self.client, lambda _: draw()))
         for slider in (size, budget):
             slider.on_update(telling(self.client, Latest(draw)))
+
+    def _add_points(self, name: str, xyz: np.ndarray, rgb: np.ndarray, size: float) -> Any:
+        """Points of a size in thousandths of a local unit."""
+        return self.client.scene.add_point_cloud(
+            name, xyz * WORLD, rgb, point_size=size * WORLD / 1000, precision="float32", point_shading="flat"
+        )
 
     def _camera_switches(self, gui: viser.GuiApi) -> None:
         shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")

@@ -100,8 +100,8 @@ class Shelf:
             with self.drawing:
                 along = hit_splats(subject.draw, origin, direction)
         else:
-            assert subject.points is not None
-            along = hit_points(subject.points.xyz, origin, direction, CONE)
+            xyz = subject.points.xyz if subject.points is not None else subject.positions()
+            along = hit_points(xyz, origin, direction, CONE)
         return None if along is None else origin + along * direction
 
     def _choose_mesh(self, budget: int) -> Mesh:

@@ -193,7 +193,7 @@ def test_pictures_of_cameras_have_the_corners_that_they_project():
 
 def test_a_crop_box_is_read_back_by_the_reader_of_crops(tmp_path):
     for axis, heading in (("z", 0.0), ("z", 30.0), ("y", -20.0), ("x", 45.0)):
-        crop = turned_box(FAR + [10, 20, 3], FAR + [-5, 8, 9], heading, axis)
+        crop = turned_box(FAR + [10, 20, 3], FAR + [-5, 4, 24], heading, axis)
         write_crop(tmp_path / "crop.json", crop)
         again = read_crop(tmp_path / "crop.json")
         assert np.allclose(again.polygon, crop.polygon) and (again.low, again.high) == (crop.low, crop.high)
@@ -202,7 +202,7 @@ def test_a_crop_box_is_read_back_by_the_reader_of_crops(tmp_path):
         along = "xyz".index(axis)
         plane = [k for k in range(3) if k != along]
         basis = turned(np.eye(3), (0, 0, 1), heading)[:2, :2].T  # sides of the box in columns
-        ends = np.stack([FAR + [10, 20, 3], FAR + [-5, 8, 9]])
+        ends = np.stack([FAR + [10, 20, 3], FAR + [-5, 4, 24]])
         flat, ends_flat = points[:, plane] @ basis, ends[:, plane] @ basis
         inside = ((flat > ends_flat.min(0)) & (flat < ends_flat.max(0))).all(1)
         inside &= (points[:, along] > ends[:, along].min()) & (points[:, along] < ends[:, along].max())
