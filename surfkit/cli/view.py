@@ -24,8 +24,8 @@ class View:
     """Look at a finished run, or at a file of splats, a mesh or points, in a browser on this machine.
 
     Splats, mesh, cameras with their photographs, blocks, depth, normals and errors; measuring in the units of the data
-    set; a crop box for `surfkit mesh --crop` and a path for `surfkit render --path`. The address that is printed ends
-    in a random token: without it, nothing is served. Ctrl-C ends it. Needs `pip install 'surfkit[view]'`.
+    set; a crop box for `surfkit mesh` and a path for `surfkit render`. The address that is printed ends in a random
+    token: without it, nothing is served. Ctrl-C ends it. Needs `pip install 'surfkit[view]'`.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
