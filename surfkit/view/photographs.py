@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 SMALL = 160
 """Of thumbnails, pixels; read only for the cameras that are near."""
 MOST_NEAR = 60
+HERE = 0.05
+"""Distance up to which one stands at a camera, of the size of its picture."""
 TURNING = 0.5
 """Distance of the place about which the mouse turns when one stands at a camera, local units."""
 
@@ -54,10 +56,16 @@ class Photographs:
         client.camera.on_update(self._rest)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> int | None:
-        """The camera whose picture a ray meets; None if none is shown there."""
+        """The camera whose picture a ray meets; None if none is shown there.
+
+        The one at which the ray begins does not count: who stands at a camera sees the surface through its picture.
+        """
         if not self.layers.camera_size:
             return None
-        return hit_camera(corners_of(self.cameras, self.layers.camera_size)[1], origin, direction)
+        away = np.flatnonzero(np.linalg.norm(self.centres - origin, axis=1) > HERE * self.layers.camera_size)
+        _, corners = corners_of([self.cameras[at] for at in away], self.layers.camera_size)
+        met = hit_camera(corners, origin, direction)
+        return None if met is None else int(away[met])
 
     def choose(self, at: int, *, stand: bool) -> None:
         """Show a camera, and stand there if that is wanted."""

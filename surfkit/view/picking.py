@@ -117,10 +117,10 @@ def hit_points(xyz: np.ndarray, origin: np.ndarray, direction: np.ndarray, sprea
 def corners_of(cameras: Sequence[Camera], size: float) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3) centres of cameras, and (V, 4, 3) corners of their pictures as far from them as `size` times the focal
     length is to the longer side: clockwise from the upper left."""
-    poses = np.stack([camera.world_to_camera.numpy() for camera in cameras])
+    poses = np.array([camera.world_to_camera.numpy() for camera in cameras]).reshape(-1, 4, 4)
     turns = poses[:, :3, :3].transpose(0, 2, 1)
     centres = -np.einsum("vij,vj->vi", turns, poses[:, :3, 3])
-    lens = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], np.float64)
+    lens = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], np.float64).reshape(-1, 6)
     fx, fy, cx, cy, width, height = lens.T
     depth = size * fx / np.maximum(width, height)
     x, y = np.stack([-cx, width - cx, width - cx, -cx], 1), np.stack([-cy, -cy, height - cy, height - cy], 1)
@@ -131,5 +131,5 @@ def corners_of(cameras: Sequence[Camera], size: float) -> tuple[np.ndarray, np.n
 def hit_camera(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Which of the pictures with (V, 4, 3) corners a ray meets first; None without one."""
     halves = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
-    along = along_triangles(origin, direction, halves).reshape(-1, 2).min(1)
-    return int(along.argmin()) if len(along) and np.isfinite(along).any() else None
+    along = along_triangles(origin, direction, halves).reshape(-1, 2).min(1, initial=np.inf)
+    return int(along.argmin()) if np.isfinite(along).any() else None

@@ -14,7 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.export.table import SplatTable
+from surfkit.lod.tree import LodBlock, LodTree
 from surfkit.mesh.base import Mesh
+from surfkit.primitives.gaussian3d import Gaussian3D
+from surfkit.primitives.model import SplatModel
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
@@ -32,6 +35,8 @@ from surfkit.view.display import (
 from surfkit.view.glb import unlit_glb
 from surfkit.view.pictures import WORST, error_picture, picture, thumbnail
 from surfkit.view.screen import whole_view
+from surfkit.view.shelf import Shelf
+from surfkit.view.subject import Subject
 
 
 def table(count=200, kind="gaussian", seed=0):
@@ -82,6 +87,22 @@ def test_a_budget_keeps_what_is_seen_most():
         assert weight[rows].min() >= weight[left].max() * (1 - 1e-5)
     assert len(most_visible(splats, 1000)) == len(most_visible(splats, 10**9)) == 1000
     assert some(10, 3).tolist() == [0, 4, 9] and len(some(0, 5)) == 0 and some(3, 9).tolist() == [0, 1, 2]
+
+
+def test_a_budget_takes_a_level_of_detail_where_there_is_one():
+    primitive = Gaussian3D(sh_degree=0)
+    sizes = (100, 30, 8)
+    models = [SplatModel(primitive, primitive.from_table(table(n), torch.Generator())) for n in sizes]
+    blocks = [LodBlock(2, 0, 8, -1, 2.0), LodBlock(1, 0, 30, 0, 1.0), LodBlock(0, 0, 100, 1, 0.0)]
+    tree = LodTree.of(np.arange(100), models, blocks)
+    subject = Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), table(100), levels=tree)
+    for budget, count, said in ((100, 100, "all 100"), (40, 30, "level of detail 1"), (8, 8, "2 stand for 100")):
+        found, told = Shelf(subject).within(budget)
+        assert len(found) == count and said in told
+    found, told = Shelf(subject).within(5)
+    assert len(found) == 5 and told.startswith("5 of 100")
+    found, told = Shelf(replace(subject, levels=None)).within(40)
+    assert len(found) == 40 and told.startswith("40 of 100")
 
 
 def grid(n, bend=0.0):

@@ -182,6 +182,7 @@ def test_pictures_of_cameras_have_the_corners_that_they_project():
         x, y, z = camera.project(torch.from_numpy(four)).numpy().T
         assert np.allclose(x, [0, 64, 64, 0]) and np.allclose(y, [0, 0, 48, 48]) and np.allclose(z, 0.4 * 50 / 64)
     assert frustum_lines(centres, corners).shape == (40, 2, 3)
+    assert hit_camera(corners_of([], 0.4)[1], np.zeros(3), np.ones(3)) is None
     for at, camera in enumerate(cameras()):
         ahead = camera.world_to_camera[2, :3].numpy()
         eye = camera.centre.numpy() - 5 * ahead

@@ -23,6 +23,8 @@ from surfkit.export.ply import write_splats
 from surfkit.export.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
+from surfkit.partition.base import Cells, Ground
+from surfkit.partition.plan import Block, Plan
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.scene.crop import read_crop
@@ -30,6 +32,7 @@ from surfkit.scene.scene import Frame
 from surfkit.view.layers import WORLD
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
+from surfkit.view.shelf import Shelf
 from surfkit.view.subject import opened_subject
 
 TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full((3, 3), 200, np.uint8))
@@ -95,13 +98,15 @@ def test_a_click_on_a_camera_shows_its_photograph(browser, page):
     subject = page[1]
     camera = subject.views[1].camera
     ahead = camera.world_to_camera[2, :3].numpy()
-    browser.click((camera.centre.numpy() - 1e-3 * ahead) * WORLD, ahead)
+    browser.click((camera.centre.numpy() - 0.1 * ahead) * WORLD, ahead)
     browser.wait_for(lambda b: any(subject.views[1].name in text and "pixels" in text for text in b.texts()))
     browser.wait_for(lambda b: "/chosen" in b.names())
     browser.set("show", "error")
     browser.wait_for(lambda b: any("|render - photograph|" in text and "PSNR" in text for text in b.texts()))
     moved = [row for row in browser.told if row["type"] == "SetCameraPositionMessage"]
     assert np.allclose(moved[-1]["position"], camera.centre.numpy() * WORLD, atol=1e-5)
+    browser.click(camera.centre.numpy() * WORLD, ahead)  # from there, through its own picture
+    browser.wait_for(lambda b: any("not georeferenced" in t or "no surface" in t for t in b.texts()))
 
 
 @needs_native
@@ -164,6 +169,29 @@ def test_two_browsers_at_once(page, browser):
     other.close()
 
 
+@needs_native
+def test_blocks(page, tmp_path):
+    subject = page[1]
+    east = float(np.median(subject.splats.means[:, 0]))
+    boxes = ((None, None, east, None), (east, None, None, None))
+    cells = Cells(Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), boxes, (0, 1))
+    blocks = (Block(0, ("a", "b"), 2, 125, 0.5), Block(1, ("b",), 1, 125, 0.5))
+    with_plan = replace(subject, plan=Plan(cells, blocks))
+    colors = Shelf(with_plan).painted(with_plan.splats, "block")
+    assert len(np.unique(colors[with_plan.splats.means[:, 0] < east], axis=0)) == 1
+    assert len(np.unique(colors, axis=0)) == 2
+    with served(Address(), "test") as found:
+        show(with_plan, found, tmp_path)
+        browser = Browser(found.url)
+        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.set("blocks", True)
+        browser.wait_for(lambda b: {"/blocks/lines", "/blocks/1"} <= set(b.names()))
+        assert browser.names()["/blocks/0"]["text"] == "block 0: 2 views"
+        browser.set("draw as", "points")
+        browser.wait_for(lambda b: "point_size" in b.names().get("/splats", {}))
+        browser.close()
+
+
 def shown_file(path):
     """The first texts and names of the page of a file."""
     needs("viser")
@@ -199,7 +227,7 @@ def test_points_are_shown(tmp_path):
 
 
 @needs_native
-@pytest.mark.parametrize("name", ["s.ply", "s.compressed.ply", "s.spz", "s.splat", "s.sog", "s.glb"])
+@pytest.mark.parametrize("name", ["s.ply", "s.compressed.ply", "s.spz", "s.splat", "s.sog", "s.glb", "s.surfkit"])
 def test_splats_of_any_format_are_shown(tmp_path, run, name):
     path = tmp_path / name
     form = format_for(path)
