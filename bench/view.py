@@ -10,6 +10,7 @@ tens of times slower than any graphics card. Needs `pip install playwright` and 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import sys
 import tempfile
@@ -25,7 +26,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.export.table import SplatTable
 from surfkit.scene.scene import Frame
-from surfkit.view import layers
+from surfkit.view import splat_layer
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
 from surfkit.view.subject import Subject
@@ -82,10 +83,11 @@ def measured(browser: Any, url: str, form: str, budget: int, asked: argparse.Nam
     page.add_init_script(COUNTING)
     begun = time.monotonic()
     page.goto(url)
-    page.wait_for_function(f"window.drawn.length > 2 && window.drawn.at(-1)[1] >= {int(0.99 * budget)}")
-    if form == "points":
+    seen = f"window.drawn.length > 2 && window.drawn.some(each => each[1] >= {int(0.99 * budget)})"
+    page.wait_for_function(seen)
+    if form != "splats":
         page.get_by_text("draw as", exact=True).locator("xpath=following::input[1]").click(force=True)
-        page.get_by_role("option", name="points", exact=True).click(force=True)
+        page.get_by_role("option", name=form, exact=True).click(force=True)
         page.wait_for_timeout(5000)
     ready = time.monotonic() - begun
     page.mouse.move(400, 360)
@@ -111,13 +113,14 @@ def measured(browser: Any, url: str, form: str, budget: int, asked: argparse.Nam
         "frames per second": round(1000 * len(times) / (last - first), 2),
         "longest gap, s": round(float(gaps.max()), 2),
         "webgl": renderer,
+        "load of the machine": round(os.getloadavg()[0], 1),
     }
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--splats", type=int, default=3_000_000)
-    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, layers.SPLATS, 200_000])
+    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, splat_layer.SPLATS, 200_000])
     parser.add_argument("--seconds", type=float, default=30.0, help="of turning, for each budget")
     parser.add_argument("--patience", type=float, default=300.0, help="seconds to wait for the first frame")
     parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("google-chrome"))
@@ -137,11 +140,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, served(Address(), "bench") as page, sync_playwright() as play:
         show(subject, page, Path(folder))
         for budget in asked.budgets:
-            layers.SPLATS = min(budget, asked.splats)
+            splat_layer.SPLATS = min(budget, asked.splats)
             arguments = [*QUIET, *([] if asked.gpu else SOFTWARE)]
             browser = play.chromium.launch(executable_path=asked.chromium, args=arguments)
-            for form in ("splats", "points"):
-                rows.append(measured(browser, page.url, form, layers.SPLATS, asked))
+            for form in splat_layer.FORMS:
+                rows.append(measured(browser, page.url, form, splat_layer.SPLATS, asked))
                 print(rows[-1], flush=True)
             browser.close()
     save("view", {"splats": asked.splats, "window": [SIZE["width"], SIZE["height"]], "budgets": rows})

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfkit.render.path import beside
-from surfkit.view.layers import WORLD, Layers, telling
+from surfkit.view.layers import Layers
 from surfkit.view.photographs import Photographs
-from surfkit.view.screen import ray_of
+from surfkit.view.screen import WORLD, ray_of, telling
 from surfkit.view.server import Served
 from surfkit.view.shelf import Shelf
 from surfkit.view.subject import Subject

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.view.layers import REST_S, WORLD, Layers, telling
+from surfkit.view.layers import Layers
 from surfkit.view.picking import corners_of, hit_camera
 from surfkit.view.pictures import KINDS, Kind, picture, thumbnail
-from surfkit.view.screen import quaternion_of, stand_at, whole_view
+from surfkit.view.screen import REST_S, WORLD, quaternion_of, stand_at, telling, whole_view
 from surfkit.view.shelf import Shelf
 
 if TYPE_CHECKING:

@@ -1,17 +1,52 @@
-"""Between a browser's camera, in the units of the page, and places and cameras of the local frame."""
+"""Between a browser and the local frame: its camera, its clicks, and what its user asks for."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
-from surfkit.view.layers import WORLD
 
 if TYPE_CHECKING:
     import viser
+
+WORLD = 10.0
+"""Units of the page per local unit: keys move the camera by two units of the page a second."""
+REST_S = 0.4
+"""A slider or a camera that has not moved for so long is at rest."""
+
+
+class Latest:
+    """Does what was asked for last, after a moment of rest: sliders send each place that they pass."""
+
+    def __init__(self, action: Callable[[], None]) -> None:
+        """Do `action`."""
+        self.action, self.asked = action, 0
+
+    def __call__(self, _event: Any = None) -> None:
+        """Ask for it, and do it here if nobody asks again."""
+        self.asked += 1
+        mine = self.asked
+        time.sleep(REST_S)
+        if mine == self.asked:
+            self.action()
+
+
+def telling(client: viser.ClientHandle, action: Callable[..., None]) -> Callable[[Any], None]:
+    """A callback that shows what a user can correct as a note on the page."""
+
+    def guarded(event: Any) -> None:
+        try:
+            action(event)
+        except (BadInput, OSError) as error:
+            client.add_notification("That did not work", " ".join(str(error).split()), color="red")
+
+    return guarded
 
 
 def ray_of(event: viser.SceneClickEvent) -> tuple[np.ndarray, np.ndarray]:

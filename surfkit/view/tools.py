@@ -15,10 +15,10 @@ from surfkit.core.check import BadInput
 from surfkit.scene.crop import Crop, write_crop
 from surfkit.view.crop_box import edges, sizes, turned_box, upright_axis
 from surfkit.view.keyframes import KeyPath, write_path
-from surfkit.view.layers import WORLD, frustum_lines, telling
+from surfkit.view.layers import frustum_lines
 from surfkit.view.measure import coordinates, in_words, measured, path_lines, shown
 from surfkit.view.picking import corners_of
-from surfkit.view.screen import pose_of, stand_at
+from surfkit.view.screen import WORLD, pose_of, stand_at, telling
 from surfkit.view.shelf import Shelf
 
 if TYPE_CHECKING:

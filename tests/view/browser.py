@@ -16,15 +16,17 @@ class Browser:
         protocol = f"viser-v{viser.__version__}"
         self.socket = client.connect(f"ws://{at.netloc}/?{at.query}", subprotocols=[protocol], max_size=None)
         self.told, self.gui = [], {}
-        self.send(
-            self.messages.ViewerCameraMessage(
-                (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0.01, 1e3, 600, 800, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
-            )
-        )
+        self.stand(0.0)
 
     def send(self, message):
         pack = needs("msgspec.msgpack")
         self.socket.send(pack.encode(message.as_serializable_dict()))
+
+    def stand(self, z):
+        """The camera at a height, looking up."""
+        lens = (1.0, 0.01, 1e3, 600, 800)
+        pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z), *lens, (0.0, 0.0, z + 1.0), (0.0, -1.0, 0.0))
+        self.send(self.messages.ViewerCameraMessage(*pose))
 
     def click(self, origin, direction):
         """A click, of a ray in units of the page."""

@@ -29,8 +29,8 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
-from surfkit.view.layers import WORLD
 from surfkit.view.page import show
+from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, served
 from surfkit.view.shelf import Shelf
 from surfkit.view.subject import opened_subject
@@ -91,6 +91,16 @@ def test_fewer_splats_and_other_colours(browser, page):
     browser.wait_for(lambda b: any("dark" in text and "pale" in text for text in b.texts()))
     browser.set("most splats", 100)
     browser.wait_for(lambda b: any(f"100 of {len(page[1].splats):,}" in text for text in b.texts()))
+
+
+@needs_native
+def test_points_while_the_camera_moves(browser):
+    browser.wait_for(lambda b: "buffer" in b.names().get("/splats", {}))
+    browser.set("draw as", "points while moving")
+    for z in range(8):
+        browser.stand(float(z))
+        browser.wait_for(lambda b: "point_size" in b.names().get("/splats", {}))
+    browser.wait_for(lambda b: "buffer" in b.names().get("/splats", {}))
 
 
 @needs_native
