@@ -20,8 +20,8 @@ MOVING = 100_000
 """Points while the camera moves."""
 STEP = 10_000
 """Of the sliders."""
-DOT = 1.5
-"""Size of splats that are drawn as points, thousandths of a local unit."""
+DOT = 200.0
+"""Size of splats that are drawn as points, thousandths of `Drawn.unit`: two standard deviations."""
 FORMS = ("splats", "points", "points while moving")
 
 
@@ -59,7 +59,7 @@ class SplatLayer:
             budget = min(self.budget.value, MOVING) if self.moving else self.budget.value
             found, told = self.shelf.splats(budget, chosen)
             if self.moving or self.form.value == "points":
-                self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT)
+                self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * found.unit)
             else:
                 self.node = self.client.scene.add_gaussian_splats(
                     "/splats",

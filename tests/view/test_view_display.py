@@ -182,6 +182,7 @@ def test_errors_are_the_differences_to_the_photograph(tmp_path):
     assert "mean 0.0%" in told and "PSNR infinite" in told and (exact == exact[0, 0]).all()
     off, told = picture(view, "error", lambda v: maps(v, 100 / 255 + 0.1), frame)
     assert "mean 10.0%" in told and "PSNR 20.00 dB" in told and off.sum() > exact.sum()
+    assert np.array_equal(picture(view, "error", lambda v: maps(v, 100 / 255 - 0.1), frame)[0], off), "without its sign"
     worst = error_picture(maps(view, 1.0), torch.zeros(3, 30, 40))[0]
     assert np.array_equal(worst, error_picture(maps(view, WORST), torch.zeros(3, 30, 40))[0])
 
