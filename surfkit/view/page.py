@@ -47,9 +47,19 @@ def show(subject: Subject, served: Served, folder: Path) -> None:
     if subject.mesh is not None:  # so that the first click need not wait
         threading.Thread(target=lambda: shelf.triangles, daemon=True).start()
 
+    pages: dict[int, Page] = {}
+
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        telling(client, lambda _: Page(shelf, client, folder))(None)
+        def build(_event: None) -> None:
+            pages[client.client_id] = Page(shelf, client, folder)
+
+        telling(client, build)(None)
+
+    @server.on_client_disconnect
+    def _(client: viser.ClientHandle) -> None:
+        if (page := pages.pop(client.client_id, None)) is not None:
+            page.path.stop()
 
 
 class Page:
@@ -63,7 +73,7 @@ class Page:
         self.measure = Measure(shelf, client)
         self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
-        PathTool(shelf, client, folder)
+        self.path = PathTool(shelf, client, folder)
         with client.gui.add_folder("Help", expand_by_default=False):
             client.gui.add_markdown(HELP)
         client.scene.on_click()(telling(client, self._click))

@@ -17,6 +17,7 @@ import secrets
 import socket
 import sys
 import threading
+import warnings
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -109,6 +110,7 @@ def require_viser() -> ModuleType:
     with needed("viser", "surfkit view"):
         import viser
 
+    warnings.filterwarnings("ignore", "Queued a .*never be delivered", UserWarning)  # a browser was closed: all is well
     return viser
 
 

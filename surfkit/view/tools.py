@@ -217,7 +217,7 @@ class PathTool:
     def _play(self) -> None:
         """Fly along the path, in the time that it takes; a second click stops it."""
         if self.playing.is_set():
-            self.playing.clear()
+            self.stop()
             return
         cameras, keys = self.keys.cameras(), self.keys
         before, self.client.camera.fov = self.client.camera.fov, math.radians(keys.fov_degrees)
@@ -229,6 +229,10 @@ class PathTool:
             time.sleep(PREVIEW_S)
         self.playing.clear()
         self.client.camera.fov = before
+
+    def stop(self) -> None:
+        """End the preview."""
+        self.playing.clear()
 
     def _write(self) -> None:
         subject = self.shelf.subject

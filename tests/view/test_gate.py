@@ -2,7 +2,9 @@
 
 import asyncio
 import http.client
+import os
 import socket
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import pytest
@@ -124,20 +126,22 @@ def test_it_listens_on_this_machine_alone_and_cannot_be_shared(page):
     assert messages.GuiUpdateMessage in page.viser._websock_server._incoming_handlers  # such is where they would be
 
 
-def test_other_ports_are_not_opened(page):
-    """The port that is gated is the only one on which this process listens."""
-    with open("/proc/net/tcp") as lines, open("/proc/net/tcp6") as more:
-        import os
+def listening():
+    """Ports on which this process listens."""
+    own = set()
+    for name in os.listdir("/proc/self/fd"):
+        with suppress(OSError):
+            own.add(os.readlink(f"/proc/self/fd/{name}"))
+    with open("/proc/net/tcp") as four, open("/proc/net/tcp6") as six:
+        rows = [line.split() for line in (*four, *six)]
+    return {int(row[1].rpartition(":")[2], 16) for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
 
-        own = set()
-        for name in os.listdir("/proc/self/fd"):
-            try:
-                own.add(os.readlink(f"/proc/self/fd/{name}"))
-            except OSError:
-                continue
-        rows = [line.split() for line in [*lines, *more][1:]]
-    listening = {int(row[1].rpartition(":")[2], 16) for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
-    assert listening == {urlsplit(page.url).port}
+
+def test_no_other_port_is_opened():
+    needs("viser")
+    before = listening()
+    with served(Address(), "test") as page:
+        assert listening() - before == {urlsplit(page.url).port}
 
 
 def test_a_taken_port():

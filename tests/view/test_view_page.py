@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -303,6 +304,12 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     url = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", "".join(lines))[0]
     browser = Browser(url)
     browser.wait_for(lambda b: "/mesh" in b.names())
+    browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    browser.set("seconds", 1000.0)
+    for label in ("add this view", "add this view", "preview"):
+        browser.press(label)
+        time.sleep(0.5)
+    Browser(url).close()  # one that leaves at once
     os.kill(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=15)
     stop.cancel()
