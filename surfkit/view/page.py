@@ -52,7 +52,7 @@ def show(subject: Subject, served: Served, folder: Path) -> None:
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
-            pages[client.client_id] = Page(shelf, client, folder)
+            pages[client.client_id] = Page(shelf, client, folder, served.closing)
 
         telling(client, build)(None)
 
@@ -65,7 +65,7 @@ def show(subject: Subject, served: Served, folder: Path) -> None:
 class Page:
     """What one browser shows; another has its own layers, measures, box and path."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path) -> None:
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
         """Build the page."""
         self.shelf, self.client, self.fov = shelf, client, client.camera.fov
         client.gui.add_button("show all").on_click(lambda _: self._show_all())
@@ -73,7 +73,7 @@ class Page:
         self.measure = Measure(shelf, client)
         self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
-        self.path = PathTool(shelf, client, folder)
+        self.path = PathTool(shelf, client, folder, closing)
         with client.gui.add_folder("Help", expand_by_default=False):
             client.gui.add_markdown(HELP)
         client.scene.on_click()(telling(client, self._click))

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 100
 """Where a free port is looked for, if none is asked for."""
+CLOSE_S = 1.0
+"""For a browser to say that it has heard the end."""
 SILENT = logging.getLogger("surfkit.view.requests")
 SILENT.setLevel(logging.CRITICAL)  # a request that is refused is no event of the program
 PATCHING = threading.Lock()
@@ -65,10 +67,12 @@ class Served:
     Attributes:
         viser: What is shown; every client of it has come through the gate.
         url: With the token.
+        closing: Set when the server is about to end, for whatever goes on for long.
     """
 
     viser: viser.ViserServer
     url: str
+    closing: threading.Event
 
     def open_browser(self) -> bool:
         """Open the page in a browser; False where there is no display to open one on."""
@@ -93,12 +97,14 @@ def served(address: Address, title: str) -> Iterator[Served]:
     try:
         with _gated(gate, listener) as used, _quiet():
             server = package.ViserServer(address.host, gate.port, label=title, verbose=False)
+        closing = threading.Event()
         try:
             if not used:
                 raise Fault(f"viser {package.__version__} starts its server in an unknown way: pip install 'viser<1.2'")
             _never_share(server)
-            yield Served(server, f"http://{_shown_host(address.host)}:{gate.port}/?token={gate.token}")
+            yield Served(server, f"http://{_shown_host(address.host)}:{gate.port}/?token={gate.token}", closing)
         finally:
+            closing.set()
             with _quiet():
                 server.stop()
     finally:
@@ -160,7 +166,8 @@ def _gated(gate: Gate, listener: socket.socket) -> Iterator[list[bool]]:
             return _refusal_or_cookie(gate, request) or process_request(connection, request)
 
         used.append(True)
-        return plain(handler, sock=listener, process_request=answer, logger=SILENT, **settings)
+        settings |= {"process_request": answer, "logger": SILENT, "close_timeout": CLOSE_S}
+        return plain(handler, sock=listener, **settings)
 
     with PATCHING:
         library.serve = serve

@@ -147,21 +147,20 @@ def of_file(path: Path, device: Device) -> Subject:
     """What a file holds."""
     if holds_splats(path):
         return of_splats(path, device)
-    notes = coordinates_of(path)
-    surface, xyz, rgb = None, np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if path.suffix.lower() in MESHES:
         surface, colors, notes = other_mesh(path)
     else:
-        surface = read_surface(path)
-        if surface.faces is None:
-            xyz, rgb = read_points(path)
+        surface, notes = read_surface(path), coordinates_of(path)
         colors = colors_of(surface)
-    if surface.faces is None and not len(xyz):
-        xyz, rgb = surface.vertices(), colors if colors is not None else np.full((len(surface), 3), 128, np.uint8)
-    frame = frame_of(surface.vertices() if surface.faces is not None else xyz, notes)
     up = np.array([0.0, 0.0, 1.0])
     if surface.faces is not None:
+        frame = frame_of(surface.vertices(), notes)
         return Subject(path, frame, up, mesh=local_mesh(surface, frame, colors))
+    if path.suffix.lower() in MESHES:
+        xyz, rgb = surface.vertices(), np.full((len(surface), 3), 128, np.uint8) if colors is None else colors
+    else:
+        xyz, rgb = read_points(path)
+    frame = frame_of(xyz, notes)
     return Subject(path, frame, up, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
 
 

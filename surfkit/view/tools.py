@@ -166,9 +166,9 @@ class CropTool:
 class PathTool:
     """Key views of a path, its preview, and its file."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path) -> None:
-        """Build the panel; files go into `folder`."""
-        self.shelf, self.client, self.folder = shelf, client, folder
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
+        """Build the panel; files go into `folder`, and a preview ends when the server is `closing`."""
+        self.shelf, self.client, self.folder, self.closing = shelf, client, folder, closing
         self.poses: list[np.ndarray] = []
         self.playing = threading.Event()
         gui = client.gui
@@ -226,7 +226,8 @@ class PathTool:
         while self.playing.is_set() and (gone := time.monotonic() - begun) < keys.seconds:
             at = min(int(gone / keys.seconds * len(cameras)), len(cameras) - 1)
             stand_at(self.client, cameras[at].world_to_camera.numpy(), 1.0)
-            time.sleep(PREVIEW_S)
+            if self.closing.wait(PREVIEW_S):
+                return
         self.playing.clear()
         self.client.camera.fov = before
 

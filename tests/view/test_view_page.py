@@ -295,7 +295,7 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     write_mesh(tmp_path / "mesh.ply", TRIANGLE, SURVEY)
     words = [sys.executable, "-m", "surfkit.cli", "view", str(tmp_path / "mesh.ply"), "--no-open"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    stop = threading.Timer(60, process.kill)
+    stop = threading.Timer(120, process.kill)
     stop.start()
     lines = []
     while not any("Ctrl-C" in line for line in lines):
@@ -311,7 +311,7 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
         time.sleep(0.5)
     Browser(url).close()  # one that leaves at once
     os.kill(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=15)
+    out, err = process.communicate(timeout=30)
     stop.cancel()
     assert process.returncode == 0 and "ended" in out and not err
     browser.close()
