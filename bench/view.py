@@ -27,12 +27,11 @@ from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.export.table import SplatTable
 from surfkit.scene.scene import Frame
-from surfkit.view import splat_layer
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
+from surfkit.view.shelf import FORMS, MOST
 from surfkit.view.subject import Subject
 
-FORMS = ("points", "splats", "points while moving")
 SIZE = {"width": 1280, "height": 720}
 SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 QUIET = ["--no-sandbox", "--disable-background-networking", "--disable-sync", "--no-first-run"]
@@ -119,7 +118,7 @@ def measured(browser: Any, url: str, form: str, budget: int, asked: argparse.Nam
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--splats", type=int, default=3_000_000)
-    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, splat_layer.SPLATS, 200_000])
+    parser.add_argument("--budgets", type=int, nargs="+", default=[3_000_000, MOST, 200_000])
     parser.add_argument("--seconds", type=float, default=30.0, help="of turning, for each budget")
     parser.add_argument("--patience", type=float, default=300.0, help="seconds to wait for the first frame")
     parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("google-chrome"))
@@ -136,14 +135,13 @@ def main() -> int:
         return 2
     subject = Subject(Path("city"), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0]), splats=city(asked.splats))
     rows = []
-    with tempfile.TemporaryDirectory() as folder, served(Address(), "bench") as page, sync_playwright() as play:
-        show(subject, page, Path(folder))
-        arguments = [*QUIET, *([] if asked.gpu else SOFTWARE)]
+    arguments = [*QUIET, *([] if asked.gpu else SOFTWARE)]
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         for form, budget in product(FORMS, sorted(asked.budgets)):
-            splat_layer.SPLATS = min(budget, asked.splats)
-            splat_layer.FORMS = (form, *(other for other in FORMS if other != form))  # the first is chosen at first
             browser = play.chromium.launch(executable_path=asked.chromium, args=arguments)
-            rows.append(measured(browser, page.url, form, splat_layer.SPLATS, asked))
+            with served(Address(), "bench") as page:
+                show(subject, page, Path(folder), budget, form)
+                rows.append(measured(browser, page.url, form, min(budget, asked.splats), asked))
             browser.close()
             print(rows[-1], flush=True)
             save("view", {"splats": asked.splats, "window": [SIZE["width"], SIZE["height"]], "rows": rows})

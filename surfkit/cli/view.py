@@ -14,6 +14,7 @@ from surfkit.raster.select import Device
 from surfkit.run.notes import collect_notes
 from surfkit.view.page import show
 from surfkit.view.server import LOCAL, Address, require_viser, served
+from surfkit.view.shelf import MOST, Form
 from surfkit.view.subject import opened_subject
 
 PORTS = range(1, 65536)
@@ -34,6 +35,13 @@ class View:
     out: Path | None = None
     """Folder for crop boxes and paths. Default: RUN/view, or FILE-view beside the file."""
 
+    most: int = MOST
+    """Splats, triangles and points that are sent to a browser at first; sliders on the page change it."""
+
+    draw: Form = "splats"
+    """How splats are drawn at first. Points are for machines without a graphics card; with points-while-moving, splats
+    come back when the camera rests."""
+
     host: str = LOCAL
     """Address to serve at. 0.0.0.0 lets other machines connect, if they have the token; nothing is encrypted."""
 
@@ -49,6 +57,8 @@ class View:
     def __post_init__(self) -> None:
         if self.port is not None and self.port not in PORTS:
             raise BadInput(f"--port {self.port}: give {PORTS[0]} to {PORTS[-1]}")
+        if self.most < 1:
+            raise BadInput(f"--most {self.most}: give 1 or more")
         if self.out is not None and self.out.is_file():
             raise BadInput(f"--out {self.out}: a file; name a folder")
 
@@ -65,7 +75,7 @@ class View:
         address = Address(self.host, self.port)
         with collect_notes(), opened_subject(self.source, self.device) as subject:
             with served(address, f"surfkit: {self.source.resolve().name}") as page:
-                show(subject, page, self.folder)
+                show(subject, page, self.folder, self.most, self.draw)
                 print(f"{self.source} is shown at\n\n    {page.url}\n\nCtrl-C ends it.", flush=True)
                 if not address.is_local:
                     print("Whoever has this address can look; what is sent is not encrypted.", flush=True)

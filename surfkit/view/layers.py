@@ -18,8 +18,6 @@ from surfkit.view.splat_layer import STEP, SplatLayer, add_points, end_of
 if TYPE_CHECKING:
     import viser
 
-TRIANGLES, POINTS = 1_000_000, 500_000
-"""Most that are sent to a browser, unless the user moves a slider."""
 TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
 MOST_LABELS = 400
@@ -52,7 +50,7 @@ class Layers:
     def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
         count, most = len(mesh.faces), end_of(len(mesh.faces))
         shown = gui.add_checkbox("mesh", self.shows_mesh)
-        budget = gui.add_slider("most triangles", min(STEP, count), most, STEP, min(TRIANGLES, most))
+        budget = gui.add_slider("most triangles", min(STEP, count), most, STEP, min(self.shelf.most, most))
         plain = gui.add_checkbox("mesh in grey", mesh.colors is None, disabled=mesh.colors is None)
         note = gui.add_markdown("")
 
@@ -92,7 +90,7 @@ class Layers:
         shown = gui.add_checkbox("points" if alone else "sparse points", alone)
         size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
         most = end_of(count)
-        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(POINTS, most))
+        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(self.shelf.most, most))
         note = gui.add_markdown("")
 
         def draw() -> None:

@@ -13,7 +13,7 @@ from surfkit.view.layers import Layers
 from surfkit.view.photographs import Photographs
 from surfkit.view.screen import WORLD, ray_of, telling
 from surfkit.view.server import Served
-from surfkit.view.shelf import Shelf
+from surfkit.view.shelf import MOST, Form, Shelf
 from surfkit.view.subject import Subject
 from surfkit.view.tools import CropTool, Measure, PathTool
 
@@ -29,15 +29,17 @@ HELP = """
 """
 
 
-def show(subject: Subject, served: Served, folder: Path) -> None:
+def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form: Form = "splats") -> None:
     """Show a subject to every browser that comes.
 
     Args:
         subject: What to look at.
         served: A server with an empty scene.
         folder: For the files that a user writes.
+        most: Splats, triangles and points that are sent to a browser to begin with.
+        form: How splats are drawn to begin with.
     """
-    shelf = Shelf(subject)
+    shelf = Shelf(subject, most, form)
     server = served.viser
     up, at, middle = first_view(subject)
     server.scene.set_up_direction(up)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from functools import lru_cache
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -28,6 +29,9 @@ from surfkit.view.display import (
 from surfkit.view.picking import Triangles, hit_points, hit_splats
 from surfkit.view.subject import Subject
 
+Form = Literal["splats", "points", "points-while-moving"]
+FORMS: tuple[Form, ...] = get_args(Form)
+MOST = 1_000_000
 CONE = 0.004
 """Radius, at distance 1, of the cone in which a click finds a point: four pixels of a window, about."""
 KEPT = 2
@@ -41,11 +45,13 @@ class Shelf:
         subject: What is looked at.
         axes: (3, 3) east, north and up in rows, local frame.
         heights: What the ends of the colours of heights are, local units along up.
+        most: Splats, triangles and points that are sent to a browser, unless its user moves a slider.
+        form: How splats are drawn, unless its user chooses another way.
     """
 
-    def __init__(self, subject: Subject) -> None:
+    def __init__(self, subject: Subject, most: int = MOST, form: Form = "splats") -> None:
         """Nothing is made yet."""
-        self.subject = subject
+        self.subject, self.most, self.form = subject, most, form
         self.axes = map_axes(subject.up)
         self.heights = height_bounds(subject.positions() @ subject.up)
         self.drawing, self.making = threading.Lock(), threading.RLock()

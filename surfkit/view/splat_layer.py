@@ -9,20 +9,17 @@ import numpy as np
 
 from surfkit.view.display import Colors
 from surfkit.view.screen import WORLD, Latest, telling
-from surfkit.view.shelf import Shelf
+from surfkit.view.shelf import FORMS, Shelf
 
 if TYPE_CHECKING:
     import viser
 
-SPLATS = 1_000_000
-"""Most that are sent to a browser, unless the user moves the slider."""
 MOVING = 100_000
 """Points while the camera moves."""
 STEP = 10_000
 """Of the sliders."""
 DOT = 200.0
 """Size of splats that are drawn as points, thousandths of `Drawn.unit`: two standard deviations."""
-FORMS = ("splats", "points", "points while moving")
 
 
 class SplatLayer:
@@ -34,9 +31,9 @@ class SplatLayer:
         self.drawing, self.moving, self.node = threading.Lock(), False, None
         gui, most = client.gui, end_of(count)
         self.shown = gui.add_checkbox("splats", True)
-        self.form = gui.add_dropdown("draw as", FORMS, hint="Points are far less work for a slow machine.")
+        self.form = gui.add_dropdown("draw as", FORMS, initial_value=shelf.form, hint="Points are less work.")
         self.colors = gui.add_dropdown("colours", shelf.colors)
-        self.budget = gui.add_slider("most splats", min(STEP, count), most, STEP, min(SPLATS, most))
+        self.budget = gui.add_slider("most splats", min(STEP, count), most, STEP, min(shelf.most, most))
         self.note = gui.add_markdown("")
         self.draw()
         for switch in (self.shown, self.form, self.colors):
@@ -74,7 +71,7 @@ class SplatLayer:
 
     def _move(self, _camera: Any) -> None:
         """Points in the place of splats, until the camera rests."""
-        if self.form.value != "points while moving" or not self.shown.value:
+        if self.form.value != "points-while-moving" or not self.shown.value:
             return
         if not self.moving:
             self.moving = True

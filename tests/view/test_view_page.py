@@ -97,7 +97,7 @@ def test_fewer_splats_and_other_colours(browser, page):
 @needs_native
 def test_points_while_the_camera_moves(browser):
     browser.wait_for(lambda b: "buffer" in b.names().get("/splats", {}))
-    browser.set("draw as", "points while moving")
+    browser.set("draw as", "points-while-moving")
     for z in range(8):
         browser.stand(float(z))
         browser.wait_for(lambda b: "point_size" in b.names().get("/splats", {}))
@@ -278,7 +278,11 @@ def test_what_cannot_be_shown_is_refused(tmp_path, capsys):
         assert main(["view", str(tmp_path / name)]) == 2, name
         error = capsys.readouterr().err
         assert error.startswith("surfkit: ") and error.count("\n") == 1 and said in error, error
-    for words, said in ((["--port", "0"], "--port 0"), (["--out", str(tmp_path / "text.txt")], "a file")):
+    for words, said in (
+        (["--port", "0"], "--port 0"),
+        (["--out", str(tmp_path / "text.txt")], "a file"),
+        (["--most", "0"], "--most 0"),
+    ):
         assert main(["view", str(tmp_path / "bad.ply"), *words]) == 2
         assert said in capsys.readouterr().err
 
