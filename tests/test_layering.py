@@ -24,8 +24,8 @@ FLOORS = (
     "blocks",
     "pipeline",
     "report doctor render",
-    "recipes",
-    "cli viewer testing",
+    "recipes view",
+    "cli testing",
 )
 LEVEL = {name: level for level, floor in enumerate(FLOORS) for name in floor.split()}
 TEMPLATES = ROOT / "cli" / "new" / "templates"

@@ -29,6 +29,7 @@ COMMANDS = {
     "lod": "Make levels of detail of a finished run, or make them again with other settings.",
     "evaluate": "Measure a finished run on held-out photographs, or its mesh against ground truth.",
     "render": "Draw a finished run along a path of the camera, as a video or as pictures.",
+    "view": "Look at a finished run, or a file of splats, a mesh or points, in a browser.",
     "doctor": "Check a data set before training: errors in it, and the memory, disk and time of a run.",
     "status": "Show the progress of a run.",
     "curves": "Draw a chart of the points, the loss or the memory of runs over the steps.",

@@ -1,0 +1,164 @@
+"""Layers of the page: splats, mesh, sparse points, cameras, blocks; with their switches, in one browser."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from surfkit.mesh.base import Mesh
+from surfkit.view.display import PALETTE, some
+from surfkit.view.glb import unlit_glb
+from surfkit.view.outlines import block_outlines
+from surfkit.view.picking import corners_of
+from surfkit.view.screen import WORLD, Latest, telling
+from surfkit.view.shelf import Shelf
+from surfkit.view.splat_layer import STEP, SplatLayer, add_points, end_of
+
+if TYPE_CHECKING:
+    import viser
+
+TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
+"""Colours of cameras."""
+MOST_LABELS = 400
+"""Blocks that get a label."""
+
+
+class Layers:
+    """What is drawn in one browser, and its switches."""
+
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle) -> None:
+        """Build the switches, and draw."""
+        self.shelf, self.client, self.subject = shelf, client, shelf.subject
+        self.shows_mesh = self.subject.splats is None
+        self.typical_size = self._typical_size()
+        self.camera_size = self.typical_size if self.subject.views else 0.0
+        gui = client.gui
+        with gui.add_folder("Layers"):
+            if self.subject.splats is not None:
+                SplatLayer(shelf, client, len(self.subject.splats))
+            if self.subject.mesh is not None:
+                self._mesh_switches(gui, self.subject.mesh)
+            if self.subject.points is not None:
+                self._point_switches(gui)
+            if self.subject.views:
+                self._camera_switches(gui)
+            if self.subject.plan is not None:
+                shown = gui.add_checkbox("blocks", False)
+                shown.on_update(telling(client, lambda _: self._blocks(shown.value)))
+
+    def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
+        count, most = len(mesh.faces), end_of(len(mesh.faces))
+        shown = gui.add_checkbox("mesh", self.shows_mesh)
+        budget = gui.add_slider("most triangles", min(STEP, count), most, STEP, min(self.shelf.most, most))
+        plain = gui.add_checkbox("mesh in grey", mesh.colors is None, disabled=mesh.colors is None)
+        note = gui.add_markdown("")
+
+        def draw() -> None:
+            self.shows_mesh = shown.value
+            for part in (budget, plain, note):
+                part.visible = shown.value
+            if not shown.value:
+                self.client.scene.remove_by_name("/mesh")
+                return
+            found = self.shelf.mesh(budget.value)
+            self._add_mesh(found, plain.value)
+            note.content = (
+                f"all {count:,} triangles are shown"
+                if len(found.faces) == count
+                else f"{len(found.faces):,} triangles stand for {count:,}; clicks meet all"
+            )
+
+        draw()
+        for switch in (shown, plain):
+            switch.on_update(telling(self.client, lambda _: draw()))
+        budget.on_update(telling(self.client, Latest(draw)))
+
+    def _add_mesh(self, mesh: Mesh, plain: bool) -> None:
+        if plain or mesh.colors is None:
+            self.client.scene.add_mesh_simple(
+                "/mesh", mesh.vertices, mesh.faces, color=(190, 190, 190), side="double", scale=WORLD
+            )
+            return
+        self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
+
+    def _point_switches(self, gui: viser.GuiApi) -> None:
+        points = self.subject.points
+        assert points is not None
+        alone = self.subject.splats is None and self.subject.mesh is None
+        count = len(points.xyz)
+        shown = gui.add_checkbox("points" if alone else "sparse points", alone)
+        size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
+        most = end_of(count)
+        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(self.shelf.most, most))
+        note = gui.add_markdown("")
+
+        def draw() -> None:
+            for part in (size, budget, note):
+                part.visible = shown.value
+            if not shown.value:
+                self.client.scene.remove_by_name("/points")
+                return
+            rows = some(count, budget.value)
+            add_points(self.client, "/points", points.xyz[rows], points.rgb[rows], size.value)
+            note.content = f"{len(rows):,} of {count:,} points are shown"
+
+        draw()
+        shown.on_update(telling(self.client, lambda _: draw()))
+        for slider in (size, budget):
+            slider.on_update(telling(self.client, Latest(draw)))
+
+    def _camera_switches(self, gui: viser.GuiApi) -> None:
+        shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")
+        size = gui.add_slider("size of cameras", 0.2, 5.0, 0.1, 1.0)
+
+        def draw() -> None:
+            self.camera_size = self.typical_size * size.value if shown.value else 0.0
+            size.visible = shown.value
+            if not shown.value:
+                self.client.scene.remove_by_name("/cameras")
+                return
+            centres, corners = corners_of([view.camera for view in self.subject.views], self.camera_size)
+            held = np.arange(len(centres)) >= len(self.subject.scene.train)  # type: ignore[union-attr]
+            colors = np.where(held[:, None], HELD_OUT, TRAINED).astype(np.uint8)
+            self.client.scene.add_line_segments(
+                "/cameras",
+                frustum_lines(centres, corners) * WORLD,
+                np.broadcast_to(np.repeat(colors, 8, axis=0)[:, None], (8 * len(centres), 2, 3)),
+                thickness=1.5,
+                thickness_units="screen",
+            )
+
+        draw()
+        shown.on_update(telling(self.client, lambda _: draw()))
+        size.on_update(telling(self.client, Latest(draw)))
+
+    def _blocks(self, shown: bool) -> None:
+        scene = self.client.scene
+        if not shown:
+            scene.remove_by_name("/blocks")
+            return
+        plan = self.subject.plan
+        assert plan is not None
+        segments, owner, places = block_outlines(plan.cells, self.subject.positions(), self.subject.up)
+        colors = np.broadcast_to(PALETTE[owner % len(PALETTE)][:, None], (len(owner), 2, 3))
+        scene.add_frame("/blocks", show_axes=False)
+        scene.add_line_segments("/blocks/lines", segments * WORLD, colors, thickness=2.5, thickness_units="screen")
+        for block, place in zip(plan.blocks[:MOST_LABELS], places, strict=False):
+            text = f"block {block.index}: {len(block.views)} views"
+            scene.add_label(f"/blocks/{block.index}", text, position=place * WORLD, anchor="bottom-center")
+
+    def _typical_size(self) -> float:
+        """Of the pictures of cameras, local units: they do not hide one another."""
+        if not self.subject.views:
+            return 0.0
+        centres = np.stack([view.camera.centre.numpy() for view in self.subject.views])
+        reach = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+        return 0.8 * reach / max(np.sqrt(len(centres)), 3.0) if reach > 0 else 0.1
+
+
+def frustum_lines(centres: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(8 V, 2, 3) segments of (V, 3) centres and (V, 4, 3) corners: four rays and four sides of each."""
+    rays = np.stack([np.broadcast_to(centres[:, None], corners.shape), corners], axis=2)
+    sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+    return np.concatenate([rays, sides], axis=1).reshape(-1, 2, 3).astype(np.float32)

@@ -1,0 +1,107 @@
+"""The page of a subject: one for each browser that has come through the gate."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from surfkit.render.path import beside
+from surfkit.view.layers import Layers
+from surfkit.view.photographs import Photographs
+from surfkit.view.screen import WORLD, ray_of, telling
+from surfkit.view.server import Served
+from surfkit.view.shelf import MOST, Form, Shelf
+from surfkit.view.subject import Subject
+from surfkit.view.tools import CropTool, Measure, PathTool
+
+if TYPE_CHECKING:
+    import viser
+
+HELP = """
+**Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
+
+**Keys.** W A S D: fly; Q E: down, up; arrows: turn. They work after a click into the picture.
+
+**Click.** On a camera: its photograph. On the surface: its coordinates; a point of the line, while *measure* is on.
+"""
+
+
+def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form: Form = "splats") -> None:
+    """Show a subject to every browser that comes.
+
+    Args:
+        subject: What to look at.
+        served: A server with an empty scene.
+        folder: For the files that a user writes.
+        most: Splats, triangles and points that are sent to a browser to begin with.
+        form: How splats are drawn to begin with.
+    """
+    shelf = Shelf(subject, most, form)
+    server = served.viser
+    up, at, middle = first_view(subject)
+    server.scene.set_up_direction(up)
+    server.initial_camera.up = up
+    server.initial_camera.position = at * WORLD
+    server.initial_camera.look_at = middle * WORLD
+    if subject.mesh is not None:  # so that the first click need not wait
+        threading.Thread(target=lambda: shelf.triangles, daemon=True).start()
+
+    pages: dict[int, Page] = {}
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+        def build(_event: None) -> None:
+            pages[client.client_id] = Page(shelf, client, folder, served.closing)
+
+        telling(client, build)(None)
+
+    @server.on_client_disconnect
+    def _(client: viser.ClientHandle) -> None:
+        if (page := pages.pop(client.client_id, None)) is not None:
+            page.path.stop()
+
+
+class Page:
+    """What one browser shows; another has its own layers, measures, box and path."""
+
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
+        """Build the page."""
+        self.shelf, self.client, self.fov = shelf, client, client.camera.fov
+        client.gui.add_button("show all").on_click(lambda _: self._show_all())
+        self.layers = Layers(shelf, client)
+        self.measure = Measure(shelf, client)
+        self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
+        CropTool(shelf, client, folder)
+        self.path = PathTool(shelf, client, folder, closing)
+        with client.gui.add_folder("Help", expand_by_default=False):
+            client.gui.add_markdown(HELP)
+        client.scene.on_click()(telling(client, self._click))
+
+    def _show_all(self) -> None:
+        """Back to the first view."""
+        up, at, middle = first_view(self.shelf.subject)
+        camera = self.client.camera
+        camera.position, camera.look_at = at * WORLD, middle * WORLD
+        camera.up_direction, camera.fov = up, self.fov
+
+    def _click(self, event: viser.SceneClickEvent) -> None:
+        origin, direction = ray_of(event)
+        if self.photographs is not None and not self.measure.on.value:
+            camera = self.photographs.hit(origin, direction)
+            if camera is not None:
+                self.photographs.choose(camera, stand=self.photographs.follow.value)
+                return
+        self.measure.click(self.shelf.pick(origin, direction, mesh=self.layers.shows_mesh))
+
+
+def first_view(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Up, where the camera stands and what it looks at, local frame: from the side, half from above."""
+    positions = subject.positions()
+    rows = positions[:: max(1, len(positions) // 100_000)].astype(np.float64)
+    middle = np.median(rows, axis=0)
+    reach = float(np.quantile(np.linalg.norm(rows - middle, axis=1), 0.8)) or 1.0
+    east, north = beside(subject.up)
+    return subject.up, middle + 1.6 * reach * (0.3 * east - north + 0.8 * subject.up), middle

@@ -1,0 +1,150 @@
+"""What browsers that look at one subject share: what takes long is made once, and one of them draws at a time."""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from typing import Literal, get_args
+
+import numpy as np
+
+from surfkit.export.table import SplatTable
+from surfkit.maps.grid import map_axes
+from surfkit.mesh.base import Mesh
+from surfkit.raster.api import Maps
+from surfkit.scene.scene import View
+from surfkit.view.display import (
+    Colors,
+    Drawn,
+    by_block,
+    by_height,
+    by_normal,
+    drawn,
+    fewer_faces,
+    height_bounds,
+    level_within,
+    most_visible,
+    normals_of,
+)
+from surfkit.view.picking import Triangles, hit_points, hit_splats
+from surfkit.view.subject import Subject
+
+Form = Literal["splats", "points", "points-while-moving"]
+FORMS: tuple[Form, ...] = get_args(Form)
+MOST = 1_000_000
+CONE = 0.004
+"""Radius, at distance 1, of the cone in which a click finds a point: four pixels of a window, about."""
+KEPT = 2
+"""Choices of splats, and of triangles, that are kept: that of now and that of before."""
+
+
+class Shelf:
+    """A subject, and what has been made of it.
+
+    Attributes:
+        subject: What is looked at.
+        axes: (3, 3) east, north and up in rows, local frame.
+        heights: What the ends of the colours of heights are, local units along up.
+        most: Splats, triangles and points that are sent to a browser, unless its user moves a slider.
+        form: How splats are drawn, unless its user chooses another way.
+    """
+
+    def __init__(self, subject: Subject, most: int = MOST, form: Form = "splats") -> None:
+        """Nothing is made yet."""
+        self.subject, self.most, self.form = subject, most, form
+        self.axes = map_axes(subject.up)
+        self.heights = height_bounds(subject.positions() @ subject.up)
+        self.drawing, self.making = threading.Lock(), threading.RLock()
+        self._triangles: Triangles | None = None
+        self._splats = lru_cache(KEPT)(self._choose_splats)
+        self._mesh = lru_cache(KEPT)(self._choose_mesh)
+
+    @property
+    def colors(self) -> tuple[Colors, ...]:
+        """How splats can be coloured."""
+        plan: tuple[Colors, ...] = ("block",) if self.subject.plan is not None else ()
+        return ("as trained", "height", "normal", *plan)
+
+    def splats(self, budget: int, colors: Colors) -> tuple[Drawn, str]:
+        """At most `budget` splats, and a line that says which."""
+        with self.making:
+            return self._splats(budget, colors)
+
+    def mesh(self, budget: int) -> Mesh:
+        """The mesh with at most `budget` triangles."""
+        with self.making:
+            return self._mesh(budget)
+
+    @property
+    def triangles(self) -> Triangles:
+        """Of the whole mesh, for clicks."""
+        with self.making:
+            if self._triangles is None:
+                mesh = self.subject.mesh
+                assert mesh is not None
+                self._triangles = Triangles(mesh.vertices, mesh.faces)
+            return self._triangles
+
+    def draw(self, view: View) -> Maps:
+        """Maps of a view."""
+        assert self.subject.draw is not None
+        with self.drawing:
+            return self.subject.draw(view)
+
+    def pick(self, origin: np.ndarray, direction: np.ndarray, *, mesh: bool) -> np.ndarray | None:
+        """(3,) local place that a ray meets: on the mesh if that is wanted and there, else on the splats, else a point.
+
+        Args:
+            origin: (3,) local.
+            direction: (3,) unit vector.
+            mesh: Whether the mesh is looked at.
+        """
+        subject = self.subject
+        if subject.mesh is not None and (mesh or subject.draw is None):
+            along = self.triangles.hit(origin, direction)
+        elif subject.draw is not None:
+            with self.drawing:
+                along = hit_splats(subject.draw, origin, direction)
+        else:
+            xyz = subject.points.xyz if subject.points is not None else subject.positions()
+            along = hit_points(xyz, origin, direction, CONE)
+        return None if along is None else origin + along * direction
+
+    def _choose_mesh(self, budget: int) -> Mesh:
+        assert self.subject.mesh is not None
+        return fewer_faces(self.subject.mesh, budget)
+
+    def _choose_splats(self, budget: int, colors: Colors) -> tuple[Drawn, str]:
+        table, told = self.within(budget)
+        return drawn(table, self.painted(table, colors)), told
+
+    def within(self, budget: int) -> tuple[SplatTable, str]:
+        """At most `budget` splats: the finest level of detail that has no more, or the most visible ones."""
+        table, levels = self.subject.splats, self.subject.levels
+        assert table is not None
+        if len(table) <= budget:
+            return table, f"all {len(table):,} splats are shown"
+        number = level_within(levels, budget) if levels is not None else None
+        if levels is not None and number is not None:
+            level = levels.levels[number]
+            coarse = level.primitive.table(level.params).on_cpu()
+            return coarse, f"{len(coarse):,} splats of level of detail {number} stand for {len(table):,}"
+        chosen = most_visible(table, budget)
+        return table.take(chosen), f"{len(chosen):,} of {len(table):,} splats are shown: the largest and most opaque"
+
+    def painted(self, table: SplatTable, colors: Colors) -> np.ndarray | None:
+        """(N, 3) uint8; None for the colours of training."""
+        up = self.subject.up
+        if colors == "height":
+            return by_height(table.means.numpy() @ up, self.heights)
+        if colors == "normal":
+            return by_normal(normals_of(table, up), self.axes)
+        if colors == "block" and self.subject.plan is not None:
+            return by_block(self.subject.plan.cells.owner(table.means).numpy())
+        return None
+
+    def height_words(self) -> str:
+        """Heights at the ends of the colours, in the coordinates of the data set."""
+        frame, up = self.subject.frame, self.subject.up
+        low, high = (float(frame.to_input(end * up) @ up) for end in self.heights)
+        return f"dark {low:,.2f} to pale {high:,.2f}{' m' if frame.metres == 1 else ''}"

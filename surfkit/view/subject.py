@@ -1,0 +1,279 @@
+"""What is looked at: a finished run, or a file of splats, of a mesh or of points, in a local frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from surfkit.blocks.block import plan_file, read_plan
+from surfkit.core.check import BadInput
+from surfkit.core.codec import read_json
+from surfkit.core.events import Warned, emit
+from surfkit.core.optional import needed
+from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.export.files import read_splat_file
+from surfkit.export.models import refuse_unsound
+from surfkit.export.table import SplatTable
+from surfkit.lod.tree import LodTree
+from surfkit.mesh.base import Mesh
+from surfkit.method.base import Reconstruction
+from surfkit.partition.plan import Plan
+from surfkit.pipeline import loaded
+from surfkit.primitives.model import SplatModel, primitive_of
+from surfkit.raster.api import Maps
+from surfkit.raster.select import Device
+from surfkit.raster.select import select as select_rasterizer
+from surfkit.readers.sparse_ply import read_points
+from surfkit.render.path import up_of
+from surfkit.run.context import RunContext
+from surfkit.run.lod import load_levels
+from surfkit.run.method import with_drawing
+from surfkit.scene.scene import Frame, Scene, View
+
+EXTENT = 0.9
+"""Share of the positions in a file that lies within the extent of its local frame."""
+MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
+SPLATS_IN_GLTF = b"KHR_gaussian_splatting"
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""From the y up of glTF to z up."""
+NOTE = re.compile(r"^comment (crs|metres[ _]per[ _]unit|offset):? (.+)$", re.MULTILINE)
+"""What files of surfkit say of their coordinates."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """A cloud: (N, 3) float32 local positions, and (N, 3) uint8 colours."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What there is to look at; anything may be missing but one of splats, mesh and points.
+
+    Attributes:
+        path: Of the run or the file.
+        frame: Where the local frame lies.
+        up: (3,) unit vector, local frame.
+        splats: As files hold them, local frame.
+        mesh: Triangles, local frame.
+        points: A cloud.
+        scene: Views and sparse points of a run.
+        draw: Maps of a view, by the rasterizer that the model was trained with.
+        plan: How a run was cut into blocks.
+        levels: Levels of detail of a run; the first is `splats` in another order.
+    """
+
+    path: Path
+    frame: Frame
+    up: np.ndarray
+    splats: SplatTable | None = None
+    mesh: Mesh | None = None
+    points: Points | None = None
+    scene: Scene | None = None
+    draw: Callable[[View], Maps] | None = field(default=None, repr=False)
+    plan: Plan | None = None
+    levels: LodTree | None = None
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """All cameras, those of held-out photographs last."""
+        return (*self.scene.train, *self.scene.held_out) if self.scene is not None else ()
+
+    def positions(self) -> np.ndarray:
+        """(N, 3) local positions of what there is, for its bounds."""
+        if self.splats is not None:
+            return self.splats.means.numpy()
+        return self.mesh.vertices if self.mesh is not None else self.points.xyz  # type: ignore[union-attr]
+
+
+@contextmanager
+def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
+    """Within, what a run folder or a file holds.
+
+    Args:
+        path: Folder of a finished run, or a file of splats, of a mesh or of points.
+        device: That draws.
+
+    Raises:
+        BadInput: It is neither, damaged, or there is nothing in it to look at.
+    """
+    if path.is_dir() and not (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
+        with loaded(path, device) as (ctx, made):
+            yield of_run(ctx, made)
+        return
+    if not path.exists():
+        raise BadInput(f"{path}: there is no such run or file")
+    yield of_file(path, device)
+
+
+def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
+    """What a finished run holds."""
+    run, frame = ctx.run, ctx.scene.frame
+    made, table, mesh = with_drawing(made, ctx.rasterizer), None, None
+    if made.splats is not None and made.splats.primitive.in_ply:
+        table = made.splats.primitive.table(made.splats.params).on_cpu()
+    elif made.splats is not None:
+        emit(Warned("splats of this primitive cannot be drawn in a browser: photographs, mesh and pictures are shown"))
+    if run.mesh.exists() and run.mesh_record.exists():
+        mesh = local_mesh(read_surface(run.mesh), frame)
+    sparse = ctx.scene.cloud
+    points = Points(sparse.xyz.numpy(), sparse.rgb.numpy()) if len(sparse.xyz) else None
+    if table is None and mesh is None and points is None:
+        raise BadInput(f"{run.out}: it has neither splats nor a mesh nor points to look at")
+    return Subject(
+        path=run.out,
+        frame=frame,
+        up=up_of(ctx.scene),
+        splats=table,
+        mesh=mesh,
+        points=points,
+        scene=ctx.scene,
+        draw=made.draw,
+        plan=read_plan(run).plan if plan_file(run).exists() else None,
+        levels=load_levels(run, made.splats) if table is not None and run.lod_record.exists() else None,
+    )
+
+
+def of_file(path: Path, device: Device) -> Subject:
+    """What a file holds."""
+    if holds_splats(path):
+        return of_splats(path, device)
+    if path.suffix.lower() in MESHES:
+        surface, colors, notes = other_mesh(path)
+    else:
+        surface, notes = read_surface(path), coordinates_of(path)
+        colors = colors_of(surface)
+    up = np.array([0.0, 0.0, 1.0])
+    if surface.faces is not None:
+        frame = frame_of(surface.vertices(), notes)
+        return Subject(path, frame, up, mesh=local_mesh(surface, frame, colors))
+    if path.suffix.lower() in MESHES:
+        xyz, rgb = surface.vertices(), np.full((len(surface), 3), 128, np.uint8) if colors is None else colors
+    else:
+        xyz, rgb = read_points(path)
+    frame = frame_of(xyz, notes)
+    return Subject(path, frame, up, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
+
+
+def of_splats(path: Path, device: Device) -> Subject:
+    """What a file of splats holds."""
+    table = read_splat_file(path)
+    if not len(table):
+        raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
+    refuse_unsound(path, table)
+    frame = frame_of(table.means.double().numpy(), coordinates_of(path))
+    local = table.on_cpu().in_local_frame(frame)
+    primitive = primitive_of(local)
+    model = SplatModel(primitive, primitive.from_table(local, torch.Generator()), local.sh_degree)
+    made = with_drawing(Reconstruction(splats=model), select_rasterizer(device)[0])
+    return Subject(path, frame, np.array([0.0, 0.0, 1.0]), splats=local, draw=made.draw)
+
+
+def holds_splats(path: Path) -> bool:
+    """Whether a file is one of splats: what is neither a mesh nor a cloud is left to the readers of splats."""
+    if path.is_dir():
+        return True
+    head = head_of(path)
+    if head.startswith(b"ply"):
+        return b"\nelement chunk " in head or b" f_dc_0" in head
+    if path.suffix.lower() in (".glb", ".gltf"):
+        return SPLATS_IN_GLTF in head
+    return path.suffix.lower() not in MESHES
+
+
+def head_of(path: Path) -> bytes:
+    """The header of a file, or the JSON of a GLB, which begins it."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    return head.partition(b"end_header")[0] if head.startswith(b"ply") else head
+
+
+def coordinates_of(path: Path) -> dict[str, str]:
+    """What the header of a PLY file says of its coordinates, by name."""
+    if path.is_dir():
+        return {}
+    text = head_of(path).decode("ascii", "replace").replace("\r", "")
+    return {key.replace("_", " "): value.strip() for key, value in NOTE.findall(text)} if text[:3] == "ply" else {}
+
+
+def frame_of(xyz: np.ndarray, notes: Mapping[str, str]) -> Frame:
+    """The local frame of a file: about the middle of its (N, 3) positions.
+
+    Args:
+        xyz: In the frame of the input, which a shift that the header names has been added to.
+        notes: From `coordinates_of`.
+    """
+    middle = np.median(xyz, axis=0)
+    extent = float(np.quantile(np.linalg.norm(xyz - middle, axis=1), EXTENT))
+    shift = tuple(float(word) for word in notes.get("offset", "0 0 0").split())
+    metres = float(notes["metres per unit"]) if "metres per unit" in notes else None
+    return Frame(middle, 1 / extent if extent > 0 else 1.0, metres, notes.get("crs"), shift)  # type: ignore[arg-type]
+
+
+def local_mesh(surface: Surface, frame: Frame, colors: np.ndarray | None = None) -> Mesh:
+    """The triangles of a file in a local frame."""
+    vertices = frame.to_local(surface.vertices()).astype(np.float32)
+    if colors is None:
+        colors = colors_of(surface)
+    return Mesh(vertices, np.ascontiguousarray(surface.faces, np.int32), colors)
+
+
+def colors_of(surface: Surface) -> np.ndarray | None:
+    """(V, 3) uint8 of the vertices of a PLY file; None where it has none."""
+    names = ("red", "green", "blue")
+    if surface.rows.dtype.names is None or not set(names) <= set(surface.rows.dtype.names):
+        return None
+    found = np.stack([surface.rows[name] for name in names], axis=1)
+    return found if found.dtype == np.uint8 else (found * (255 if found.dtype.kind == "f" else 1)).astype(np.uint8)
+
+
+def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, dict[str, str]]:
+    """A mesh that is no PLY file, with the colours of its vertices, in the frame of the input.
+
+    A GLB of surfkit has its offset, unit and coordinate reference system in NAME.glb.json.
+    """
+    surface, notes = read_surface(path), {}
+    colors = vertex_colors(path)
+    colors = colors if colors is not None and len(colors) == len(surface) else None
+    beside = Path(f"{path}.json")
+    if path.suffix.lower() == ".glb" and beside.exists():
+        told = read_json(beside, dict[str, Any])
+        vertices = surface.vertices()
+        if str(told.get("up", "")).startswith("y"):
+            vertices = vertices @ Z_UP.T
+        surface = Surface(path, vertices + np.asarray(told.get("offset", (0, 0, 0)), np.float64), surface.faces)
+        notes = {"crs": told.get("crs"), "metres per unit": told.get("metres_per_unit")}
+        notes = {name: str(value) for name, value in notes.items() if value is not None}
+    return surface, colors, notes
+
+
+def vertex_colors(path: Path) -> np.ndarray | None:
+    """(V, 3) uint8 of a file with one mesh that trimesh reads; None where it has none, or several parts."""
+    with needed("trimesh", f"{path}: a file that is not binary PLY"):
+        import trimesh
+    found: Any = trimesh.load(path, process=False)
+    if isinstance(found, trimesh.Scene):
+        if len(found.geometry) != 1:
+            return None
+        found = next(iter(found.geometry.values()))
+    visual = getattr(found, "visual", None)
+    if visual is None or not visual.defined:
+        return None
+    if visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[:, :3]
+    if visual.kind != "texture":
+        return None
+    if "color" in visual.vertex_attributes:  # of a GLB with a material
+        colors = np.asarray(visual.vertex_attributes["color"])[:, :3]
+        whole = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
+        return np.round(colors / whole * 255).astype(np.uint8)
+    return None if visual.uv is None else np.asarray(visual.to_color().vertex_colors)[:, :3]

@@ -1,0 +1,84 @@
+"""A browser without a screen, which speaks viser's protocol: it has a camera, clicks, and keeps what it is told."""
+
+import time
+from urllib.parse import urlsplit
+
+from needs import needs
+
+
+class Browser:
+    """Connects to a page with the token of its address, and says where its camera is."""
+
+    def __init__(self, url):
+        viser, client = needs("viser"), needs("websockets.sync.client", "a websocket client")
+        self.messages = needs("viser._messages")
+        at = urlsplit(url)
+        protocol = f"viser-v{viser.__version__}"
+        self.socket = client.connect(f"ws://{at.netloc}/?{at.query}", subprotocols=[protocol], max_size=None)
+        self.told, self.gui = [], {}
+        self.stand(0.0)
+
+    def send(self, message):
+        pack = needs("msgspec.msgpack")
+        self.socket.send(pack.encode(message.as_serializable_dict()))
+
+    def stand(self, z):
+        """The camera at a height, looking up."""
+        lens = (1.0, 0.01, 1e3, 600, 800)
+        pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, z), *lens, (0.0, 0.0, z + 1.0), (0.0, -1.0, 0.0))
+        self.send(self.messages.ViewerCameraMessage(*pose))
+
+    def click(self, origin, direction):
+        """A click, of a ray in units of the page."""
+        ray = tuple(map(float, origin)), tuple(map(float, direction))
+        self.send(self.messages.ScenePointerMessage("click", *ray, ((0.5, 0.5),), None))
+
+    def set(self, label, value):
+        """What a user does to a part of the panel."""
+        self.send(self.messages.GuiUpdateMessage(self.part(label), {"value": value}))
+
+    def press(self, label):
+        """A button."""
+        self.send(self.messages.GuiUpdateMessage(self.part(label), {"value": True}))
+
+    def part(self, label):
+        return next(uuid for uuid, row in self.gui.items() if row.get("label") == label)
+
+    def texts(self):
+        """Of all parts of the panel."""
+        return [row["_markdown"] for row in self.gui.values() if row.get("_markdown")]
+
+    def wait_for(self, seen, seconds=20.0):
+        """What `seen(self)` returns as soon as it is true, after messages that have come."""
+        until = time.monotonic() + seconds
+        while not (found := seen(self)):
+            assert time.monotonic() < until, (self.texts(), [row["type"] for row in self.told][-20:])
+            try:
+                self._take(self.socket.recv(timeout=0.2))
+            except TimeoutError:
+                continue
+        return found
+
+    def names(self):
+        """Of the nodes of the scene, those that were removed left out."""
+        found = {}
+        for row in self.told:
+            if row["type"].startswith("Remove"):
+                found = {k: v for k, v in found.items() if not (k + "/").startswith(row.get("name", "?") + "/")}
+            elif "props" in row and "name" in row:
+                found[row["name"]] = row["props"]
+        return found
+
+    def _take(self, raw):
+        pack, zstandard = needs("msgspec.msgpack"), needs("zstandard")
+        size = int.from_bytes(raw[8:16], "little")
+        inner = zstandard.ZstdDecompressor().decompress(raw[16 : 16 + size], int.from_bytes(raw[:8], "little"))
+        for row in pack.decode(inner)["messages"]:
+            self.told.append(row)
+            if row["type"] == "GuiUpdateMessage":
+                self.gui.setdefault(row["uuid"], {}).update(row["updates"])
+            elif row["type"].startswith("Gui") and "props" in row:
+                self.gui[row["uuid"]] = dict(row["props"])
+
+    def close(self):
+        self.socket.close()

@@ -1,0 +1,321 @@
+"""Pages of runs and files, as a browser sees them, and what is refused in one line."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser
+from models import ORIGIN, data_set, like_3dgs
+from needs import needs, needs_native
+
+from surfkit.cli import main
+from surfkit.core.check import BadInput
+from surfkit.export.files import format_for, format_of
+from surfkit.export.ply import write_splats
+from surfkit.export.table import SplatTable
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.files import write_mesh
+from surfkit.partition.base import Cells, Ground
+from surfkit.partition.plan import Block, Plan
+from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.scene.crop import read_crop
+from surfkit.scene.scene import Frame
+from surfkit.view.page import show
+from surfkit.view.screen import WORLD
+from surfkit.view.server import Address, served
+from surfkit.view.shelf import Shelf
+from surfkit.view.subject import opened_subject
+
+TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full((3, 3), 200, np.uint8))
+GROUND = 0.125
+"""Height of the mesh of the run, local units."""
+SURVEY = Frame(np.array(ORIGIN), 0.1, 1.0, "EPSG:32632")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("view")
+    data = data_set(folder / "data", far=True)
+    words = ["recipe:2dgs", "mesh:none", "--steps", "2", "--primitive.sh-degree", "0", "--pictures-every", "0"]
+    out = folder / "run"
+    assert main(["train", *words, "--data", str(data), "--out", str(out)]) == 0
+    corners = np.array([[x, y, GROUND] for x, y in ((-9, -9), (9, -9), (9, 9), (-9, 9))], np.float32)
+    write_mesh(out / "mesh.ply", Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32)), read(Data(data)).frame)
+    (out / "mesh.json").write_text("{}")
+    return out
+
+
+@pytest.fixture(scope="module")
+def page(run, tmp_path_factory):
+    """The page of the run, and the folder for its files."""
+    needs("viser")
+    out = tmp_path_factory.mktemp("written")
+    with opened_subject(run, "cpu") as subject, served(Address(), "test") as found:
+        show(subject, found, out)
+        yield found, subject, out
+
+
+@pytest.fixture
+def browser(page):
+    found = Browser(page[0].url)
+    found.wait_for(lambda b: any("first" in t or "Click on the surface" in t for t in b.texts()))
+    found.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    yield found
+    found.close()
+
+
+@needs_native
+def test_a_run_has_splats_and_cameras(browser, page):
+    subject = page[1]
+    assert any(f"all {len(subject.splats):,} splats are shown" in text for text in browser.texts())
+    names = browser.wait_for(lambda b: {"/splats", "/cameras"} <= set(b.names()) and b.names())
+    assert "/mesh" not in names and "/points" not in names
+    browser.set("sparse points", True)
+    browser.wait_for(lambda b: "/points" in b.names())
+    browser.set("cameras", False)
+    browser.wait_for(lambda b: "/cameras" not in b.names())
+
+
+@needs_native
+def test_fewer_splats_and_other_colours(browser, page):
+    browser.set("colours", "height")
+    browser.wait_for(lambda b: any("dark" in text and "pale" in text for text in b.texts()))
+    browser.set("most splats", 100)
+    browser.wait_for(lambda b: any(f"100 of {len(page[1].splats):,}" in text for text in b.texts()))
+
+
+@needs_native
+def test_points_while_the_camera_moves(browser):
+    browser.wait_for(lambda b: "buffer" in b.names().get("/splats", {}))
+    browser.set("draw as", "points-while-moving")
+    for z in range(8):
+        browser.stand(float(z))
+        browser.wait_for(lambda b: "point_size" in b.names().get("/splats", {}))
+    browser.wait_for(lambda b: "buffer" in b.names().get("/splats", {}))
+
+
+@needs_native
+def test_a_click_on_a_camera_shows_its_photograph(browser, page):
+    subject = page[1]
+    camera = subject.views[1].camera
+    ahead = camera.world_to_camera[2, :3].numpy()
+    browser.click((camera.centre.numpy() - 0.1 * ahead) * WORLD, ahead)
+    browser.wait_for(lambda b: any(subject.views[1].name in text and "pixels" in text for text in b.texts()))
+    browser.wait_for(lambda b: "/chosen" in b.names())
+    browser.set("show", "error")
+    browser.wait_for(lambda b: any("|render - photograph|" in text and "PSNR" in text for text in b.texts()))
+    moved = [row for row in browser.told if row["type"] == "SetCameraPositionMessage"]
+    assert np.allclose(moved[-1]["position"], camera.centre.numpy() * WORLD, atol=1e-5)
+    browser.click(camera.centre.numpy() * WORLD, ahead)  # from there, through its own picture
+    browser.wait_for(lambda b: any("not georeferenced" in t or "no surface" in t for t in b.texts()))
+
+
+@needs_native
+def test_a_click_on_the_surface_measures(browser, page):
+    subject = page[1]
+    browser.set("cameras", False)
+    browser.set("mesh", True)
+    browser.wait_for(lambda b: "/mesh" in b.names() and "/cameras" not in b.names())
+    browser.set("measure", True)
+    browser.wait_for(lambda b: "/measure" in b.names())
+    corners = np.array([[0.0, 0.0, GROUND], [0.3, 0.0, GROUND], [0.3, 0.4, GROUND]])
+    for number, place in enumerate(corners):
+        browser.click((place + [0, 0, 3]) * WORLD, [0, 0, -1])
+        browser.wait_for(lambda b, n=number: f"/measure/{n}" in b.names())
+    exact = subject.frame.to_input(corners[2])
+    said = browser.wait_for(lambda b: next((t for t in b.texts() if "not georeferenced" in t), None))
+    numbers = [float(value) for value in re.findall(r"[xyz] (-?[\d.]+)", said)]
+    assert np.allclose(numbers, exact, atol=0.01), "survey coordinates"
+    unit = 1 / subject.frame.scale
+    table = browser.wait_for(lambda b: next((t for t in b.texts() if "area from above" in t), None))
+    values = [float(v.replace(",", "")) for v in re.findall(r"\| (-?[\d,.]+) ", table)]
+    assert np.allclose(values, [0.7 * unit, 0.7 * unit, 0.0, 0.06 * unit**2, 0.06 * unit**2], rtol=1e-2, atol=1e-2)
+    assert sum(name.startswith("/measure/label") for name in browser.names()) == 2
+    browser.set("measure", False)
+    browser.wait_for(lambda b: not any(name.startswith("/measure/") for name in b.names()))
+
+
+@needs_native
+def test_files_that_the_page_writes(browser, page):
+    _, subject, out = page
+    browser.set("show the box", True)
+    browser.wait_for(lambda b: "/crop/box" in b.names())
+    browser.press("write crop file")
+    text = browser.wait_for(lambda b: next((t for t in b.texts() if "surfkit mesh" in t), None))
+    crop = read_crop(out / "crop.json")
+    assert str(out / "crop.json") in text and str(subject.path) in text
+    places = subject.frame.to_input(subject.splats.means.numpy())
+    assert 0.6 < crop.inside(places).mean() < 1
+    for _ in range(2):
+        browser.press("add this view")
+    browser.wait_for(lambda b: any("2 key views" in t for t in b.texts()))
+    browser.press("write path file")
+    browser.wait_for(lambda b: any("surfkit render" in t for t in b.texts()))
+    assert len(json.loads((out / "path.json").read_text())["camera_path"]) == 300
+
+
+@needs_native
+def test_two_browsers_at_once(page, browser):
+    other = Browser(page[0].url)
+    other.wait_for(lambda b: "/splats" in b.names())
+    other.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    other.set("measure", True)
+    other.set("mesh", True)
+    other.wait_for(lambda b: {"/mesh", "/measure"} <= set(b.names()))
+    other.click((0.0, 0.0, 3 * WORLD), (0, 0, -1))
+    other.wait_for(lambda b: "/measure/0" in b.names())
+    browser.set("sparse points", True)
+    browser.wait_for(lambda b: "/points" in b.names())
+    assert "/measure/0" not in browser.names() and "/points" not in other.names()
+    other.close()
+
+
+@needs_native
+def test_blocks(page, tmp_path):
+    subject = page[1]
+    east = float(np.median(subject.splats.means[:, 0]))
+    boxes = ((None, None, east, None), (east, None, None, None))
+    cells = Cells(Ground((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), boxes, (0, 1))
+    blocks = (Block(0, ("a", "b"), 2, 125, 0.5), Block(1, ("b",), 1, 125, 0.5))
+    with_plan = replace(subject, plan=Plan(cells, blocks))
+    colors = Shelf(with_plan).painted(with_plan.splats, "block")
+    assert len(np.unique(colors[with_plan.splats.means[:, 0] < east], axis=0)) == 1
+    assert len(np.unique(colors, axis=0)) == 2
+    with served(Address(), "test") as found:
+        show(with_plan, found, tmp_path)
+        browser = Browser(found.url)
+        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.set("blocks", True)
+        browser.wait_for(lambda b: {"/blocks/lines", "/blocks/1"} <= set(b.names()))
+        assert browser.names()["/blocks/0"]["text"] == "block 0: 2 views"
+        browser.set("draw as", "points")
+        browser.wait_for(lambda b: "point_size" in b.names().get("/splats", {}))
+        browser.close()
+
+
+def shown_file(path):
+    """The first texts and names of the page of a file."""
+    needs("viser")
+    with opened_subject(path, "cpu") as subject, served(Address(), "test") as found:
+        show(subject, found, path.parent / "out")
+        browser = Browser(found.url)
+        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.wait_for(lambda b: {"/splats", "/mesh", "/points"} & set(b.names()))
+        names = set(browser.names())
+        browser.close()
+    return subject, names
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "mesh.glb", "mesh.obj"])
+def test_a_mesh_is_shown_in_its_coordinates(tmp_path, name):
+    needs("trimesh")
+    write_mesh(tmp_path / name, TRIANGLE, SURVEY)
+    subject, names = shown_file(tmp_path / name)
+    assert "/mesh" in names and "/splats" not in names
+    back = subject.frame.to_input(subject.mesh.vertices)
+    assert np.allclose(back, SURVEY.to_input(TRIANGLE.vertices), atol=1e-3)
+    assert subject.frame.crs == (None if name.endswith("obj") else "EPSG:32632")
+    assert np.allclose(subject.mesh.colors, 200, atol=1)
+
+
+def test_points_are_shown(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    colors = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    (tmp_path / "a.ply").write_text(f"{header}{colors}end_header\n0 0 0 9 8 7\n1 0 0 1 2 3\n0 1 0 4 5 6\n")
+    subject, names = shown_file(tmp_path / "a.ply")
+    assert "/points" in names and subject.points.rgb[0].tolist() == [9, 8, 7]
+    assert np.allclose(subject.frame.to_input(subject.points.xyz)[1], [1, 0, 0], atol=1e-5)
+
+
+@needs_native
+@pytest.mark.parametrize("name", ["s.ply", "s.compressed.ply", "s.spz", "s.splat", "s.sog", "s.glb", "s.surfkit"])
+def test_splats_of_any_format_are_shown(tmp_path, run, name):
+    path = tmp_path / name
+    form = format_for(path)
+    form.write(path, format_of(run / "point_cloud.ply").read(run / "point_cloud.ply"))
+    with opened_subject(path, "cpu") as subject:
+        assert len(subject.splats) == 250 and subject.draw is not None and subject.mesh is None
+
+
+@needs_native
+def test_the_offset_of_a_file_of_splats(tmp_path):
+    count = 50
+    draw = torch.Generator().manual_seed(0)
+    means = torch.randn(count, 3, generator=draw).double() + torch.tensor(ORIGIN, dtype=torch.float64)
+    parts = [torch.randn(count, n, generator=draw) for n in (4, 2, 1, 3)]
+    splats = SplatTable("surfel", means, parts[0], parts[1] - 3, parts[2][:, 0], parts[3], torch.zeros(count, 0, 3))
+    frame = replace(SURVEY, shift=(492000.0, 5260000.0, 0.0))
+    write_splats(tmp_path / "s.ply", splats, frame=frame)
+    with opened_subject(tmp_path / "s.ply", "cpu") as subject:
+        assert subject.frame.crs == "EPSG:32632" and subject.frame.metres == 1.0
+        assert np.allclose(subject.frame.to_input(subject.splats.means.numpy()), means.numpy(), atol=1e-3)
+
+
+def test_what_cannot_be_shown_is_refused(tmp_path, capsys):
+    needs("viser")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n")
+    (tmp_path / "text.txt").write_text("hello")
+    (tmp_path / "short.glb").write_bytes(b"glTF\x02\0\0\0\xff")
+    cases = {
+        "nowhere": "there is no such run or file",
+        "empty": "no run folder",
+        "bad.ply": "bad.ply",
+        "text.txt": "known",
+        "short.glb": "short.glb",
+    }
+    for name, said in cases.items():
+        assert main(["view", str(tmp_path / name)]) == 2, name
+        error = capsys.readouterr().err
+        assert error.startswith("surfkit: ") and error.count("\n") == 1 and said in error, error
+    for words, said in (
+        (["--port", "0"], "--port 0"),
+        (["--out", str(tmp_path / "text.txt")], "a file"),
+        (["--most", "0"], "--most 0"),
+    ):
+        assert main(["view", str(tmp_path / "bad.ply"), *words]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_a_damaged_scale_is_refused(tmp_path):
+    scene = read(Data(data_set(tmp_path / "data")))
+    path = like_3dgs(tmp_path / "a.ply", scene, quats=torch.zeros(len(scene.cloud.xyz), 4))
+    with pytest.raises(BadInput, match="rotation of length 0"), opened_subject(path or tmp_path / "a.ply", "cpu"):
+        pass
+
+
+def test_ctrl_c_ends_it_at_once(tmp_path):
+    needs("viser")
+    write_mesh(tmp_path / "mesh.ply", TRIANGLE, SURVEY)
+    words = [sys.executable, "-m", "surfkit.cli", "view", str(tmp_path / "mesh.ply"), "--no-open"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    stop = threading.Timer(120, process.kill)
+    stop.start()
+    lines = []
+    while not any("Ctrl-C" in line for line in lines):
+        lines.append(process.stdout.readline())
+        assert lines[-1], process.stderr.read()
+    url = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", "".join(lines))[0]
+    browser = Browser(url)
+    browser.wait_for(lambda b: "/mesh" in b.names())
+    browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    browser.set("seconds", 1000.0)
+    for label in ("add this view", "add this view", "preview"):
+        browser.press(label)
+        time.sleep(0.5)
+    Browser(url).close()  # one that leaves at once
+    os.kill(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    stop.cancel()
+    assert process.returncode == 0 and "ended" in out and not err
+    browser.close()
