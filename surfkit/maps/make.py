@@ -21,11 +21,11 @@ from surfkit.maps.difference import draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_axes, map_crs
 from surfkit.maps.hillshade import draw_hillshade
-from surfkit.maps.resolution import ground_sampling_distance
 from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.scene import Frame, View
+from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
