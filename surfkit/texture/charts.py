@@ -16,7 +16,7 @@ from surfkit.texture.topology import NONE as NO_FACE
 
 CELL = 256
 """Charts that are larger are cut along a grid of so many pixels: smaller pieces leave less room empty."""
-PAD = 3
+PAD = 2
 """Texels around a chart: what is mixed with it when a page is shown reduced to a quarter is a copy of its rim."""
 PATCH = 4
 """Side of the square of texels of a triangle without a photograph."""

@@ -107,7 +107,7 @@ def _colors(
 
 
 def _patch(what: Paint, image: np.ndarray, owner: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> None:
-    """Paint the squares of triangles without a photograph: between the middles of its texels, the square has the colours
+    """Paint the squares of triangles without a photograph: between the middles of texels, a square has the colours
     of the corners at three of them."""
     if not len(faces):
         return

@@ -20,10 +20,12 @@ from surfkit.texture.topology import NONE as NO_FACE
 
 SAMPLES = 5
 """Along each edge of a seam."""
-SMOOTH = 0.1
+SMOOTH = 0.3
 """Weight of the change along an edge within a part, to that of the difference at a seam."""
-SMALL = 1e-3
+SMALL = 0.01
 """Weight of the values themselves: far from seams they go back to 0."""
+STEP = 0.05
+"""Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
 MOST = 0.25
 """Largest value that is added."""
 
@@ -108,19 +110,20 @@ def _seam_colors(
 def _solved(pairs: np.ndarray, inner: np.ndarray, color: np.ndarray, count: int) -> np.ndarray:
     """(n, 3) float32 values that make colours equal across pairs, and differ little along the inner edges."""
 
-    def laplacian(ends: np.ndarray) -> coo_matrix:
+    def laplacian(ends: np.ndarray, weight: np.ndarray) -> coo_matrix:
         one, other = ends.T
-        ones = np.ones(len(ends))
-        graph = coo_matrix((ones, (one, other)), (count, count))
-        degree = np.bincount(one, minlength=count) + np.bincount(other, minlength=count)
-        return diags(degree.astype(np.float64)) - graph - graph.T
+        graph = coo_matrix((weight, (one, other)), (count, count))
+        return diags(np.bincount(one, weight, count) + np.bincount(other, weight, count)) - graph - graph.T
 
-    matrix = (laplacian(pairs) + SMOOTH * laplacian(inner) + SMALL * diags(np.ones(count))).tocsr()
+    one, other = pairs.T
+    steps = color[other] - color[one]
+    weight = 1 / (1 + (np.abs(steps).max(1) / STEP) ** 2) ** 2
+    smooth = laplacian(inner, np.full(len(inner), SMOOTH))
+    matrix = (laplacian(pairs, weight) + smooth + SMALL * diags(np.ones(count))).tocsr()
     scale = diags(1 / matrix.diagonal())
     found = np.zeros((count, 3), np.float32)
-    one, other = pairs.T
     for channel in range(3):
-        step = color[other, channel] - color[one, channel]
+        step = weight * steps[:, channel]
         side = np.bincount(one, step, count) - np.bincount(other, step, count)
         found[:, channel] = cg(matrix, side, rtol=1e-3, maxiter=500, M=scale)[0]
         emit(Progress("levelling seams", channel + 1, 3))
