@@ -22,7 +22,7 @@ from surfkit.texture.regions import Region
 from surfkit.texture.tiles import Shape, write_tiles
 
 NAME = "textured"
-TILES = "tiles"
+TILES = "tiles3d"
 PAGES = "pages"
 
 
@@ -80,10 +80,7 @@ def painted(what: Paint, kind: Pictures, folder: Path) -> tuple[list[Part], list
     page = atlas.page[atlas.chart]
     order = np.argsort(page, kind="stable")
     rows = np.split(order, np.searchsorted(page[order], np.arange(1, len(atlas.pages))))
-    expect = getattr(what.photo, "expect", None)
-    if expect is not None:
-        views = [np.unique(atlas.view[some][atlas.view[some] != NONE]) for some in rows]
-        expect(np.concatenate(views))
+    what.photos.expect(np.concatenate([np.unique(atlas.view[some][atlas.view[some] != NONE]) for some in rows]))
     parts, paths = [], []
     for number, some in enumerate(rows):
         path = folder / f"{NAME}-{number:03d}.{SUFFIX[kind]}"

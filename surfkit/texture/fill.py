@@ -14,7 +14,8 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.texture.candidates import NONE
 from surfkit.texture.charts import PATCH, Atlas, Page
-from surfkit.texture.level import Levels, Photo
+from surfkit.texture.level import Levels
+from surfkit.texture.photographs import Photographs
 
 Pictures = Literal["jpeg", "png"]
 QUALITY = 92
@@ -32,14 +33,14 @@ class Paint:
     Attributes:
         mesh: The mesh.
         atlas: Where its triangles lie.
-        photo: Photographs; asked for in rising order for each page.
+        photos: The photographs.
         gains: (V, 3) what their colours are multiplied by.
         levels: What is added to these.
     """
 
     mesh: Mesh
     atlas: Atlas
-    photo: Photo
+    photos: Photographs
     gains: np.ndarray
     levels: Levels
 
@@ -67,7 +68,7 @@ def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
     ends = np.searchsorted(views[owner.reshape(-1)[texel]], np.unique(views[seen]), "right")
     for part in np.split(texel, ends[:-1]) if len(texel) else []:
         number = int(views[owner.reshape(-1)[part[0]]])
-        picture = what.photo(number)
+        picture = what.photos(number)
         for at in range(0, len(part), AT_ONCE):
             some = part[at : at + AT_ONCE]
             image.reshape(-1, 3)[some] = _colors(what, number, picture, faces, corners, owner, some)

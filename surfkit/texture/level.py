@@ -7,7 +7,6 @@ a part the values change little from vertex to vertex.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.sparse.linalg import cg
 
 from surfkit.core.events import Progress, emit
 from surfkit.texture.candidates import NONE
+from surfkit.texture.photographs import Photographs
 from surfkit.texture.topology import NONE as NO_FACE
 
 SAMPLES = 5
@@ -28,9 +28,6 @@ STEP = 0.05
 """Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
 MOST = 0.25
 """Largest value that is added."""
-
-Photo = Callable[[int], np.ndarray]
-"""(3, H, W) uint8 photograph of a view by its number."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class Levels:
 
 
 def level(
-    faces: np.ndarray, view: np.ndarray, places: np.ndarray, beyond: np.ndarray, photo: Photo, gains: np.ndarray
+    faces: np.ndarray, view: np.ndarray, places: np.ndarray, beyond: np.ndarray, photos: Photographs, gains: np.ndarray
 ) -> Levels:
     """Find the values.
 
@@ -56,7 +53,7 @@ def level(
         view: (F,) photograph of each triangle; NONE for none.
         places: (F, 3, 2) corners in the photograph.
         beyond: (F, 3) triangles beyond the edges.
-        photo: Photographs; asked for in rising order, once each.
+        photos: The photographs.
         gains: (V, 3) what their colours are multiplied by.
     """
     seen = np.flatnonzero(view != NONE)
@@ -68,7 +65,7 @@ def level(
     face, edge = np.nonzero((beyond != NO_FACE) & (there != view[:, None]) & (there != NONE) & (view != NONE)[:, None])
     if not len(face):
         return Levels(corner, np.zeros((len(known), 3), np.float32))
-    color = _seam_colors(corner, view, places, (face, edge), photo, gains, len(known))
+    color = _seam_colors(corner, view, places, (face, edge), photos, gains, len(known))
     ends = np.stack([corner[face, edge], corner[face, (edge + 1) % 3]], axis=1)
     # the same two vertices, of the part beyond
     vertices = np.stack([faces[face, edge], faces[face, (edge + 1) % 3]], axis=1).astype(np.int64)
@@ -84,7 +81,7 @@ def _seam_colors(
     view: np.ndarray,
     places: np.ndarray,
     seam: tuple[np.ndarray, np.ndarray],
-    photo: Photo,
+    photos: Photographs,
     gains: np.ndarray,
     count: int,
 ) -> np.ndarray:
@@ -93,8 +90,9 @@ def _seam_colors(
     face, edge = seam
     order = np.argsort(view[face], kind="stable")
     numbers, starts = np.unique(view[face[order]], return_index=True)
+    photos.expect(numbers)
     for done, (number, rows) in enumerate(zip(numbers, np.split(order, starts[1:]), strict=True), 1):
-        picture, f, e = photo(int(number)), face[rows], edge[rows]
+        picture, f, e = photos(int(number)), face[rows], edge[rows]
         begin, end = places[f, e], places[f, (e + 1) % 3]
         for share in (np.arange(SAMPLES) + 0.5) / SAMPLES:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)

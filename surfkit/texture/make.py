@@ -19,10 +19,8 @@ from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.simplify import simplify_to
-from surfkit.readers.masks import mask_cache
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
-from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import Frame, View
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
@@ -31,6 +29,7 @@ from surfkit.texture.deliver import Delivery, deliver
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.level import level
 from surfkit.texture.look import project, sight
+from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import Region, divide, middles
 from surfkit.texture.resolution import pixel_sizes
 from surfkit.texture.topology import neighbours, with_short_edges
@@ -38,7 +37,7 @@ from surfkit.texture.topology import neighbours, with_short_edges
 Format = Literal["obj", "glb", "tiles3d"]
 RECORD = "texture.json"
 """What the textured mesh is; written last."""
-TEXELS = 12.0
+TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
 """Longer edges are halved: in texels, and in edges of a triangle of mean size."""
@@ -55,7 +54,7 @@ class TextureSettings:
     and other viewers of 3D Tiles."""
 
     triangles: int | Literal["auto"] = "auto"
-    """Triangles to simplify the mesh to; where the surface is flat, large ones are divided again. `auto` is one for 12
+    """Triangles to simplify the mesh to; where the surface is flat, large ones are divided again. `auto` is one for 6
     texels, and no more than the mesh has."""
 
     texel: Length = "auto"
@@ -114,77 +113,76 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     began = time.perf_counter()
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
         raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
-    if settings.triangles != "auto":
-        refuse_missing()
-    sizes = pixel_sizes(subject.surface, subject.views, subject.frame)
-    if np.isnan(sizes).all():
-        raise BadInput(f"{subject.surface.path}: no photograph shows any of it, so it has no texture")
-    texel = np.nanmedian(sizes) if settings.texel == "auto" else settings.texel / (subject.frame.metres or 1.0)
-    views = subject.views if settings.texel == "auto" else reduced(subject.views, sizes, texel)
-    mesh = prepared(local_mesh(subject.surface, subject.frame), settings, texel * subject.frame.scale)
-    photos = Photographs(views, budget_bytes)
-    found, gains, refused = look_at_all(mesh, photos, settings.size - ROOM)
-    atlas, region, beyond = lay_out(mesh, views, found, settings.size)
-    photos.expect(np.unique(atlas.view[atlas.view != NONE]))
-    levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
+    frame = subject.frame
+    made = textured(subject, settings, budget_bytes)
+    mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
+    seen, areas = atlas.view != NONE, _areas(mesh)
+    record = {
+        "mesh": str(subject.surface.path),
+        "crs": frame.crs,
+        "offset": list(frame.shift),
+        "metres_per_unit": frame.metres,
+        "texel": float(f"{made.texel:.3g}"),
+        "triangles": len(mesh.faces),
+        "seen": round(float(areas[seen].sum() / areas.sum()), 6),
+        "photographs": len(np.unique(atlas.view[seen])),
+        "outliers": made.outliers,
+        "gains": [round(float(gains.min()), 4), round(float(gains.max()), 4)],
+        "charts": len(atlas.page),
+        "pages": [[page.width, page.height] for page in atlas.pages],
+        "tiles": int(atlas.tile.max()) + 1,
+    }
     with replacing_folder(out) as folder:
-        paint = Paint(mesh, atlas, photos, gains, levels)
-        kinds = set(settings.formats)
-        files = deliver(
-            paint, Delivery(subject.frame, subject.views, region, kinds, settings.pictures, settings.up), folder
-        )
-        seen = atlas.view != NONE
-        record = {
-            "mesh": str(subject.surface.path),
-            "crs": subject.frame.crs,
-            "offset": list(subject.frame.shift),
-            "metres_per_unit": subject.frame.metres,
-            "texel": float(f"{texel:.3g}"),
-            "triangles": len(mesh.faces),
-            "seen": round(float(_areas(mesh)[seen].sum() / _areas(mesh).sum()), 6),
-            "photographs": len(np.unique(atlas.view[seen])),
-            "outliers": refused,
-            "gains": [round(float(gains.min()), 4), round(float(gains.max()), 4)],
-            "charts": len(atlas.page),
-            "pages": [[page.width, page.height] for page in atlas.pages],
-            "tiles": int(atlas.tile.max()) + 1,
-            "files": files,
-            "seconds": round(time.perf_counter() - began, 1),
-        }
+        how = Delivery(frame, subject.views, made.region, set(settings.formats), settings.pictures, settings.up)
+        record["files"] = deliver(made.paint, how, folder)
+        record["seconds"] = round(time.perf_counter() - began, 1)
         write_json(folder / RECORD, record)
-    for name in files:
+    for name in (*record["files"], RECORD):
         emit(FileWritten(out / name, "textured mesh"))
     return record
+
+
+@dataclass(frozen=True)
+class Textured:
+    """A mesh with a photograph for each triangle.
+
+    Attributes:
+        paint: What its pages are painted with.
+        region: The regions of its tiles.
+        texel: Side of a texel, units of the input.
+        outliers: Photographs of a triangle that were refused, as they show something else.
+    """
+
+    paint: Paint
+    region: Region
+    texel: float
+    outliers: int
+
+
+def textured(subject: Subject, settings: TextureSettings, budget_bytes: int) -> Textured:
+    """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`."""
+    if settings.triangles != "auto":
+        refuse_missing()
+    surface, frame = subject.surface, subject.frame
+    sizes = pixel_sizes(surface, subject.views, frame)
+    if np.isnan(sizes).all():
+        raise BadInput(f"{surface.path}: no photograph shows any of it, so it has no texture")
+    texel, views = float(np.nanmedian(sizes)), subject.views
+    if settings.texel != "auto":
+        texel = settings.texel / (frame.metres or 1.0)
+        views = reduced(views, sizes, texel)
+    mesh = prepared(local_mesh(surface, frame), settings, texel * frame.scale)
+    photos = Photographs(views, budget_bytes)
+    found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM)
+    atlas, region, beyond = lay_out(mesh, views, found, settings.size)
+    levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
+    return Textured(Paint(mesh, atlas, photos, gains, levels), region, texel, outliers)
 
 
 def refuse_missing() -> None:
     """BadInput if the package that simplifies meshes is missing."""
     with needed("fast_simplification", "surfkit texture"):
         __import__("fast_simplification")
-
-
-class Photographs:
-    """Photographs of views by number, read ahead in the order in which they are expected."""
-
-    def __init__(self, views: Sequence[View], budget_bytes: int) -> None:
-        self.views = views
-        self.cache = photo_cache(views, 3 * budget_bytes // 4)
-        self.masks = mask_cache(views, budget_bytes // 4)
-
-    def expect(self, numbers: Sequence[int] | np.ndarray) -> None:
-        """Read in this order from now on."""
-        self.cache.expect([int(number) for number in numbers])
-
-    def __call__(self, number: int) -> np.ndarray:
-        """(3, H, W) uint8."""
-        return self.cache[number].numpy()
-
-    def keep(self, number: int) -> np.ndarray | None:
-        """(H, W) bool, or None for all of it."""
-        if self.masks is None:
-            return None
-        found = self.masks[number]
-        return None if found is None else found.numpy()
 
 
 def local_mesh(surface: Surface, frame: Frame) -> Mesh:

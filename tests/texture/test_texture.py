@@ -17,7 +17,8 @@ from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import packed
 from surfkit.texture.choose import choose_views
 from surfkit.texture.look import look, look_in_numpy, project, sight
-from surfkit.texture.make import Photographs, Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture
+from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture
+from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
 
@@ -195,7 +196,7 @@ def test_tiles_have_each_triangle_once_and_boxes_hold_them(tmp_path):
     scene = town(tmp_path, crs="EPSG:32633", move=move)
     settings = replace(PNG, formats=("tiles3d", "obj"), size=128)
     record = made(scene, tmp_path / "out", settings)
-    tileset = json.loads((tmp_path / "out" / "tiles" / "tileset.json").read_text())
+    tileset = json.loads((tmp_path / "out" / "tiles3d" / "tileset.json").read_text())
     assert record["tiles"] > 3 and tileset["asset"]["version"] == "1.1"
     matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
     corners, boxes = [], 0
@@ -209,7 +210,7 @@ def test_tiles_have_each_triangle_once_and_boxes_hold_them(tmp_path):
             assert child["geometricError"] <= tile["geometricError"]
             visit(child, (low, high))
         if "content" in tile:
-            found = read_pieces(tmp_path / "out" / "tiles" / tile["content"]["uri"])[0]
+            found = read_pieces(tmp_path / "out" / "tiles3d" / tile["content"]["uri"])[0]
             assert (found >= low - 1e-6).all() and (found <= high + 1e-6).all()
             corners.append(found)
             boxes += 1
