@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
-from surfkit.export import tiles3d
 from surfkit.export.glb import read_glb
 from surfkit.export.gltf_reader import read_splats
 from surfkit.export.table import SplatTable, Tile

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from needs import needs, needs_native
+from town import BOX, HALF, HIDDEN, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
@@ -21,8 +22,6 @@ from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, 
 from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
-
-from .town import BOX, HALF, HIDDEN, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 PNG = TextureSettings(triangles=100_000, pictures="png", size=1024)
 """Keeps all the triangles of the scene, and loses nothing in pictures."""
