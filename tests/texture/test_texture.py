@@ -130,7 +130,7 @@ def test_sight_is_what_rays_see(tmp_path):
     for number in (0, 5, 9):
         view = scene.views[number]
         found = sight(mesh, view.camera, Photographs(scene.views, 10**8)(number))
-        share = is_seen(places.reshape(-1, 3))[number].reshape(-1, 60).mean(1)
+        share = is_seen(places.reshape(-1, 3), [number])[number].reshape(-1, 60).mean(1)
         told = np.zeros(len(share), bool)
         told[found.faces] = True
         assert share[told].min() > 0.85, "what is told to be whole is hardly hidden: less than a pixel of it"
