@@ -5,20 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from needs import needs, needs_native
 from town import BOX, HALF, HIDDEN, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
+from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
 from surfkit.texture import level as leveling
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import packed
 from surfkit.texture.choose import choose_views
+from surfkit.texture.fill import paint
 from surfkit.texture.look import look, look_in_numpy, project, sight
-from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture
+from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture, textured
 from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
@@ -138,6 +141,53 @@ def test_sight_is_what_rays_see(tmp_path):
         exact = [255 * truth(places[f], on_box(places[f])).mean(0) for f in found.faces]
         good = found.quality > 5
         assert np.percentile(np.abs(found.color - exact).max(1)[good], 90) < 8
+
+
+def test_what_lies_beside_an_outline_counts_less():
+    """A plate over the ground, seen from above: what it hides is not seen, and next to it the quality is a tenth."""
+    ground, faces = sheet((-4, -4, 0), np.array([8.0, 0, 0]), np.array([0, 8.0, 0]), 0.25)
+    plate, above = sheet((-1, -1, 1.5), np.array([2.0, 0, 0]), np.array([0, 2.0, 0]), 2.0)
+    both = Mesh(np.concatenate([ground, plate]).astype(np.float32), np.concatenate([faces, above + len(ground)]))
+    both = replace(both, faces=both.faces.astype(np.int32))
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 8], [0, 0, 0, 1]], dtype=torch.float64)
+    camera = Camera(pose, 150.0, 150.0, 100.0, 100.0, 200, 200)
+    photo = np.zeros((3, 200, 200), np.uint8)
+    plain = sight(replace(both, faces=faces.astype(np.int32)), camera, photo)
+    found = sight(both, camera, photo)
+    rows = np.flatnonzero(np.isin(plain.faces, found.faces))
+    ours = np.isin(found.faces, plain.faces)
+    ratio = found.quality[ours] / plain.quality[rows]
+    assert np.isclose(ratio, 1).sum() + np.isclose(ratio, 0.1).sum() == len(ratio)
+    hidden = np.setdiff1d(plain.faces, found.faces)
+    half = 8 / 6.5  # the shadow of the plate, as the camera sees it
+    away = np.abs(ground[faces][..., :2]).max(2) - half
+    pixel = 8 / 150
+    assert (away[hidden].min(1) < 0.5 * pixel).all() and (away[found.faces[ours]].max(1) > -0.5 * pixel).all()
+    near = away[found.faces[ours]].min(1) < 1.5 * pixel
+    assert near.sum() > 20 and np.isclose(ratio[near], 0.1).all()
+    assert np.isclose(ratio[away[found.faces[ours]].min(1) > 3.5 * pixel], 1).all()
+
+
+def test_corrections_are_linear_between_vertices(tmp_path):
+    scene = town(tmp_path)
+    made_of = textured(Subject(scene.surface, scene.frame, scene.views), PNG, 10**8)
+    mesh, atlas = made_of.paint.mesh, made_of.paint.atlas
+    levels = made_of.paint.levels
+    value = np.zeros((len(levels.value), 3), np.float32)
+    seen = atlas.view != NONE
+    value[levels.corner[seen].ravel()] = mesh.vertices[mesh.faces[seen].ravel()][:, :1] / 3
+    page = np.flatnonzero(atlas.page[atlas.chart] == 0)
+    before, after = (
+        paint(replace(made_of.paint, levels=replace(levels, value=each)), atlas.pages[0], page).astype(float)
+        for each in (np.zeros_like(value), value)
+    )
+    shares = np.random.default_rng(6).dirichlet([1, 1, 1], len(page))
+    x, y = np.floor((atlas.texels(page) * shares[:, :, None]).sum(1)).astype(int).T
+    wanted = 255 * (mesh.vertices[mesh.faces[page]][:, :, 0] * shares).sum(1) / 3
+    told = (after - before)[y, x]
+    usable = seen[page] & ((after[y, x] > 0) & (after[y, x] < 255)).all(1)
+    assert usable.mean() > 0.8 and wanted[usable].std() > 10
+    assert np.percentile(np.abs(told - wanted[:, None])[usable], 95) < 2.5
 
 
 @needs_native
