@@ -32,7 +32,7 @@ def truth(places, on_box):
 
 def looking(eye, target):
     z = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    x = np.cross(z, [0.0, 1.0, 0.01])
+    x = np.cross(z, [0.0, 1.0, 0.0] if abs(z[2]) > 0.99 else [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = [x, np.cross(z, x), z]

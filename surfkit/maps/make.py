@@ -14,12 +14,12 @@ from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.surface import Surface
-from surfkit.evaluate.geometry.up_direction import up_direction
+from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
 from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Grid, map_axes, map_crs
+from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import draw_surface, has_colors, needs_double

@@ -51,7 +51,7 @@ def write_tiles(folder: Path, shape: Shape, region: Region, frame: Frame, up: np
         frame: Of the data set.
         up: (3, 3) from the frame of the input to z up, where it is not placed on Earth.
     """
-    ground = ground_of(folder, frame, up)
+    ground = ground_of(Path(folder.name), frame, up)  # not the folder that it is written in until it is whole
 
     def place(local: np.ndarray) -> np.ndarray:
         return ground.metres(frame.to_input(local))
