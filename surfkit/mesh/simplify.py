@@ -46,7 +46,7 @@ def simplify_to(mesh: Mesh, count: int) -> Mesh:
     """
     if count >= len(mesh.faces):
         return mesh
-    with needed("fast_simplification", "--triangles"):
+    with needed("fast_simplification", "simplifying a mesh"):
         from fast_simplification import simplify as reduced
     # its first limits are lengths: a thousandth of an edge
     unit = 1 / max(_mean_edge(mesh), 1e-30)

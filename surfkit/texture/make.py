@@ -181,7 +181,7 @@ def textured(subject: Subject, settings: TextureSettings, budget_bytes: int) -> 
 
 def refuse_missing() -> None:
     """BadInput if the package that simplifies meshes is missing."""
-    with needed("fast_simplification", "surfkit texture"):
+    with needed("fast_simplification", "simplifying a mesh"):
         __import__("fast_simplification")
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 from needs import needs, needs_native
-from town import BOX, HALF, HIDDEN, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
+from PIL import Image
+from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
 from surfkit.export.glb import read_glb
@@ -380,6 +381,25 @@ def test_coarser_texels_and_fewer_triangles(tmp_path):
     ground = (places[:, 2] < 0.01) & (BOX.distance(places) > 0.8) & (np.abs(places[:, :2]).max(1) < 5)
     assert np.abs(colors - 255 * truth(places, False))[ground].mean() < 10
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["texture.json", "textured.glb"]
+
+
+def test_masks_hide(tmp_path):
+    """With all of a photograph masked it is not used; with all of all of them, the vertices are what is left."""
+    scene = town(tmp_path)
+    masks = []
+    for at, black in enumerate((True, False)):
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, : WIDTH if black else 0] = 0
+        masks.append(tmp_path / f"mask-{at}.png")
+        Image.fromarray(mask).save(masks[-1])
+    some = [replace(view, mask=masks[at % 2]) for at, view in enumerate(scene.views)]
+    found, _, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(some, 10**8), 1000)
+    assert set(np.unique(found.view)) == {NONE, 1, 3, 5, 7, 9, 11}
+    hidden = replace(scene, views=tuple(replace(view, mask=masks[0]) for view in scene.views))
+    record = made(hidden, tmp_path / "out", replace(PNG, formats=("glb",)))
+    assert record["seen"] == 0 and record["photographs"] == 0
+    _, colors = points_on(read_pieces(tmp_path / "out" / "textured.glb"))
+    assert np.abs(colors - HIDDEN).max() <= 1
 
 
 def test_what_is_refused(tmp_path):
