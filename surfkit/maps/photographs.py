@@ -11,7 +11,7 @@ from surfkit.maps.geotiff import Sheet
 from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
 from surfkit.scene.scene import Frame
 from surfkit.texture.candidates import NONE as UNSEEN
-from surfkit.texture.make import Textured
+from surfkit.texture.deliver import Textured
 
 NEAR = 3.0
 """Cells of height by which the textured mesh, which is simplified, may differ from the surface model, to be what is

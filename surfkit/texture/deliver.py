@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from surfkit.texture.candidates import NONE
 from surfkit.texture.files import SUFFIX, Part, material_lines, part_of, write_obj, write_textured_glb
 from surfkit.texture.fill import Paint, Pictures, encoded, paint
 from surfkit.texture.regions import Region
-from surfkit.texture.tiles import Shape, write_tiles
+from surfkit.texture.tiles import Tiles
 
 NAME = "textured"
 TILES = "tiles3d"
@@ -33,7 +34,6 @@ class Delivery:
     Attributes:
         frame: Of the data set.
         views: Of the data set, which tell what is up.
-        region: The regions of the tiles.
         kinds: Formats.
         pictures: Of the pages.
         up: Axis that points up; None to find out.
@@ -41,14 +41,38 @@ class Delivery:
 
     frame: Frame
     views: Sequence[View]
-    region: Region
     kinds: set[str]
     pictures: Pictures
     up: Axis | None
 
 
-def deliver(what: Paint, how: Delivery, folder: Path) -> list[str]:
-    """Paint the pages and write all formats into a folder; names of the files."""
+@dataclass(frozen=True)
+class Textured:
+    """A mesh with a photograph for each triangle.
+
+    Attributes:
+        paint: What its pages are painted with.
+        region: The regions of its tiles.
+        texel: Side of a texel, units of the input.
+        outliers: Photographs of a triangle that were refused, as they show something else.
+    """
+
+    paint: Paint
+    region: Region
+    texel: float
+    outliers: int
+
+
+def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: Path) -> list[str]:
+    """Paint the pages and write all formats into a folder; names of the files.
+
+    Args:
+        fine: The textured mesh.
+        coarser: Its levels of detail, for 3D Tiles.
+        how: What is written.
+        folder: Where.
+    """
+    what = fine.paint
     parts, pages = painted(what, how.pictures, folder)
     frame, files = how.frame, []
     level = np.eye(3) if frame.crs else map_axes(up_direction(how.up, how.views, frame, np.eye(4)).direction)
@@ -65,8 +89,15 @@ def deliver(what: Paint, how: Delivery, folder: Path) -> list[str]:
         write_textured_glb(path, what.mesh, parts, pages, how.pictures, frame.to_file, UPS["z"] @ level, notes)
         files.append(path.name)
     if "tiles3d" in how.kinds:
-        shape = Shape(what.mesh, parts, pages, [page.tile for page in what.atlas.pages], how.pictures)
-        write_tiles(folder / TILES, shape, how.region, frame, level)
+        tiles = Tiles(folder / TILES, frame, level, how.pictures)
+        tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
+        for made in coarser:
+            draft = folder / "level"
+            draft.mkdir()
+            regions = fine.region.at(made.region.depth)
+            tiles.write(regions, made.paint, *painted(made.paint, how.pictures, draft), made.texel)
+            shutil.rmtree(draft)
+        tiles.finish(fine.region)
         files.append(f"{TILES}/tileset.json")
     if "obj" not in how.kinds:
         for page in pages:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from surfkit.scene.scene import Frame, View
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
 from surfkit.texture.choose import choose_views
-from surfkit.texture.deliver import Delivery, deliver
+from surfkit.texture.deliver import Delivery, Textured, deliver
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.level import level
 from surfkit.texture.look import project, sight
@@ -41,6 +41,8 @@ TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
 """Longer edges are halved: in texels, and in edges of a triangle of mean size."""
+LEAST = 100
+"""Triangles of a level of detail."""
 ROOM = 16
 """Texels that a triangle on a page must leave free along each side."""
 
@@ -133,8 +135,9 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
         "tiles": int(atlas.tile.max()) + 1,
     }
     with replacing_folder(out) as folder:
-        how = Delivery(frame, subject.views, made.region, set(settings.formats), settings.pictures, settings.up)
-        record["files"] = deliver(made.paint, how, folder)
+        how = Delivery(frame, subject.views, set(settings.formats), settings.pictures, settings.up)
+        more = coarser(subject, settings, budget_bytes, made) if "tiles3d" in settings.formats else ()
+        record["files"] = deliver(made, more, how, folder)
         record["seconds"] = round(time.perf_counter() - began, 1)
         write_json(folder / RECORD, record)
     for name in (*record["files"], RECORD):
@@ -142,27 +145,19 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     return record
 
 
-@dataclass(frozen=True)
-class Textured:
-    """A mesh with a photograph for each triangle.
+def textured(
+    subject: Subject,
+    settings: TextureSettings,
+    budget_bytes: int,
+    mesh: Mesh | None = None,
+    region: Region | None = None,
+) -> Textured:
+    """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
-    Attributes:
-        paint: What its pages are painted with.
-        region: The regions of its tiles.
-        texel: Side of a texel, units of the input.
-        outliers: Photographs of a triangle that were refused, as they show something else.
+    `mesh` stands for that of the subject where it is simplified already, and `region` has the regions of the tiles
+    where they are known.
     """
-
-    paint: Paint
-    region: Region
-    texel: float
-    outliers: int
-
-
-def textured(subject: Subject, settings: TextureSettings, budget_bytes: int) -> Textured:
-    """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`."""
-    if settings.triangles != "auto":
-        refuse_missing()
+    refuse_missing()
     surface, frame = subject.surface, subject.frame
     sizes = pixel_sizes(surface, subject.views, frame)
     if np.isnan(sizes).all():
@@ -171,12 +166,25 @@ def textured(subject: Subject, settings: TextureSettings, budget_bytes: int) -> 
     if settings.texel != "auto":
         texel = settings.texel / (frame.metres or 1.0)
         views = reduced(views, sizes, texel)
-    mesh = prepared(local_mesh(surface, frame), settings, texel * frame.scale)
+    mesh = prepared(local_mesh(surface, frame) if mesh is None else mesh, settings, texel * frame.scale)
     photos = Photographs(views, budget_bytes)
     found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM)
-    atlas, region, beyond = lay_out(mesh, views, found, settings.size)
+    atlas, region, beyond = lay_out(mesh, views, found, settings.size, region)
     levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
     return Textured(Paint(mesh, atlas, photos, gains, levels), region, texel, outliers)
+
+
+def coarser(subject: Subject, settings: TextureSettings, budget_bytes: int, fine: Textured) -> Iterator[Textured]:
+    """Levels of detail: texels twice as large each, a quarter of the triangles, and regions of four tiles each."""
+    mesh, depth, level = fine.paint.mesh, fine.region.depth, 0
+    while depth > 0:
+        depth, level = max(0, depth - 2), level + 1
+        texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
+        few = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
+        less = replace(settings, texel=texel, triangles=few)
+        made = textured(subject, less, budget_bytes, mesh, fine.region.cut(depth))
+        mesh = made.paint.mesh
+        yield made
 
 
 def refuse_missing() -> None:
@@ -214,9 +222,8 @@ def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View
 def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
     """The mesh with as many triangles as wanted, none of them too large; `texel` in local units."""
     area = float(_areas(mesh).sum())
-    wanted = settings.triangles if settings.triangles != "auto" else max(1000, int(area / texel**2 / TEXELS))
+    wanted = settings.triangles if settings.triangles != "auto" else max(LEAST, int(area / texel**2 / TEXELS))
     if wanted < len(mesh.faces):
-        refuse_missing()
         emit(Progress("simplifying", 0, 1))
         mesh = simplify_to(mesh, wanted)
         emit(Progress("simplifying", 1, 1))
@@ -239,7 +246,9 @@ def look_at_all(mesh: Mesh, photos: Photographs, longest: float) -> tuple[Candid
     return found, gains, found.refuse_outliers(gains)
 
 
-def lay_out(mesh: Mesh, views: Sequence[View], found: Candidates, size: int) -> tuple[Atlas, Region, np.ndarray]:
+def lay_out(
+    mesh: Mesh, views: Sequence[View], found: Candidates, size: int, region: Region | None = None
+) -> tuple[Atlas, Region, np.ndarray]:
     """The atlas, the regions of its tiles, and the neighbours of the triangles."""
     beyond, edge = neighbours(mesh.faces)
     chosen = choose_views(found, beyond, edge)
@@ -248,7 +257,7 @@ def lay_out(mesh: Mesh, views: Sequence[View], found: Candidates, size: int) -> 
         mine = chosen == number
         places[mine] = project(mesh, views[number].camera)[mesh.faces[mine], :2]
     where = middles(mesh)
-    region = divide(where, texels_of(chosen, places), FULL * size**2)
+    region = region or divide(where, texels_of(chosen, places), FULL * size**2)
     return make_atlas(chosen, places, region.of(where), beyond, size), region, beyond
 
 

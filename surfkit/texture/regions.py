@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,30 @@ class Region:
             yield self
         for part in self.below:
             yield from part.leaves()
+
+    @property
+    def depth(self) -> int:
+        """How often it is divided, at most."""
+        return max((1 + part.depth for part in self.below), default=0)
+
+    def at(self, depth: int) -> list[Region]:
+        """What it consists of when it is divided `depth` times at most."""
+        if not depth or not self.below:
+            return [self]
+        return [part for half in self.below for part in half.at(depth - 1)]
+
+    def cut(self, depth: int) -> Region:
+        """The same, divided `depth` times at most; numbers are places in `at(depth)`."""
+        count = 0
+
+        def shorter(region: Region, left: int) -> Region:
+            nonlocal count
+            if left and region.below:
+                return replace(region, below=tuple(shorter(half, left - 1) for half in region.below))
+            count += 1
+            return Region(count - 1)
+
+        return shorter(self, depth)
 
     def of(self, places: np.ndarray) -> np.ndarray:
         """(P,) int32 number of the region that each of (P, 3) places lies in."""

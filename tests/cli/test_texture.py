@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from needs import needs
 
 from surfkit.cli import main
 from surfkit.mesh.base import Mesh
@@ -12,6 +13,8 @@ from surfkit.mesh.files import write_mesh
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
+
+needs("fast_simplification")
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +73,6 @@ def test_other_folders_are_left_alone(run, tmp_path, capsys):
 
 def test_without_the_package_one_line_says_what_to_install(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    assert main(["texture", str(run), "--triangles", "4"]) == 2
+    assert main(["texture", str(run)]) == 2
     said = capsys.readouterr().err
     assert "needs the package fast_simplification" in said and "surfkit[texture]" in said and said.count("\n") == 1

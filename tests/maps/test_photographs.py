@@ -11,6 +11,7 @@ from surfkit.maps.make import MapSettings, Subject, make_maps
 from surfkit.maps.photographs import between
 
 rasterio = needs("rasterio")
+needs("fast_simplification")
 SETTINGS = MapSettings(products=("orthophoto",), colors="photographs", gsd=0.1, up="z", memory="100MB", tile=64)
 
 

@@ -28,6 +28,8 @@ from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
 
+needs("fast_simplification")
+
 PNG = TextureSettings(triangles=100_000, pictures="png", size=1024)
 """Keeps all the triangles of the scene, and loses nothing in pictures."""
 
@@ -265,24 +267,28 @@ def test_tiles_have_each_triangle_once_and_boxes_hold_them(tmp_path):
     tileset = json.loads((tmp_path / "out" / "tiles3d" / "tileset.json").read_text())
     assert record["tiles"] > 3 and tileset["asset"]["version"] == "1.1"
     matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
-    corners, boxes = [], 0
+    corners, count = [], []
 
     def visit(tile, outer):
-        nonlocal boxes
         box = np.array(tile["boundingVolume"]["box"])
         low, high = box[:3] - np.diag(box[3:].reshape(3, 3)), box[:3] + np.diag(box[3:].reshape(3, 3))
         assert (low >= outer[0] - 1e-6).all() and (high <= outer[1] + 1e-6).all()
-        for child in tile.get("children", []):
-            assert child["geometricError"] <= tile["geometricError"]
-            visit(child, (low, high))
-        if "content" in tile:
-            found = read_pieces(tmp_path / "out" / "tiles3d" / tile["content"]["uri"])[0]
-            assert (found >= low - 1e-6).all() and (found <= high + 1e-6).all()
+        found = read_pieces(tmp_path / "out" / "tiles3d" / tile["content"]["uri"])[0]
+        assert (found >= low - 1e-6).all() and (found <= high + 1e-6).all()
+        if not (children := tile.get("children", [])):
+            assert tile["geometricError"] == 0
             corners.append(found)
-            boxes += 1
+            return len(found)
+        for child in children:
+            assert child["geometricError"] <= tile["geometricError"] / 2
+        below = sum(visit(child, (low, high)) for child in children)
+        count.append((len(found), below, len(children)))
+        return below
 
     visit(tileset["root"], (np.full(3, -np.inf), np.full(3, np.inf)))
-    assert boxes == record["tiles"]
+    assert len(corners) == record["tiles"] and len(count) > 1
+    assert all(few < 0.7 * many and 2 <= parts <= 4 for few, many, parts in count), "coarser tiles have fewer triangles"
+    assert tileset["root"]["geometricError"] > 16 * 2 * record["texel"]
     earth = np.concatenate(corners) @ matrix[:3, :3].T + matrix[:3, 3]
     exact = scene.surface.vertices(scene.surface.faces.ravel())
     exact = to_ecef("EPSG:32633", exact).reshape(-1, 3, 3)
@@ -369,7 +375,6 @@ def test_regions_weigh_no_more_than_asked():
 
 
 def test_coarser_texels_and_fewer_triangles(tmp_path):
-    needs("fast_simplification")
     scene = town(tmp_path)
     settings = TextureSettings(formats=("glb",), triangles=600, texel=0.4)
     record = made(scene, tmp_path / "out", settings)
