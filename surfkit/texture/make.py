@@ -67,7 +67,7 @@ class TextureSettings:
     """Largest side of a picture of the atlas, a power of two. Each tile of 3D Tiles has its own."""
 
     pictures: Pictures = "jpeg"
-    """Pictures of the atlas: jpeg, or png, which loses nothing and is some four times larger."""
+    """Pictures of the atlas: jpeg, or png, which loses nothing and is larger."""
 
     up: Axis | None = None
     """Axis of the data set that points up, for GLB and 3D Tiles. Default: z if it is georeferenced, else what the
@@ -154,8 +154,7 @@ def textured(
 ) -> Textured:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
-    `mesh` stands for that of the subject where it is simplified already, and `region` has the regions of the tiles
-    where they are known.
+    What is known already can be given: `mesh`, simplified before, and `region`, the regions of the tiles.
     """
     refuse_missing()
     surface, frame = subject.surface, subject.frame
