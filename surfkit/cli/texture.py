@@ -26,8 +26,8 @@ class TextureOf:
     """Give the mesh of a finished run a texture from the photographs; writes OBJ, GLB and 3D Tiles into RUN/texture.
 
     Each triangle takes its picture from one photograph that shows it whole, well, and in the colour that others show
-    too; seams between photographs are levelled. Needs `pip install 'surfkit[texture]'`, as the mesh is simplified first.
-    Examples: `surfkit texture RUN`, `surfkit texture RUN --formats glb --triangles 100000`.
+    too; seams between photographs are levelled. The mesh is simplified first, which needs `pip install
+    'surfkit[texture]'`. Examples: `surfkit texture RUN`, `surfkit texture RUN --formats glb --triangles 100000`.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]

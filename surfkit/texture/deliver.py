@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from surfkit.core.events import Progress, emit
+from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
@@ -24,7 +25,6 @@ from surfkit.texture.tiles import Tiles
 
 NAME = "textured"
 TILES = "tiles3d"
-PAGES = "pages"
 
 
 @dataclass(frozen=True)
@@ -85,18 +85,19 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
         files += [f"{NAME}.obj", f"{NAME}.mtl", *(page.name for page in pages)]
     if "glb" in how.kinds:
         notes = {"offset": list(frame.shift), "crs": frame.crs, "metres_per_unit": frame.metres}
-        path = folder / f"{NAME}.glb"
-        write_textured_glb(path, what.mesh, parts, pages, how.pictures, frame.to_file, UPS["z"] @ level, notes)
-        files.append(path.name)
+        try:
+            turn, name = UPS["z"] @ level, f"{NAME}.glb"
+            write_textured_glb(folder / name, what.mesh, parts, pages, how.pictures, frame.to_file, turn, notes)
+            files.append(name)
+        except BadInput as error:  # larger than such a file can be: the rest is not to be lost
+            emit(Warned(f"{NAME}.glb is left out: {error}".replace(f"{folder / name}: ", "")))
     if "tiles3d" in how.kinds:
         tiles = Tiles(folder / TILES, frame, level, how.pictures)
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
         for made in coarser:
-            draft = folder / "level"
-            draft.mkdir()
-            regions = fine.region.at(made.region.depth)
-            tiles.write(regions, made.paint, *painted(made.paint, how.pictures, draft), made.texel)
-            shutil.rmtree(draft)
+            with TemporaryDirectory(dir=folder) as draft:
+                drawn = painted(made.paint, how.pictures, Path(draft))
+                tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, made.texel)
         tiles.finish(fine.region)
         files.append(f"{TILES}/tileset.json")
     if "obj" not in how.kinds:

@@ -67,11 +67,12 @@ def sight(
         depth[~keep] = 0
     focal = min(camera.fx, camera.fy)
     covered, hidden, sums = look(places, mesh.faces, photo, depth, SLACK_PX / focal)
-    corners = places[mesh.faces]
-    rows = np.flatnonzero((covered > 0) & (hidden == 0) & (np.ptp(corners[:, :, :2], axis=1).max(1) <= longest))
+    rows = np.flatnonzero((covered > 0) & (hidden == 0))
+    rows = rows[np.ptp(places[mesh.faces[rows], :2], axis=1).max(1) <= longest]
+    corners = places[mesh.faces[rows]]
     near = ndimage.minimum_filter(depth, 2 * EDGE_PX + 1)
     _, at_edge, _ = look(places, mesh.faces[rows], photo, near, STEP_PX / focal)
-    (ax, ay), (bx, by) = (corners[rows, i, :2].T - corners[rows, 0, :2].T for i in (1, 2))
+    (ax, ay), (bx, by) = (corners[:, i, :2].T - corners[:, 0, :2].T for i in (1, 2))
     area = np.abs(ax * by - ay * bx) / 2
     quality = area * _cosine(mesh, camera, rows) * np.where(at_edge > 0, AT_EDGE, 1.0)
     color = np.rint(sums[rows] / covered[rows, None]).astype(np.uint8)

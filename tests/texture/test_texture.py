@@ -11,6 +11,7 @@ from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
 from surfkit.export.glb import read_glb
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
@@ -386,6 +387,16 @@ def test_coarser_texels_and_fewer_triangles(tmp_path):
     ground = (places[:, 2] < 0.01) & (BOX.distance(places) > 0.8) & (np.abs(places[:, :2]).max(1) < 5)
     assert np.abs(colors - 255 * truth(places, False))[ground].mean() < 10
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["texture.json", "textured.glb"]
+
+
+def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.setattr("surfkit.export.glb.MOST_BYTES", 20_000)
+    told = []
+    monkeypatch.setattr("surfkit.texture.deliver.emit", told.append)
+    record = made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb", "obj")))
+    assert "textured.glb" not in record["files"] and "textured.obj" in record["files"]
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert len(said) == 1 and said[0].startswith("textured.glb is left out: ") and str(tmp_path) not in said[0]
 
 
 def test_masks_hide(tmp_path):
