@@ -6,7 +6,8 @@
 Reads dsm.tif, dsm-other.tif (the exact heights) and orthophoto.tif. Corners are found in the exact heights: a vertex
 of the truth with a roof in one quarter around it and ground 4 m lower in the rest. The orthophoto is compared there
 with an exact one: the mean of the photographs that look down, at the exact heights, where the exact mesh hides
-nothing. The shift with the best correlation of 25 x 25 cells is the error. Frames are level, z up.
+nothing. The shift with the best correlation of 25 x 25 cells is the error; PSNR and sharpness are told too. Frames are
+level, z up.
 """
 
 from __future__ import annotations
@@ -105,6 +106,12 @@ def shift_of(ours: np.ndarray, exact: np.ndarray, row: int, column: int) -> floa
     return float(np.hypot(*shift))
 
 
+def gradient(grey: np.ndarray, where: np.ndarray) -> float:
+    """Mean absolute difference of neighbouring cells, a measure of sharpness."""
+    down, right = np.abs(np.diff(grey, axis=0)), np.abs(np.diff(grey, axis=1))
+    return float(np.mean([down[where[1:] & where[:-1]].mean(), right[where[:, 1:] & where[:, :-1]].mean()]))
+
+
 def main(maps: Path, data: Path, truth: Path) -> None:
     """Print the figures."""
     ours, place = heights_of(maps / "dsm.tif")
@@ -127,6 +134,12 @@ def main(maps: Path, data: Path, truth: Path) -> None:
         *colors, alpha = file.read().astype(np.float64)
     grey, reference = np.where(alpha > 0, np.mean(colors, 0), np.nan), exact_orthophoto(exact, place, data, truth)
     found = corners_of(exact, place, read_surface(truth).vertices())
+    both = np.isfinite(grey) & np.isfinite(reference)
+    error = (grey - reference)[both]
+    print(
+        f"orthophoto and the mean of the photographs: PSNR {10 * np.log10(255**2 / np.mean(error**2)):.2f} dB, ", end=""
+    )
+    print(f"mean gradient {gradient(grey, both):.2f} and {gradient(reference, both):.2f}")
     shifts = np.array([shift_of(grey, reference, row, column) for row, column in found])
     print(f"orthophoto at {len(found)} corners of roofs: {np.isfinite(shifts).sum()} found, within 1 cell ", end="")
     good = shifts[np.isfinite(shifts)]

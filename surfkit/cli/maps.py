@@ -101,6 +101,8 @@ def show(out: Path, record: dict[str, Any]) -> None:
         ("covered", f"{record['covered']:.1%}"),
         ("heights", "{:.2f} to {:.2f} {}".format(*record["heights"], unit)),
     ]
+    if found := record.get("orthophoto"):
+        rows.append(("orthophoto", f"{found['from_photographs']:.1%} of it from photographs, the rest from the mesh"))
     if found := record.get("contours"):
         rows.append(("contour lines", f"{found['lines']:,}, every {found['interval']:g} {unit}"))
     if found := record.get("points"):

@@ -17,23 +17,19 @@ import torch
 
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.codec import write_json
-from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing_folder
-from surfkit.core.version import own_version
 from surfkit.export.base import Format
 from surfkit.export.gltf import Compress, Up, extensions_of, up_of, write_splats
 from surfkit.export.gltf_reader import UPS, read_splats
 from surfkit.export.spz import SPZ
 from surfkit.export.table import SplatTable, Tile
-from surfkit.export.turn import turned
-from surfkit.scene.earth import Site
+from surfkit.export.tileset import INDEX, box_json, ground_of, tileset
 from surfkit.scene.scene import Frame
 
 SIGMAS = 3.0
 """Standard deviations of a splat that the box of a tile contains; viewers draw no more."""
 PIXELS = 16.0
 """Geometric errors of as many pixels or more make viewers refine, by default."""
-INDEX = "tileset.json"
 CONTENT = "3DTILES_content_gltf"
 
 
@@ -84,45 +80,21 @@ class Tiles3D(Format):
 
     def _place(self, path: Path, frame: Frame | None) -> Place:
         """From the coordinates of the table to metres in a tileset, and from there to Earth."""
-        if frame is not None and frame.crs and self.georeference:
-            site = Site.at(frame.crs, frame.origin)
+        turn = UPS["z"].T @ UPS[up_of(self.up, frame)]
+        ground = ground_of(path, frame, turn, self.georeference)
 
-            def on_earth(table: SplatTable) -> SplatTable:
-                means = torch.from_numpy(site.local(table.means.detach().cpu().double().numpy()))
-                return replace(table, means=means, log_scales=table.log_scales + float(np.log(site.unit)))
+        def moved(table: SplatTable) -> SplatTable:
+            means = torch.from_numpy(ground.metres(table.means.detach().cpu().double().numpy()))
+            return replace(table, means=means, log_scales=table.log_scales + float(np.log(ground.unit)))
 
-            return Place(on_earth, site.unit * PIXELS / self.error_px, site.pose)
-        if self.georeference:
-            emit(
-                Warned(
-                    f"{path}: the data set has no coordinate reference system, so the tiles have no place on Earth; "
-                    "viewers show them about its centre"
-                )
-            )
-        unit = (frame.metres if frame else None) or 1.0
-
-        def about_zero(table: SplatTable) -> SplatTable:
-            return turned(replace(table, means=table.file_means(frame)), np.eye(3), unit)
-
-        matrix = np.eye(4)
-        matrix[:3, :3] = UPS["z"].T @ UPS[up_of(self.up, frame)]
-        return Place(about_zero, unit * PIXELS / self.error_px, matrix)
+        return Place(moved, ground.unit * PIXELS / self.error_px, ground.matrix)
 
     def _index(self, root: dict[str, Any], place: Place) -> dict[str, Any]:
         """The JSON of a tileset."""
-        if not np.array_equal(place.matrix, np.eye(4)):
-            root = {**root, "transform": place.matrix.T.ravel().tolist()}
         names = {"extensionsUsed": extensions_of(self.compress)}
         if self.compress == "spz":
             names["extensionsRequired"] = extensions_of(self.compress)
-        halves = np.array(root["boundingVolume"]["box"][3:]).reshape(3, 3).sum(0)
-        return {
-            "asset": {"version": "1.1", "extras": {"generator": f"surfkit {own_version()}"}},
-            "extensionsUsed": [CONTENT],
-            "extensions": {CONTENT: names},
-            "geometricError": max(root["geometricError"], float(2 * np.linalg.norm(halves))),
-            "root": {"refine": "REPLACE", **root},
-        }
+        return tileset(root, place.matrix, extensionsUsed=[CONTENT], extensions={CONTENT: names})
 
 
 @dataclass(frozen=True)
@@ -157,11 +129,11 @@ def _written(
         found["content"] = {"uri": f"tiles/{name}.glb"}
     low = np.min([box[0] for box in boxes], axis=0) if boxes else np.zeros(3)
     high = np.max([box[1] for box in boxes], axis=0) if boxes else np.zeros(3)
-    middle, half = (low + high) / 2, (high - low) / 2
+    half = (high - low) / 2
     error = max([tile.error * place.error, *(child["geometricError"] for child, _ in below)])
     if below and not len(tile.splats):  # seen from afar, it would be nothing: as far off as it is large
         error = max(error, float(2 * np.linalg.norm(half)))
-    found |= {"boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}, "geometricError": error}
+    found |= {"boundingVolume": box_json(np.stack([low, high])), "geometricError": error}
     if below:
         found["children"] = [child for child, _ in below]
     return found, np.stack([low, high])

@@ -95,17 +95,6 @@ class Grid:
                 yield Window(left, top, min(side, self.width - left), min(side, self.height - top))
 
 
-def map_axes(up: np.ndarray) -> np.ndarray:
-    """(3, 3) unit vectors in rows: east, north and up for a direction that is up. For z, the axes of the frame.
-
-    East is the x axis of the frame as far as it lies on the ground, or the y axis where x points up.
-    """
-    axis = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
-    east = axis - up * (up @ axis)
-    east /= np.linalg.norm(east)
-    return np.stack([east, np.cross(up, east), up]) + 0.0
-
-
 def map_crs(frame: Frame) -> tuple[Any, str]:
     """The coordinate reference system (of rasterio) that files of a frame have, and a line that says what it is.
 

@@ -14,18 +14,22 @@ from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.surface import Surface
-from surfkit.evaluate.geometry.up_direction import up_direction
+from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
 from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Grid, map_axes, map_crs
+from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.hillshade import draw_hillshade
-from surfkit.maps.resolution import ground_sampling_distance
+from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
+from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Frame, View
+from surfkit.texture.make import Subject as Textures
+from surfkit.texture.make import TextureSettings, textured
+from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
@@ -69,7 +73,15 @@ class MapSettings:
     """Side of the tiles that are drawn at once, pixels. Rasters do not depend on it; contour lines are cut where tiles
     meet."""
 
+    colors: Literal["photographs", "mesh"] = "mesh"
+    """Of the orthophoto: those of the photographs, one for each place, or those of the vertices of the mesh, which are
+    means of photographs or of renders."""
+
+    memory: str = "auto"
+    """Memory for photographs, such as 4GB, with --colors photographs; auto is half of the free memory."""
+
     def __post_init__(self) -> None:
+        cache_bytes(self.memory, "--memory")
         for name in ("gsd", "interval", "spacing"):
             value = getattr(self, name)
             if value != "auto" and not 0 < value < float("inf"):
@@ -131,9 +143,13 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     gsd = ground_sampling_distance(surface, subject.views, frame) if settings.gsd == "auto" else settings.gsd / units
     grid = Grid.around(map_axes(up.direction), gsd, settings.bounds or bounds_of(surface, map_axes(up.direction)))
     done = settings.names
-    if "orthophoto" in done and not has_colors(surface):
+    if "orthophoto" in done and settings.colors == "mesh" and not has_colors(surface):
         emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
         done = tuple(name for name in done if name != "orthophoto")
+    made = None
+    if "orthophoto" in done and settings.colors == "photographs":
+        budget = cache_bytes(settings.memory, "--memory")
+        made = textured(Textures(surface, frame, subject.views), TextureSettings(texel=gsd * units), budget)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     with workshop(out, (*files, RECORD)) as folder:
         if (out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
@@ -141,8 +157,10 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             for name in {*FILES.values()} - {*files}:
                 (out / name).unlink(missing_ok=True)
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
-        colors = FILES["orthophoto"] if "orthophoto" in done else None
-        drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors)
+        colors, photographs = FILES["orthophoto"] if "orthophoto" in done else None, None
+        if made is not None:
+            photographs = FromPhotographs(made, frame, sheet, settings.tile)
+        drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
         record = {
             "mesh": str(surface.path),
             "crs": frame.crs,
@@ -156,6 +174,8 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
             "heights": [drawn.lowest, drawn.highest],
         }
+        if photographs is not None:
+            record["orthophoto"] = {"from_photographs": round(photographs.cells / drawn.covered, 6)}
         if "hillshade" in done:
             draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], settings.tile)
         if "contours" in done:

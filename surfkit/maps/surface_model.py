@@ -15,10 +15,13 @@ from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.bins import Bins, corners_of, sort_faces
 from surfkit.maps.geotiff import NODATA, Sheet, window_of
 from surfkit.maps.grid import Grid, Window
+from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
 
 CELLS = 1 << 20
 """Cells whose colour is computed at once."""
+GREY = 128
+"""Of what no photograph shows, if the mesh has no colours."""
 COLORS = ("red", "green", "blue")
 
 
@@ -42,7 +45,14 @@ def has_colors(surface: Surface) -> bool:
     return set(COLORS) <= set(surface.rows.dtype.names or ())
 
 
-def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors: str | None = None) -> Drawn:
+def draw_surface(
+    surface: Surface,
+    sheet: Sheet,
+    side: int,
+    heights: str,
+    colors: str | None = None,
+    photographs: FromPhotographs | None = None,
+) -> Drawn:
     """Write the surface model, and the orthophoto, of a mesh.
 
     Args:
@@ -51,6 +61,7 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
         side: Cells of a tile, along each side, on which memory depends.
         heights: File name of the surface model.
         colors: File name of the orthophoto; None for none.
+        photographs: What has the colours of the cells that photographs show; None for those of the vertices everywhere.
 
     Raises:
         BadInput: No cell has a surface.
@@ -60,7 +71,7 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
     with ExitStack() as files:
         model = files.enter_context(sheet.raster(heights, "heights"))
         photo = None if colors is None else files.enter_context(sheet.raster(colors, "colors"))
-        for window, buffer in tiles_of(bins, side, f"drawing {Path(heights).stem}"):
+        for tile, (window, buffer) in enumerate(tiles_of(bins, side, f"drawing {Path(heights).stem}")):
             there = buffer.face != NONE
             if not there.any():
                 continue  # is nodata, and takes no room
@@ -70,7 +81,10 @@ def draw_surface(surface: Surface, sheet: Sheet, side: int, heights: str, colors
             at = window_of(window)
             model.write(np.where(there, buffer.height, NODATA).astype(model.dtypes[0]), 1, window=at)
             if photo is not None:
-                photo.write(colors_of(buffer, bins), window=at)
+                image = colors_of(buffer, bins)
+                if photographs is not None:
+                    photographs.over(tile, buffer, image)
+                photo.write(image, window=at)
         if not covered:
             raise BadInput(
                 f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
@@ -91,10 +105,10 @@ def tiles_of(bins: Bins, side: int, what: str) -> Iterator[tuple[Window, ZBuffer
 
 
 def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
-    """(4, H, W) uint8 colours of the highest triangles at the centres of cells, between those of their corners, and
-    255; 0 0 0 0 where there is none."""
+    """(4, H, W) uint8 colours of the highest triangles at the centres of cells, between those of their corners (grey if
+    they have none), and 255; 0 0 0 0 where there is no triangle."""
     window, faces = buffer.window, buffer.face.reshape(-1)
-    image = np.zeros((4, faces.size), np.uint8)
+    image, colored = np.zeros((4, faces.size), np.uint8), has_colors(bins.surface)
     seen = np.flatnonzero(faces != NONE)
     for at in range(0, len(seen), CELLS):
         cells = seen[at : at + CELLS]
@@ -104,7 +118,8 @@ def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:
         inside, second, third = barycentric(corners_of(bins.surface, bins.grid, used), owner, *places)
         rows = bins.surface.rows[np.asarray(bins.surface.faces[used]).ravel()]
         for channel, name in enumerate(COLORS):
-            a, b, c = rows[name].reshape(-1, 3).T.astype(np.float64)
+            values = rows[name] if colored else np.full(len(rows), GREY)
+            a, b, c = values.reshape(-1, 3).T.astype(np.float64)
             found = a[owner] + second * (b - a)[owner] + third * (c - a)[owner]
             image[channel, cells[inside]] = np.rint(found).astype(np.uint8)
         image[3, cells] = 255

@@ -11,6 +11,7 @@ void add_raster(nanobind::module_& m);
 void add_mesh(nanobind::module_& m);
 void add_stereo(nanobind::module_& m);
 void add_compress(nanobind::module_& m);
+void add_texture(nanobind::module_& m);
 
 namespace {
 
@@ -32,4 +33,5 @@ NB_MODULE(_native, m) {
     surfkit::add_mesh(m);
     surfkit::add_stereo(m);
     surfkit::add_compress(m);
+    surfkit::add_texture(m);
 }

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
-from surfkit.export import tiles3d
 from surfkit.export.glb import read_glb
 from surfkit.export.gltf_reader import read_splats
 from surfkit.export.table import SplatTable, Tile
@@ -123,7 +122,7 @@ def test_the_json_is_what_cesiumjs_expects(tmp_path):
 
 def test_without_a_place_on_earth_up_is_z_and_one_line_says_so(tmp_path, monkeypatch):
     told = []
-    monkeypatch.setattr(tiles3d, "emit", told.append)
+    monkeypatch.setattr("surfkit.export.tileset.emit", told.append)
     table = splat_table(count=20)
     Tiles3D(compress="none").write(tmp_path / "t", table, Frame(np.zeros(3), 1.0, metres=2.0))
     assert [type(event) for event in told] == [Warned] and "no coordinate reference system" in told[0].text

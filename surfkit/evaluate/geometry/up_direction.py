@@ -69,6 +69,17 @@ def up_direction(axis: Axis | None, views: Sequence[View], frame: Frame | None, 
     return Up(_snapped(turn @ found), "cameras")
 
 
+def map_axes(up: np.ndarray) -> np.ndarray:
+    """(3, 3) unit vectors in rows: east, north and up for a direction that is up. For z, the axes of the frame.
+
+    East is the x axis of the frame as far as it lies on the ground, or the y axis where x points up.
+    """
+    axis = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    east = axis - up * (up @ axis)
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(up, east), up]) + 0.0
+
+
 def _up_of_cameras(views: Sequence[View]) -> np.ndarray | None:
     """(3,) unit vector: the direction that no camera has to its side, as cameras are held level; or None.
 

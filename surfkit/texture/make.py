@@ -1,0 +1,266 @@
+"""A textured mesh, from the settings of a user to a folder of files."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.codec import write_json
+from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
+from surfkit.core.files import replacing_folder
+from surfkit.core.optional import needed
+from surfkit.evaluate.geometry.surface import Surface
+from surfkit.mesh.base import Mesh
+from surfkit.mesh.simplify import simplify_to
+from surfkit.scene.crop import Axis
+from surfkit.scene.lengths import Length
+from surfkit.scene.scene import Frame, View
+from surfkit.texture.candidates import NONE, Candidates, exposure_gains
+from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
+from surfkit.texture.choose import choose_views
+from surfkit.texture.deliver import Delivery, Textured, deliver
+from surfkit.texture.fill import Paint, Pictures
+from surfkit.texture.level import level
+from surfkit.texture.look import project, sight
+from surfkit.texture.photographs import Photographs
+from surfkit.texture.regions import Region, divide, middles
+from surfkit.texture.resolution import pixel_sizes
+from surfkit.texture.topology import neighbours, with_short_edges
+
+Format = Literal["obj", "glb", "tiles3d"]
+RECORD = "texture.json"
+"""What the textured mesh is; written last."""
+TEXELS = 6.0
+"""Texels of a triangle by default, were each photograph to look straight at the surface."""
+LONGEST_PX, LONGEST = 32.0, 4.0
+"""Longer edges are halved: in texels, and in edges of a triangle of mean size."""
+LEAST = 100
+"""Triangles of a level of detail."""
+ROOM = 16
+"""Texels that a triangle on a page must leave free along each side."""
+
+
+@dataclass(frozen=True)
+class TextureSettings:
+    """What is written, and how fine it is."""
+
+    formats: tuple[Format, ...] = ("obj", "glb", "tiles3d")
+    """Files to write: obj (with an MTL file and pictures), glb, and tiles3d, a folder with tileset.json for CesiumJS
+    and other viewers of 3D Tiles."""
+
+    triangles: int | Literal["auto"] = "auto"
+    """Triangles to simplify the mesh to; where the surface is flat, large ones are divided again. `auto` is one for 6
+    texels, and no more than the mesh has."""
+
+    texel: Length = "auto"
+    """Side of a texel on the surface, metres; in units of the data set where it does not say how long these are. `auto`
+    is the resolution of the photographs: they are then copied pixel by pixel."""
+
+    size: int = 4096
+    """Largest side of a picture of the atlas, a power of two. Each tile of 3D Tiles has its own."""
+
+    pictures: Pictures = "jpeg"
+    """Pictures of the atlas: jpeg, or png, which loses nothing and is larger."""
+
+    up: Axis | None = None
+    """Axis of the data set that points up, for GLB and 3D Tiles. Default: z if it is georeferenced, else what the
+    cameras tell."""
+
+    def __post_init__(self) -> None:
+        if not self.formats:
+            raise BadInput("--formats: name at least one of obj, glb, tiles3d")
+        if self.triangles != "auto" and not 4 <= self.triangles <= 10**9:
+            raise BadInput(f"--triangles {self.triangles}: give 4 to 1e9, or auto")
+        if self.texel != "auto" and not 0 < self.texel < float("inf"):
+            raise BadInput(f"--texel {self.texel:g}: it is a length, so it must be above 0, or auto")
+        if not 128 <= self.size <= 16384 or self.size & (self.size - 1):
+            raise BadInput(f"--size {self.size}: give a power of two from 128 to 16384")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is textured.
+
+    Attributes:
+        surface: The mesh, in the frame of the input.
+        frame: Of the data set.
+        views: The photographs to use.
+    """
+
+    surface: Surface
+    frame: Frame
+    views: Sequence[View]
+
+
+def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_bytes: int) -> dict[str, Any]:
+    """Write a textured mesh into a folder, and return what texture.json says: lengths are in units of the input.
+
+    Args:
+        subject: What to texture.
+        settings: How.
+        out: The folder; an earlier textured mesh in it is replaced when the new one is complete.
+        budget_bytes: Memory for photographs.
+
+    Raises:
+        BadInput: A package is missing, or no photograph shows the mesh.
+        OSError: The folder holds other files.
+    """
+    began = time.perf_counter()
+    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
+        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
+    frame = subject.frame
+    made = textured(subject, settings, budget_bytes)
+    mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
+    seen, areas = atlas.view != NONE, _areas(mesh)
+    record = {
+        "mesh": str(subject.surface.path),
+        "crs": frame.crs,
+        "offset": list(frame.shift),
+        "metres_per_unit": frame.metres,
+        "texel": float(f"{made.texel:.3g}"),
+        "triangles": len(mesh.faces),
+        "seen": round(float(areas[seen].sum() / areas.sum()), 6),
+        "photographs": len(np.unique(atlas.view[seen])),
+        "outliers": made.outliers,
+        "gains": [round(float(gains.min()), 4), round(float(gains.max()), 4)],
+        "charts": len(atlas.page),
+        "pages": [[page.width, page.height] for page in atlas.pages],
+        "tiles": int(atlas.tile.max()) + 1,
+    }
+    with replacing_folder(out) as folder:
+        how = Delivery(frame, subject.views, set(settings.formats), settings.pictures, settings.up)
+        more = coarser(subject, settings, budget_bytes, made) if "tiles3d" in settings.formats else ()
+        record["files"] = deliver(made, more, how, folder)
+        record["seconds"] = round(time.perf_counter() - began, 1)
+        write_json(folder / RECORD, record)
+    for name in (*record["files"], RECORD):
+        emit(FileWritten(out / name, "textured mesh"))
+    return record
+
+
+def textured(
+    subject: Subject,
+    settings: TextureSettings,
+    budget_bytes: int,
+    mesh: Mesh | None = None,
+    region: Region | None = None,
+) -> Textured:
+    """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
+
+    What is known already can be given: `mesh`, simplified before, and `region`, the regions of the tiles.
+    """
+    refuse_missing()
+    surface, frame = subject.surface, subject.frame
+    sizes = pixel_sizes(surface, subject.views, frame)
+    if np.isnan(sizes).all():
+        raise BadInput(f"{surface.path}: no photograph shows any of it, so it has no texture")
+    texel, views = float(np.nanmedian(sizes)), subject.views
+    if settings.texel != "auto":
+        texel = settings.texel / (frame.metres or 1.0)
+        views = reduced(views, sizes, texel)
+    mesh = prepared(local_mesh(surface, frame) if mesh is None else mesh, settings, texel * frame.scale)
+    photos = Photographs(views, budget_bytes)
+    found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM)
+    atlas, region, beyond = lay_out(mesh, views, found, settings.size, region)
+    levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
+    return Textured(Paint(mesh, atlas, photos, gains, levels), region, texel, outliers)
+
+
+def coarser(subject: Subject, settings: TextureSettings, budget_bytes: int, fine: Textured) -> Iterator[Textured]:
+    """Levels of detail: texels twice as large each, a quarter of the triangles, and regions of four tiles each."""
+    mesh, depth, level = fine.paint.mesh, fine.region.depth, 0
+    while depth > 0:
+        depth, level = max(0, depth - 2), level + 1
+        texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
+        few = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
+        less = replace(settings, texel=texel, triangles=few)
+        made = textured(subject, less, budget_bytes, mesh, fine.region.cut(depth))
+        mesh = made.paint.mesh
+        yield made
+
+
+def refuse_missing() -> None:
+    """BadInput if the package that simplifies meshes is missing."""
+    with needed("fast_simplification", "simplifying a mesh"):
+        __import__("fast_simplification")
+
+
+def local_mesh(surface: Surface, frame: Frame) -> Mesh:
+    """A mesh in the local frame."""
+    vertices = np.empty((len(surface), 3), np.float32)
+    for at in range(0, len(surface), 1 << 20):
+        part = slice(at, at + (1 << 20))
+        vertices[part] = frame.to_local(surface.vertices(part))
+    names = ("red", "green", "blue")
+    colors = None
+    if set(names) <= set(surface.rows.dtype.names or ()):
+        colors = np.stack([surface.rows[name] for name in names], axis=1).astype(np.uint8)
+    else:
+        emit(Warned(f"{surface.path}: its vertices have no colours; what no photograph shows becomes grey"))
+    return Mesh(vertices, np.asarray(surface.faces, np.int32), colors)
+
+
+def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View]:
+    """Views whose pixels are no smaller on the surface than a texel."""
+    found = []
+    for view, size in zip(views, sizes.tolist(), strict=True):
+        camera = view.camera
+        by = min(1.0, size / texel) if np.isfinite(size) else 1.0
+        camera = camera.resized(max(1, round(by * camera.width)), max(1, round(by * camera.height)))
+        found.append(replace(view, camera=camera))
+    return found
+
+
+def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
+    """The mesh with as many triangles as wanted, none of them too large; `texel` in local units."""
+    area = float(_areas(mesh).sum())
+    wanted = settings.triangles if settings.triangles != "auto" else max(LEAST, int(area / texel**2 / TEXELS))
+    if wanted < len(mesh.faces):
+        emit(Progress("simplifying", 0, 1))
+        mesh = simplify_to(mesh, wanted)
+        emit(Progress("simplifying", 1, 1))
+    edge = (area / max(wanted, 1) * 4 / 3**0.5) ** 0.5
+    return with_short_edges(mesh, max(LONGEST_PX * texel, LONGEST * edge))
+
+
+def look_at_all(mesh: Mesh, photos: Photographs, longest: float) -> tuple[Candidates, np.ndarray, int]:
+    """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
+    found, count = Candidates(len(mesh.faces)), len(photos.views)
+    for number, view in enumerate(photos.views):
+        try:
+            picture, keep = photos(number), photos.keep(number)
+        except BadInput as error:
+            emit(PhotoSkipped(view.name, str(error)))
+            continue
+        found.offer(number, sight(mesh, view.camera, picture, keep, longest))
+        emit(Progress("looking at photographs", number + 1, count))
+    gains = exposure_gains(found, count)
+    return found, gains, found.refuse_outliers(gains)
+
+
+def lay_out(
+    mesh: Mesh, views: Sequence[View], found: Candidates, size: int, region: Region | None = None
+) -> tuple[Atlas, Region, np.ndarray]:
+    """The atlas, the regions of its tiles, and the neighbours of the triangles."""
+    beyond, edge = neighbours(mesh.faces)
+    chosen = choose_views(found, beyond, edge)
+    places = np.zeros((len(mesh.faces), 3, 2), np.float32)
+    for number in np.unique(chosen[chosen != NONE]).tolist():
+        mine = chosen == number
+        places[mine] = project(mesh, views[number].camera)[mesh.faces[mine], :2]
+    where = middles(mesh)
+    region = region or divide(where, texels_of(chosen, places), FULL * size**2)
+    return make_atlas(chosen, places, region.of(where), beyond, size), region, beyond
+
+
+def _areas(mesh: Mesh) -> np.ndarray:
+    """(F,) float64."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

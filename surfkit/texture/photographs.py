@@ -1,0 +1,35 @@
+"""The photographs of a data set, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from surfkit.readers.masks import mask_cache
+from surfkit.scene.photos import photo_cache
+from surfkit.scene.scene import View
+
+
+class Photographs:
+    """Photographs of views by number, read ahead in the order in which they are expected."""
+
+    def __init__(self, views: Sequence[View], budget_bytes: int) -> None:
+        self.views = views
+        self.cache = photo_cache(views, 3 * budget_bytes // 4)
+        self.masks = mask_cache(views, budget_bytes // 4)
+
+    def expect(self, numbers: Sequence[int] | np.ndarray) -> None:
+        """Read in this order from now on."""
+        self.cache.expect([int(number) for number in numbers])
+
+    def __call__(self, number: int) -> np.ndarray:
+        """(3, H, W) uint8."""
+        return self.cache[number].numpy()
+
+    def keep(self, number: int) -> np.ndarray | None:
+        """(H, W) bool, or None for all of it."""
+        if self.masks is None:
+            return None
+        found = self.masks[number]
+        return None if found is None else found.numpy()
