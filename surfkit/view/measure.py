@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.maps.grid import map_axes
+from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.scene.earth import TOPOCENTRIC
 from surfkit.scene.scene import Frame
 

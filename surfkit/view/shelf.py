@@ -8,8 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.export.table import SplatTable
-from surfkit.maps.grid import map_axes
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import View
