@@ -9,7 +9,7 @@ import torch
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.maps.grid import map_axes
+from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.mesh.base import Mesh
 from surfkit.method.base import Reconstruction
 from surfkit.partition.base import Cells, Contraction, Ground
