@@ -298,7 +298,11 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     needs("viser")
     write_mesh(tmp_path / "mesh.ply", TRIANGLE, SURVEY)
     words = [sys.executable, "-m", "surfkit.cli", "view", str(tmp_path / "mesh.ply"), "--no-open"]
+    heard = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's background has it ignored, for children too
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, heard)
     stop = threading.Timer(120, process.kill)
     stop.start()
     lines = []
