@@ -1,6 +1,7 @@
 """A small world of components and recipes for the tests of core and cli: no built-in folder, no plugin, no torch."""
 
 import gc
+import importlib
 import os
 import sys
 import types
@@ -174,6 +175,7 @@ def bare(monkeypatch):
 @pytest.fixture
 def world(bare, monkeypatch):
     """The classes of this module, offered by a plugin named stand-in, with `surfkit train` and `surfkit.recipe`."""
+    importlib.import_module("surfkit.cli.parse")  # which would import the modules that are replaced below
     bare.plugins().register(Plugin(), "stand-in")
     for name, values in {
         "surfkit.cli.train": {"COMMAND": Train},

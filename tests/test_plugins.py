@@ -142,6 +142,16 @@ def test_a_recipe_hook_that_fails_takes_only_its_plugin(world, install, capsys):
     assert failures()[0].error == "surfkit_recipes: ZeroDivisionError: division by zero"
 
 
+def test_memory_that_gives_out_is_no_fault_of_a_plugin(world, install):
+    once = "ERRORS = [MemoryError()]\n\n@hookimpl\ndef surfkit_components():\n    if ERRORS: raise ERRORS.pop()"
+    install("acme", GOOD.replace("NAME", "'far'").replace("@hookimpl\ndef surfkit_components():", once))
+    with pytest.raises(MemoryError):
+        components(world.Loss)
+    assert "far" in components(world.Loss) and not failures()
+    with pytest.raises(MemoryError):
+        install("bolt", "raise MemoryError")
+
+
 def test_two_recipes_of_one_name(world, bare, capsys):
     class Other:
         @hookimpl

@@ -70,7 +70,6 @@ class Fuzz:
 
     def judged(self, words: list[str], others: dict[str, Damage]) -> tuple[str | None, str]:
         """What is wrong with how a command ends, if anything is, and what it said; `others` are damages of no file."""
-        import surfkit
         from surfkit.cli import main, parse
         from surfkit.core.memory import peak_memory_bytes
 
@@ -92,8 +91,7 @@ class Fuzz:
             ):
                 status = main(words)
         except BaseException as error:
-            ours = f"{Path(surfkit.__file__).parent}{os.sep}"  # not every folder of this name: a clone may have it
-            where = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(ours)][-1]
+            where = [f for f in traceback.extract_tb(error.__traceback__) if f.filename.startswith(limits.PACKAGE)][-1]
             place = f"{Path(where.filename).name} {where.name}"
             return f"{type(error).__name__} in {place}", out.getvalue() + traceback.format_exc()
         finally:

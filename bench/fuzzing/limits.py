@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import surfkit
+
 from .damage import OUTPUTS, Damage
 
 SECONDS = 20
@@ -23,7 +25,9 @@ WRITES = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "
 FLAGS = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 MOST_CALLS = 100_000
 """Calls of functions of surfkit that a command makes at most before memory gives out, where it is damaged."""
-GUARD = tuple(str(Path(__file__).parents[2] / "surfkit" / "cli" / name) for name in ("__init__.py", "streams.py"))
+PACKAGE = f"{Path(surfkit.__file__).parent}{os.sep}"
+"""Not every folder of this name: a clone may have it."""
+GUARD = tuple(f"{PACKAGE}cli{os.sep}{name}" for name in ("__init__.py", "streams.py"))
 """Where errors become lines: memory does not give out in there."""
 
 
@@ -83,7 +87,7 @@ def giving_out(damage: Damage | None) -> Iterator[None]:
     def called(frame: Any, event: str, argument: object) -> None:
         nonlocal left
         code = frame.f_code
-        ours = "/surfkit/" in code.co_filename and not code.co_filename.startswith(GUARD)
+        ours = code.co_filename.startswith(PACKAGE) and not code.co_filename.startswith(GUARD)
         if ours and not code.co_flags & inspect.CO_GENERATOR:  # which are also called to be closed
             left -= 1
             if left == 0:

@@ -22,6 +22,7 @@ import pluggy
 import tyro
 
 from surfkit.core.check import BadInput
+from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
 _PARTS = """
@@ -153,7 +154,7 @@ def offered(hook: str) -> Iterator[tuple[str, str, Any]]:
             for name, value in offer.items():
                 _check_offer(hook, name, value)
         except Exception as error:
-            if impl.plugin_name in BUILTIN:
+            if impl.plugin_name in BUILTIN or is_out_of_memory(error):
                 raise
             origin = known.get(impl.plugin_name, Plugin(impl.plugin_name, "", ""))
             known[impl.plugin_name] = Plugin(
@@ -257,11 +258,13 @@ def _installed() -> list[importlib.metadata.EntryPoint]:
 
 
 def _load(manager: pluggy.PluginManager, point: importlib.metadata.EntryPoint) -> Plugin:
-    """Register an installed plugin; a failure is written down instead of raised."""
+    """Register an installed plugin; a failure of its own is written down instead of raised."""
     origin = Plugin(point.name, point.dist.name if point.dist else "", point.dist.version if point.dist else "")
     try:
         _register(manager, point.load(), point.name)
     except Exception as error:
+        if is_out_of_memory(error):
+            raise
         return Plugin(origin.name, origin.distribution, origin.version, error=_one_line(error))
     return origin
 
