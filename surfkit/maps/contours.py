@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import struct
+from pathlib import Path
 
 import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
+from surfkit.core.files import replacing
 from surfkit.core.optional import needed
-from surfkit.maps.geotiff import Sheet
+from surfkit.maps.geotiff import TILES, Sheet
 from surfkit.maps.grid import Grid, Window
 from surfkit.maps.hillshade import read_heights
 
@@ -47,8 +49,8 @@ def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side:
     import rasterio
 
     grid, path, count = sheet.grid, sheet.folder / name, 0
-    windows = list(grid.tiles(side))
-    crs = sheet.crs.to_wkt()
+    windows, tiles = list(grid.tiles(side)), sheet.folder / f"{name}{TILES}"
+    tiles.mkdir(exist_ok=True)
     with rasterio.open(sheet.out / heights) as model:
         for at, window in enumerate(windows):
             wide, high = (
@@ -56,16 +58,40 @@ def write_contours(sheet: Sheet, heights: str, name: str, interval: float, side:
                 min(window.height + 1, grid.height - window.top),
             )
             part = Window(window.left, window.top, wide, high)
-            lines = contour_lines(read_heights(model, part), grid, part, interval)
-            if lines or not path.exists():
-                shapes = np.array([_binary(line) for _, line in lines], object)
-                levels = np.array([level for level, _ in lines], np.float64)
-                layer = {"layer": "contours", "driver": "GPKG", "geometry_type": "LineString", "crs": crs}
-                write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
-            count += len(lines)
+            if not (tiles / f"{at}.npz").exists():
+                _keep(contour_lines(read_heights(model, part), grid, part, interval), tiles / f"{at}.npz")
             emit(Progress("contour lines", at + 1, len(windows)))
+    layer = {"layer": "contours", "driver": "GPKG", "geometry_type": "LineString", "crs": sheet.crs.to_wkt()}
+    for rest in sheet.folder.glob(f"{name}*"):
+        if rest != tiles:  # of an interrupted call
+            rest.unlink()
+    for at in range(len(windows)):
+        lines = _kept(tiles / f"{at}.npz")
+        if lines or not path.exists():
+            shapes = np.array([_binary(line) for _, line in lines], object)
+            levels = np.array([level for level, _ in lines], np.float64)
+            write(path, shapes, [levels], ["elevation"], append=path.exists(), **layer)
+        count += len(lines)
+        emit(Progress("writing contour lines", at + 1, len(windows)))
     sheet.deliver(path)
     return count
+
+
+def _keep(lines: list[tuple[float, np.ndarray]], path: Path) -> None:
+    """Keep the levels and lines of a tile."""
+    levels, places = [level for level, _ in lines], [line for _, line in lines]
+    with replacing(path) as file:
+        ends = np.cumsum([len(line) for line in places], dtype=np.int64)
+        np.savez(
+            file, levels=np.array(levels, np.float64), ends=ends, places=np.concatenate([*places, np.empty((0, 2))])
+        )
+
+
+def _kept(path: Path) -> list[tuple[float, np.ndarray]]:
+    """What was kept."""
+    with np.load(path) as found:
+        lines = np.split(found["places"], found["ends"])[:-1]
+        return list(zip(found["levels"].tolist(), lines, strict=True))
 
 
 def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: float) -> list[tuple[float, np.ndarray]]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import replacing
-from surfkit.maps.geotiff import NODATA, Sheet, window_of
+from surfkit.maps.geotiff import Sheet
 from surfkit.maps.hillshade import read_heights
+from surfkit.maps.rasters import NODATA
 
 PIXELS = 1400
 """Longest side of the map in the picture."""
@@ -60,25 +62,38 @@ def write_difference(sheet: Sheet, heights: tuple[Path, Path], name: str, side: 
     """
     import rasterio
 
-    windows, cell = list(sheet.grid.tiles(side)), sheet.grid.gsd**2
-    cells, fill, cut, only_here, only_other = 0, 0.0, 0.0, 0, 0
+    windows, found = list(sheet.grid.tiles(side)), []
     with rasterio.open(heights[0]) as here, rasterio.open(heights[1]) as other:
         with sheet.raster(name, "heights") as file:
             for at, window in enumerate(windows):
-                ours, theirs = read_heights(here, window), read_heights(other, window)
-                found = ours - theirs
-                there = np.isfinite(found)
-                cells += int(there.sum())
-                fill += float(found[there].clip(min=0).sum()) * cell
-                cut -= float(found[there].clip(max=0).sum()) * cell
-                only_here += int((np.isfinite(ours) & ~there).sum())
-                only_other += int((np.isfinite(theirs) & ~there).sum())
-                if there.any():
-                    file.write(np.where(there, found, NODATA).astype(file.dtypes[0]), 1, window=window_of(window))
+                facts = file.facts(window)
+                if facts is None:
+                    ours, theirs = read_heights(here, window), read_heights(other, window)
+                    facts = _counted(ours, theirs)
+                    if facts["cells"]:
+                        differences = ours - theirs
+                        file.write(np.where(np.isfinite(differences), differences, NODATA), window, facts)
+                found.append(facts)
                 emit(Progress("comparing heights", at + 1, len(windows)))
-            if not cells:
+            total = {name: sum(facts[name] for facts in found) for name in found[0]}
+            if not total["cells"]:
                 raise BadInput(f"no cell of {sheet.grid.gsd:g} has both surfaces: they do not lie in the same place")
-    return Difference(cells, cells * cell, fill, cut, *_percentiles(sheet, name, side), only_here, only_other)
+    cell, counts = sheet.grid.gsd**2, (total["only_here"], total["only_other"])
+    volumes = total["cells"] * cell, total["fill"] * cell, total["cut"] * cell
+    return Difference(total["cells"], *volumes, *_percentiles(sheet, name, side), *counts)
+
+
+def _counted(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
+    """Of a tile: cells with both surfaces, sums of the heights above and below, and cells with one surface only."""
+    differences = ours - theirs
+    both = np.isfinite(differences)
+    return {
+        "cells": int(both.sum()),
+        "fill": float(differences[both].clip(min=0).sum()),
+        "cut": -float(differences[both].clip(max=0).sum()),
+        "only_here": int((np.isfinite(ours) & ~both).sum()),
+        "only_other": int((np.isfinite(theirs) & ~both).sum()),
+    }
 
 
 def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, float]:

@@ -1,4 +1,7 @@
-"""GeoTIFFs: written tile by tile, then laid out as Cloud Optimized GeoTIFF with overviews; whole or not at all."""
+"""GeoTIFFs: a file for each tile, then all of them as a Cloud Optimized GeoTIFF with overviews; whole or not at all.
+
+Tiles and finished files outlive an interruption: the next call for the same maps goes on with them.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +9,29 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from surfkit.core.check import BadInput, Fault
+from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
-from surfkit.core.optional import needed
-from surfkit.maps.grid import Grid, Window
+from surfkit.core.stages import kept_parts
+from surfkit.maps.grid import Grid
+from surfkit.maps.rasters import BLOCK, Kind, Raster
 
-BLOCK = 512
-"""Side of the tiles within a file, cells."""
 CACHE = 256
 """Megabytes of GDAL's own cache of blocks."""
 LEAST_FREE = 1 << 20
 """Bytes of a disk, below which it is full."""
 NOT_WRITTEN = re.compile("write (error|failed)|no space", re.IGNORECASE)
 """How GDAL says that a file could not be written."""
-NODATA = -9999.0
-"""Height where there is no surface."""
-Kind = Literal["heights", "colors", "shades"]
+WORK, TILES = "unfinished", ".tiles"
+"""Folder for what is finished of maps, in theirs; ending of the names of folders with the tiles of a raster."""
 
 
 @dataclass(frozen=True)
@@ -50,38 +52,20 @@ class Sheet:
     out: Path
     double: bool = False
 
-    @property
-    def profile(self) -> dict[str, Any]:
-        """How rasterio creates a file."""
-        west, _, _, north = self.grid.bounds
-        with needed("rasterio", "surfkit maps"):
-            from rasterio import Affine
-        place = Affine(self.grid.gsd, 0, west, 0, -self.grid.gsd, north)
-        size = {"width": self.grid.width, "height": self.grid.height}
-        inner = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "sparse_ok": True}
-        return {"driver": "GTiff", "crs": self.crs, "transform": place, "bigtiff": "IF_SAFER", **size, **inner}
-
     @contextmanager
-    def raster(self, name: str, kind: Kind) -> Iterator[Any]:
-        """A GeoTIFF, open to write and read windows, that becomes the Cloud Optimized GeoTIFF `name` in `out` at the
-        end, when all went well.
+    def raster(self, name: str, kind: Kind) -> Iterator[Raster]:
+        """A raster to write tiles of, that becomes the Cloud Optimized GeoTIFF `name` in `out` when all went well.
 
         Heights have NODATA where there is nothing; colours have a fourth channel that is 0 there and 255 elsewhere;
         shades are 1 to 255, and 0 where there is nothing.
         """
         import rasterio
 
-        heights = "float64" if self.double else "float32"
-        dtype, count, nodata = {
-            "heights": (heights, 1, NODATA),
-            "colors": ("uint8", 4, None),
-            "shades": ("uint8", 1, 0),
-        }[kind]
-        more = {"photometric": "RGB", "alpha": "YES"} if kind == "colors" else {}
-        draft = self.folder / f"draft-{name}"
-        options = {"dtype": dtype, "count": count, "nodata": nodata, "compress": "LZW", **more}
-        with rasterio.Env(GDAL_CACHEMAX=CACHE), rasterio.open(draft, "w+", **self.profile, **options) as file:
-            yield file
+        folder = self.folder / f"{name}{TILES}"
+        folder.mkdir(exist_ok=True)
+        raster = Raster(folder, self.grid, self.crs, kind, self.double)
+        with rasterio.Env(GDAL_CACHEMAX=CACHE):
+            yield raster
         refuse_full(self.folder)
         emit(Progress(f"compressing {name}", 0, 1))
         finished = self.folder / name
@@ -97,10 +81,32 @@ class Sheet:
         with rasterio.Env(GDAL_CACHEMAX=CACHE, CPL_TMPDIR=str(self.folder)):
             from rasterio.shutil import copy
 
-            copy(draft, finished, driver="COG", **layout)
-        draft.unlink()
+            copy(raster.whole(), finished, driver="COG", **layout)
         self.deliver(finished)
         emit(Progress(f"compressing {name}", 1, 1))
+
+    def once(self, names: Sequence[str], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The facts that `make` returns, which delivers files; what an interrupted call has made is not made again.
+
+        Args:
+            names: Of the files.
+            make: Makes them; the facts are what JSON has.
+        """
+        record = self.folder / f"{names[0]}.json"
+        if record.exists():
+            known = read_json(record, dict[str, Any])
+            if known["files"] == self._stamps(names):
+                return known["facts"]
+        facts = make()
+        write_json(record, {"facts": facts, "files": self._stamps(names)})
+        for tiles in self.folder.glob(f"*{TILES}"):
+            shutil.rmtree(tiles)
+        return facts
+
+    def _stamps(self, names: Sequence[str]) -> list[list[int] | None]:
+        """Size and time of delivered files."""
+        states = [(self.out / name).stat() if (self.out / name).exists() else None for name in names]
+        return [state and [state.st_size, state.st_mtime_ns] for state in states]
 
     def deliver(self, finished: Path) -> None:
         """Move a file of `folder` to `out`."""
@@ -112,13 +118,6 @@ class Sheet:
         emit(FileWritten(self.out / finished.name, "map"))
 
 
-def window_of(window: Window) -> Any:
-    """The same as rasterio has it."""
-    from rasterio.windows import Window as Their
-
-    return Their(window.left, window.top, window.width, window.height)
-
-
 def refuse_full(folder: Path) -> None:
     """OSError if the disk is full: GDAL does not always say that what it wrote last found no room."""
     if shutil.disk_usage(folder).free < LEAST_FREE:
@@ -126,33 +125,34 @@ def refuse_full(folder: Path) -> None:
 
 
 @contextmanager
-def workshop(out: Path, names: tuple[str, ...]) -> Iterator[Path]:
+def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]:
     """Within, no other process writes maps into `out`, and there is a folder in it for files that are being written.
 
-    What dead processes left in such folders is deleted.
+    What an interrupted call with the same key has finished is in it. It stays when this call is interrupted.
 
     Args:
         out: Made if it is missing.
         names: Files to be written: OSError if something else than a file has such a name.
+        key: Of all that the maps depend on.
 
     Raises:
         Fault: The disk is full.
     """
     for name in names:
         refuse_special(out / name)
+    folder = out / WORK
     with locked(out):
         sweep(out, deep=False)
-        folder = out / f".maps.{os.getpid()}.part"
-        folder.mkdir()
         try:
-            yield folder
+            with kept_parts(folder, key):
+                yield folder
+        except BadInput:  # the same command would come to it again
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
-            full = shutil.disk_usage(folder).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
-            if isinstance(error, BadInput) or not full:
+            full = shutil.disk_usage(out).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
+            if not full:
                 raise
             raise Fault(
                 f"{out}: the disk is full; the maps that are in it are whole: free some space, then do it again"
             ) from error
-        finally:
-            with suppress(OSError):
-                shutil.rmtree(folder)

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from surfkit.core.events import Progress, emit
-from surfkit.maps.geotiff import NODATA, Sheet, window_of
+from surfkit.maps.geotiff import Sheet
 from surfkit.maps.grid import Window
+from surfkit.maps.rasters import NODATA, window_of
 
 AZIMUTH, ALTITUDE = 315.0, 45.0
 """Degrees: the light comes from the north-west, as maps have it."""
@@ -21,7 +22,8 @@ def draw_hillshade(sheet: Sheet, heights: str, name: str, side: int) -> None:
     windows = list(sheet.grid.tiles(side))
     with rasterio.open(sheet.out / heights) as model, sheet.raster(name, "shades") as file:
         for at, window in enumerate(windows):
-            file.write(hillshade(_with_margin(model, window), sheet.grid.gsd), 1, window=window_of(window))
+            if file.facts(window) is None:
+                file.write(hillshade(_with_margin(model, window), sheet.grid.gsd), window, {})
             emit(Progress("shading", at + 1, len(windows)))
 
 

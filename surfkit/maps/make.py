@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,20 +13,23 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.core.optional import needed
+from surfkit.core.stages import key_of
+from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
 from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
-from surfkit.maps.difference import draw_difference, write_difference
+from surfkit.maps.difference import Difference, draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
-from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
+from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Frame, View
+from surfkit.texture.keep import Kept, identity, seen
 from surfkit.texture.make import Subject as Textures
 from surfkit.texture.make import TextureSettings, textured
 from surfkit.texture.resolution import ground_sampling_distance
@@ -125,7 +128,8 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     Args:
         subject: What to draw.
         settings: How.
-        out: The folder; maps in it are replaced, files of other names stay.
+        out: The folder; maps in it are replaced, files of other names stay. What an interrupted call has finished for
+            the same maps is in it, and is not done again.
         other: A mesh in the same coordinates, to subtract.
 
     Raises:
@@ -146,21 +150,18 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     if "orthophoto" in done and settings.colors == "mesh" and not has_colors(surface):
         emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
         done = tuple(name for name in done if name != "orthophoto")
-    made = None
-    if "orthophoto" in done and settings.colors == "photographs":
-        budget = cache_bytes(settings.memory, "--memory")
-        made = textured(Textures(surface, frame, subject.views), TextureSettings(texel=gsd * units), budget)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
-    with workshop(out, (*files, RECORD)) as folder:
-        if (out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
-            (out / RECORD).unlink()
-            for name in {*FILES.values()} - {*files}:
-                (out / name).unlink(missing_ok=True)
+    key = key_of(
+        replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
+        grid.gsd, grid.bounds, identity(surface), other and identity(other),
+        seen(subject.views) if settings.colors == "photographs" else "",
+    )  # fmt: skip
+    with workshop(out, (*files, RECORD), key) as folder:
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
-        colors, photographs = FILES["orthophoto"] if "orthophoto" in done else None, None
-        if made is not None:
-            photographs = FromPhotographs(made, frame, sheet, settings.tile)
-        drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
+        drawn = Drawn(**sheet.once(
+            [FILES[name] for name in ("dsm", "orthophoto") if name in done],
+            lambda: asdict(draw(subject, settings, sheet, files)),
+        ))  # fmt: skip
         record = {
             "mesh": str(surface.path),
             "crs": frame.crs,
@@ -174,17 +175,16 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
             "heights": [drawn.lowest, drawn.highest],
         }
-        if photographs is not None:
-            record["orthophoto"] = {"from_photographs": round(photographs.cells / drawn.covered, 6)}
+        if "orthophoto" in done and settings.colors == "photographs":
+            record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
         if "hillshade" in done:
-            draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], settings.tile)
+            sheet.once([FILES["hillshade"]], lambda: shade(sheet, settings.tile))
         if "contours" in done:
             interval = length(settings.interval, even_interval(drawn.lowest, drawn.highest))
-            count = write_contours(sheet, FILES["dsm"], FILES["contours"], interval, settings.tile)
-            record["contours"] = {"interval": interval, "lines": count}
+            record["contours"] = sheet.once([FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
         if "points" in done:
             spacing = length(settings.spacing, gsd)
-            record["points"] = {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
+            record["points"] = sheet.once([FILES["points"]], lambda: scatter(surface, sheet, spacing))
         if other is not None:
             record["difference"] = subtract(sheet, other, settings.tile, frame)
         record["files"] = files
@@ -193,13 +193,48 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     return record
 
 
+def draw(subject: Subject, settings: MapSettings, sheet: Sheet, files: Sequence[str]) -> Drawn:
+    """Draw the surface model, and the orthophoto if it is among the `files` of the maps."""
+    photographs, colored = None, FILES["orthophoto"] in files
+    if colored and settings.colors == "photographs":
+        texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
+        textures = Textures(subject.surface, subject.frame, subject.views)
+        made = textured(textures, TextureSettings(texel=texel), budget, Kept(sheet.folder))
+        photographs = FromPhotographs(made, subject.frame, sheet, settings.tile)
+    if (sheet.out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
+        (sheet.out / RECORD).unlink()
+        for name in {*FILES.values()} - {*files}:
+            (sheet.out / name).unlink(missing_ok=True)
+    colors = FILES["orthophoto"] if colored else None
+    return draw_surface(subject.surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
+
+
+def shade(sheet: Sheet, side: int) -> dict[str, Any]:
+    """Draw the hillshade; there is nothing to tell of it."""
+    draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], side)
+    return {}
+
+
+def trace(sheet: Sheet, interval: float, side: int) -> dict[str, Any]:
+    """Write the contour lines, and return what maps.json says of them."""
+    return {
+        "interval": interval,
+        "lines": write_contours(sheet, FILES["dsm"], FILES["contours"], interval, side),
+    }
+
+
+def scatter(surface: Surface, sheet: Sheet, spacing: float) -> dict[str, Any]:
+    """Write the point cloud, and return what maps.json says of it."""
+    return {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
+
+
 def subtract(sheet: Sheet, other: Surface, side: int, frame: Frame) -> dict[str, Any]:
     """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
-    draw_surface(other, sheet, side, FILES["other"])
+    sheet.once([FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, FILES["other"])))
     heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
-    found = write_difference(sheet, heights, FILES["difference"], side)
-    unit = "m" if frame.metres == 1 else "units"
-    draw_difference(sheet.out / FILES["picture"], sheet.out / FILES["difference"], found, unit)
+    name, unit = FILES["difference"], "m" if frame.metres == 1 else "units"
+    found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
+    draw_difference(sheet.out / FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}
 
 

@@ -35,10 +35,9 @@ class FromPhotographs:
         mesh = made.paint.mesh
         surface = Surface(sheet.out / "textured", frame.to_input(mesh.vertices), mesh.faces)
         self.bins = sort_faces(surface, sheet.grid, side, sheet.folder / "faces-textured")
-        self.cells = 0
 
-    def over(self, tile: int, buffer: ZBuffer, image: np.ndarray) -> None:
-        """Replace the colours of the cells of a tile that a photograph shows.
+    def over(self, tile: int, buffer: ZBuffer, image: np.ndarray) -> int:
+        """Replace the colours of the cells of a tile that a photograph shows, and return how many these are.
 
         Args:
             tile: Its number.
@@ -57,11 +56,11 @@ class FromPhotographs:
         order = order[view[order] != UNSEEN]
         numbers, starts = np.unique(view[order], return_index=True)
         self.paint.photos.expect(numbers)
-        self.cells += len(order)
         for number, some in zip(numbers, np.split(order, starts[1:]), strict=True):
             for at in range(0, len(some), CELLS):
                 rows = some[at : at + CELLS]
                 image.reshape(4, -1)[:3, cells[rows]] = self._colors(int(number), buffer, cells[rows], face[rows]).T
+        return len(order)
 
     def _colors(self, number: int, buffer: ZBuffer, cells: np.ndarray, face: np.ndarray) -> np.ndarray:
         """(n, 3) uint8 colours of cells in a photograph, between its pixels."""

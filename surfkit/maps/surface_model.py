@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.bins import Bins, corners_of, sort_faces
-from surfkit.maps.geotiff import NODATA, Sheet, window_of
+from surfkit.maps.geotiff import Sheet
 from surfkit.maps.grid import Grid, Window
 from surfkit.maps.photographs import FromPhotographs
+from surfkit.maps.rasters import NODATA
 from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
 
 CELLS = 1 << 20
@@ -33,11 +34,13 @@ class Drawn:
         covered: Cells with a surface.
         lowest: Height, units of the input.
         highest: The same.
+        from_photographs: Cells with the colour of a photograph.
     """
 
     covered: int
     lowest: float
     highest: float
+    from_photographs: int = 0
 
 
 def has_colors(surface: Surface) -> bool:
@@ -67,41 +70,46 @@ def draw_surface(
         BadInput: No cell has a surface.
     """
     bins = sort_faces(surface, sheet.grid, side, sheet.folder / f"faces-{Path(heights).stem}")
-    covered, lowest, highest = 0, np.inf, -np.inf
+    windows, found = list(sheet.grid.tiles(side)), []
     with ExitStack() as files:
         model = files.enter_context(sheet.raster(heights, "heights"))
         photo = None if colors is None else files.enter_context(sheet.raster(colors, "colors"))
-        for tile, (window, buffer) in enumerate(tiles_of(bins, side, f"drawing {Path(heights).stem}")):
-            there = buffer.face != NONE
-            if not there.any():
-                continue  # is nodata, and takes no room
-            found = buffer.height[there]
-            covered += len(found)
-            lowest, highest = min(lowest, found.min()), max(highest, found.max())
-            at = window_of(window)
-            model.write(np.where(there, buffer.height, NODATA).astype(model.dtypes[0]), 1, window=at)
-            if photo is not None:
-                image = colors_of(buffer, bins)
-                if photographs is not None:
-                    photographs.over(tile, buffer, image)
-                photo.write(image, window=at)
-        if not covered:
+        for tile, window in enumerate(windows):
+            facts = model.facts(window)
+            if facts is None and (buffer := drawn_tile(bins, tile, window)).covered.any():
+                facts = facts_of(buffer)
+                if photo is not None:
+                    image = colors_of(buffer, bins)
+                    facts["from_photographs"] = 0 if photographs is None else photographs.over(tile, buffer, image)
+                    photo.write(image, window)
+                model.write(np.where(buffer.covered, buffer.height, NODATA), window, facts)  # last: the tile is done
+            found += [] if facts is None else [facts]
+            emit(Progress(f"drawing {Path(heights).stem}", tile + 1, len(windows)))
+        if not found:
             raise BadInput(
                 f"{surface.path}: none of its triangles covers the centre of a cell of {sheet.grid.gsd:g}; give a "
                 "smaller --gsd, or other --bounds"
             )
-    return Drawn(covered, float(lowest), float(highest))
+    return Drawn(
+        sum(facts["covered"] for facts in found),
+        min(facts["lowest"] for facts in found),
+        max(facts["highest"] for facts in found),
+        sum(facts.get("from_photographs", 0) for facts in found),
+    )
 
 
-def tiles_of(bins: Bins, side: int, what: str) -> Iterator[tuple[Window, ZBuffer]]:
-    """Each tile of the map with the highest triangles on it; progress under the name `what`."""
-    windows = list(bins.grid.tiles(side))
-    for at, window in enumerate(windows):
-        buffer = ZBuffer(window)
-        for numbers in bins.of(at):
-            buffer.draw(corners_of(bins.surface, bins.grid, numbers), numbers)
-        yield window, buffer
-        emit(Progress(what, at + 1, len(windows)))
+def drawn_tile(bins: Bins, tile: int, window: Window) -> ZBuffer:
+    """The highest triangles on a tile of the map."""
+    buffer = ZBuffer(window)
+    for numbers in bins.of(tile):
+        buffer.draw(corners_of(bins.surface, bins.grid, numbers), numbers)
+    return buffer
+
+
+def facts_of(buffer: ZBuffer) -> dict[str, Any]:
+    """What is counted of a tile with a surface."""
+    found = buffer.height[buffer.covered]
+    return {"covered": len(found), "lowest": float(found.min()), "highest": float(found.max())}
 
 
 def colors_of(buffer: ZBuffer, bins: Bins) -> np.ndarray:

@@ -29,6 +29,11 @@ class ZBuffer:
         self.height = np.full((window.height, window.width), -np.inf)
         self.face = np.full((window.height, window.width), NONE, np.int64)
 
+    @property
+    def covered(self) -> np.ndarray:
+        """(H, W) bool: where there is a triangle."""
+        return self.face != NONE
+
     def draw(self, corners: np.ndarray, numbers: np.ndarray) -> None:
         """Draw triangles.
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.codec import read_json, write_json
+from surfkit.core.stages import Stages, key_of
 from surfkit.sfm.features import FEWEST, feature_file, find_features, read_features
 from surfkit.sfm.matching import contents, match, refuse_other
 from surfkit.sfm.pairs import Pair, choose_pairs
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
-from surfkit.sfm.stages import Stages, key_of
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
+from surfkit.core.stages import Stages, key_of
 from surfkit.readers.georeference import Similarity
 from surfkit.readers.placed import Placed
 from surfkit.sfm.adjust import adjust_once
@@ -26,7 +27,6 @@ from surfkit.sfm.matching import matched
 from surfkit.sfm.photographs import Photo, look
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import Settings
-from surfkit.sfm.stages import Stages, key_of
 
 WORK = "prepare"
 """Folder of the scene for what the stages keep."""

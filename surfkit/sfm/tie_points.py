@@ -18,6 +18,7 @@ from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing_folder
+from surfkit.core.stages import Stages, key_of
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.masks import find_masks
@@ -33,7 +34,6 @@ from surfkit.sfm.mapping import SMALLEST, read_model
 from surfkit.sfm.photographs import Photo, is_copy, look, mark_copies
 from surfkit.sfm.report import model_facts
 from surfkit.sfm.settings import Settings
-from surfkit.sfm.stages import Stages, key_of
 
 WORK, REPORT = "prepare", "report.json"
 """Folder of the scene for what the stages keep, and what is told of it."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -37,6 +37,7 @@ class Delivery:
         kinds: Formats.
         pictures: Of the pages.
         up: Axis that points up; None to find out.
+        work: Folder where painted pages are kept.
     """
 
     frame: Frame
@@ -44,6 +45,7 @@ class Delivery:
     kinds: set[str]
     pictures: Pictures
     up: Axis | None
+    work: Path
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
         folder: Where.
     """
     what = fine.paint
-    parts, pages = painted(what, how.pictures, folder)
+    parts, pages = painted(what, how.pictures, how.work)
     frame, files = how.frame, []
     level = np.eye(3) if frame.crs else map_axes(up_direction(how.up, how.views, frame, np.eye(4)).direction)
     if "obj" in how.kinds:
@@ -82,6 +84,8 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
             write_obj(file, what.mesh, parts, frame.to_file, f"{NAME}.mtl", notes)
         with replacing(folder / f"{NAME}.mtl") as file:
             file.write(material_lines([page.name for page in pages]).encode())
+        for page in pages:
+            shutil.copyfile(page, folder / page.name)
         files += [f"{NAME}.obj", f"{NAME}.mtl", *(page.name for page in pages)]
     if "glb" in how.kinds:
         notes = {"offset": list(frame.shift), "crs": frame.crs, "metres_per_unit": frame.metres}
@@ -94,30 +98,26 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
     if "tiles3d" in how.kinds:
         tiles = Tiles(folder / TILES, frame, level, how.pictures)
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
-        for made in coarser:
-            with TemporaryDirectory(dir=folder) as draft:
-                drawn = painted(made.paint, how.pictures, Path(draft))
-                tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, made.texel)
+        for level, made in enumerate(coarser, 1):
+            drawn = painted(made.paint, how.pictures, how.work / f"level-{level}")
+            tiles.write(fine.region.at(made.region.depth), made.paint, *drawn, made.texel)
         tiles.finish(fine.region)
         files.append(f"{TILES}/tileset.json")
-    if "obj" not in how.kinds:
-        for page in pages:
-            page.unlink()
     return files
 
 
 def painted(what: Paint, kind: Pictures, folder: Path) -> tuple[list[Part], list[Path]]:
-    """The triangles and the file of each page."""
+    """The triangles and the file of each page; pages that are in the folder already are not painted again."""
     atlas = what.atlas
     page = atlas.page[atlas.chart]
     order = np.argsort(page, kind="stable")
     rows = np.split(order, np.searchsorted(page[order], np.arange(1, len(atlas.pages))))
-    what.photos.expect(np.concatenate([np.unique(atlas.view[some][atlas.view[some] != NONE]) for some in rows]))
-    parts, paths = [], []
-    for number, some in enumerate(rows):
-        path = folder / f"{NAME}-{number:03d}.{SUFFIX[kind]}"
-        path.write_bytes(encoded(paint(what, atlas.pages[number], some), kind))
-        parts.append(part_of(what.mesh, atlas, number, some))
-        paths.append(path)
-        emit(Progress("painting pages", number + 1, len(rows)))
-    return parts, paths
+    paths = [folder / f"{NAME}-{number:03d}.{SUFFIX[kind]}" for number in range(len(rows))]
+    left = [number for number, path in enumerate(paths) if not path.exists()]
+    views = [np.unique(atlas.view[rows[number]][atlas.view[rows[number]] != NONE]) for number in left]
+    what.photos.expect(np.concatenate([*views, np.empty(0, np.int32)]))
+    for done, number in enumerate(left, len(rows) - len(left) + 1):
+        with replacing(paths[number]) as file:
+            file.write(encoded(paint(what, atlas.pages[number], rows[number]), kind))
+        emit(Progress("painting pages", done, len(rows)))
+    return [part_of(what.mesh, atlas, number, some) for number, some in enumerate(rows)], paths

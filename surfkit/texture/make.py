@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import errno
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
 from surfkit.core.files import replacing_folder
+from surfkit.core.lock import locked
 from surfkit.core.optional import needed
+from surfkit.core.stages import kept_parts, key_of
+from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.simplify import simplify_to
@@ -27,7 +30,8 @@ from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
 from surfkit.texture.choose import choose_views
 from surfkit.texture.deliver import Delivery, Textured, deliver
 from surfkit.texture.fill import Paint, Pictures
-from surfkit.texture.level import level
+from surfkit.texture.keep import Arrays, Kept, identity, seen
+from surfkit.texture.level import Levels, level
 from surfkit.texture.look import project, sight
 from surfkit.texture.photographs import Photographs
 from surfkit.texture.regions import Region, divide, middles
@@ -37,6 +41,10 @@ from surfkit.texture.topology import neighbours, with_short_edges
 Format = Literal["obj", "glb", "tiles3d"]
 RECORD = "texture.json"
 """What the textured mesh is; written last."""
+WORK = ".unfinished"
+"""Ending of the name of the folder, beside the one that is written, for what is finished of it."""
+LOOKED, PAUSE_S, SHARE = "looked", 20.0, 30.0
+"""What was seen in the photographs so far is kept every `PAUSE_S` seconds, or `SHARE` times as long as that takes."""
 TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
@@ -105,7 +113,8 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     Args:
         subject: What to texture.
         settings: How.
-        out: The folder; an earlier textured mesh in it is replaced when the new one is complete.
+        out: The folder; an earlier textured mesh in it is replaced when the new one is complete. Beside it lies what an
+            interrupted call has finished of the same, which is not done again.
         budget_bytes: Memory for photographs.
 
     Raises:
@@ -115,15 +124,35 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     began = time.perf_counter()
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
         raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
-    frame = subject.frame
-    made = textured(subject, settings, budget_bytes)
+    work, frame = out.with_name(f"{out.name}{WORK}"), subject.frame
+    key = key_of(
+        settings, own_version(), identity(subject.surface), seen(subject.views), frame.crs, frame.metres, frame.scale,
+        list(frame.shift), frame.to_input(np.eye(3)).tolist(),
+    )  # fmt: skip
+    with locked(work), kept_parts(work, key):
+        kept = Kept(work)
+        made = textured(subject, settings, budget_bytes, kept)
+        record = facts_of(made, subject)
+        with replacing_folder(out) as folder:
+            how = Delivery(frame, subject.views, set(settings.formats), settings.pictures, settings.up, work)
+            more = coarser(subject, settings, budget_bytes, made, kept) if "tiles3d" in settings.formats else ()
+            record["files"] = deliver(made, more, how, folder)
+            record["seconds"] = round(time.perf_counter() - began, 1)
+            write_json(folder / RECORD, record)
+    for name in (*record["files"], RECORD):
+        emit(FileWritten(out / name, "textured mesh"))
+    return record
+
+
+def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
+    """What texture.json says of a textured mesh."""
     mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
     seen, areas = atlas.view != NONE, _areas(mesh)
-    record = {
+    return {
         "mesh": str(subject.surface.path),
-        "crs": frame.crs,
-        "offset": list(frame.shift),
-        "metres_per_unit": frame.metres,
+        "crs": subject.frame.crs,
+        "offset": list(subject.frame.shift),
+        "metres_per_unit": subject.frame.metres,
         "texel": float(f"{made.texel:.3g}"),
         "triangles": len(mesh.faces),
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),
@@ -134,27 +163,20 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
         "pages": [[page.width, page.height] for page in atlas.pages],
         "tiles": int(atlas.tile.max()) + 1,
     }
-    with replacing_folder(out) as folder:
-        how = Delivery(frame, subject.views, set(settings.formats), settings.pictures, settings.up)
-        more = coarser(subject, settings, budget_bytes, made) if "tiles3d" in settings.formats else ()
-        record["files"] = deliver(made, more, how, folder)
-        record["seconds"] = round(time.perf_counter() - began, 1)
-        write_json(folder / RECORD, record)
-    for name in (*record["files"], RECORD):
-        emit(FileWritten(out / name, "textured mesh"))
-    return record
 
 
 def textured(
     subject: Subject,
     settings: TextureSettings,
     budget_bytes: int,
-    mesh: Mesh | None = None,
+    kept: Kept = Kept(),
+    finer: Mesh | None = None,
     region: Region | None = None,
 ) -> Textured:
     """Choose a photograph for each triangle of the mesh, simplified; arguments and errors as for `make_texture`.
 
-    What is known already can be given: `mesh`, simplified before, and `region`, the regions of the tiles.
+    What is known already can be given: `finer`, the mesh simplified before, and `region`, the regions of the tiles.
+    Each step is kept in `kept` when it is finished, and not done again if it is there.
     """
     refuse_missing()
     surface, frame = subject.surface, subject.frame
@@ -165,15 +187,40 @@ def textured(
     if settings.texel != "auto":
         texel = settings.texel / (frame.metres or 1.0)
         views = reduced(views, sizes, texel)
-    mesh = prepared(local_mesh(surface, frame) if mesh is None else mesh, settings, texel * frame.scale)
+
+    def simplified() -> Mesh:
+        given = local_mesh(surface, frame) if finer is None else finer
+        return prepared(given, settings, texel * frame.scale)
+
+    mesh = kept_mesh(kept, simplified)
     photos = Photographs(views, budget_bytes)
-    found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM)
-    atlas, region, beyond = lay_out(mesh, views, found, settings.size, region)
-    levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
-    return Textured(Paint(mesh, atlas, photos, gains, levels), region, texel, outliers)
+    beyond, edge = neighbours(mesh.faces)
+
+    def choose() -> Arrays:
+        found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM, kept)
+        return {"view": choose_views(found, beyond, edge), "gains": gains, "outliers": np.array([outliers])}
+
+    chosen = kept.once("chosen", choose)
+    kept.forget(LOOKED)
+    atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
+    gains = chosen["gains"]
+    levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))
+    return Textured(Paint(mesh, atlas, photos, gains, Levels(**levels)), region, texel, chosen["outliers"].item())
 
 
-def coarser(subject: Subject, settings: TextureSettings, budget_bytes: int, fine: Textured) -> Iterator[Textured]:
+def kept_mesh(kept: Kept, make: Callable[[], Mesh]) -> Mesh:
+    """The mesh that `make` returns, or the one that was kept."""
+
+    def arrays() -> Arrays:
+        mesh = make()
+        return {name: value for name, value in vars(mesh).items() if isinstance(value, np.ndarray)}
+
+    return Mesh(**kept.once("mesh", arrays))
+
+
+def coarser(
+    subject: Subject, settings: TextureSettings, budget_bytes: int, fine: Textured, kept: Kept
+) -> Iterator[Textured]:
     """Levels of detail: texels twice as large each, a quarter of the triangles, and regions of four tiles each."""
     mesh, depth, level = fine.paint.mesh, fine.region.depth, 0
     while depth > 0:
@@ -181,7 +228,7 @@ def coarser(subject: Subject, settings: TextureSettings, budget_bytes: int, fine
         texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
         few = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
         less = replace(settings, texel=texel, triangles=few)
-        made = textured(subject, less, budget_bytes, mesh, fine.region.cut(depth))
+        made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
         mesh = made.paint.mesh
         yield made
 
@@ -230,34 +277,55 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
     return with_short_edges(mesh, max(LONGEST_PX * texel, LONGEST * edge))
 
 
-def look_at_all(mesh: Mesh, photos: Photographs, longest: float) -> tuple[Candidates, np.ndarray, int]:
+def look_at_all(
+    mesh: Mesh, photos: Photographs, longest: float, kept: Kept = Kept()
+) -> tuple[Candidates, np.ndarray, int]:
     """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
-    for number, view in enumerate(photos.views):
+    start = 0
+    if (before := kept.read(LOOKED)) is not None:
+        start = int(before.pop("count"))
+        vars(found).update(before)
+    photos.expect(range(start, count))
+    saved, spent = time.perf_counter(), 0.0
+    for number in range(start, count):
+        view = photos.views[number]
         try:
             picture, keep = photos(number), photos.keep(number)
         except BadInput as error:
             emit(PhotoSkipped(view.name, str(error)))
             continue
         found.offer(number, sight(mesh, view.camera, picture, keep, longest))
+        now = time.perf_counter()
+        if now - saved > max(PAUSE_S, SHARE * spent):
+            kept.write(LOOKED, {**vars(found), "count": np.array(number + 1)})
+            saved = time.perf_counter()
+            spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
     gains = exposure_gains(found, count)
     return found, gains, found.refuse_outliers(gains)
 
 
 def lay_out(
-    mesh: Mesh, views: Sequence[View], found: Candidates, size: int, region: Region | None = None
-) -> tuple[Atlas, Region, np.ndarray]:
-    """The atlas, the regions of its tiles, and the neighbours of the triangles."""
-    beyond, edge = neighbours(mesh.faces)
-    chosen = choose_views(found, beyond, edge)
+    mesh: Mesh, views: Sequence[View], chosen: np.ndarray, beyond: np.ndarray, size: int, region: Region | None = None
+) -> tuple[Atlas, Region]:
+    """The atlas of triangles with a photograph each, and the regions of its tiles.
+
+    Args:
+        mesh: The mesh.
+        views: The photographs.
+        chosen: (F,) photograph of each triangle.
+        beyond: (F, 3) triangles beyond the edges.
+        size: Of a page.
+        region: Of the tiles, where it is known.
+    """
     places = np.zeros((len(mesh.faces), 3, 2), np.float32)
     for number in np.unique(chosen[chosen != NONE]).tolist():
         mine = chosen == number
         places[mine] = project(mesh, views[number].camera)[mesh.faces[mine], :2]
     where = middles(mesh)
     region = region or divide(where, texels_of(chosen, places), FULL * size**2)
-    return make_atlas(chosen, places, region.of(where), beyond, size), region, beyond
+    return make_atlas(chosen, places, region.of(where), beyond, size), region
 
 
 def _areas(mesh: Mesh) -> np.ndarray:

@@ -7,8 +7,9 @@ from needs import needs
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.evaluate.geometry.up_direction import map_axes
-from surfkit.maps.geotiff import NODATA, Sheet, workshop
+from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_crs
+from surfkit.maps.rasters import NODATA
 from surfkit.maps.surface_model import draw_surface, needs_double
 from surfkit.maps.zbuffer import NONE
 from surfkit.scene.earth import geocentric, to_ecef

@@ -233,7 +233,8 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
     found, gains, _ = look_at_all(mesh, photos, 1000)
     wanted = 1 / exposures / np.exp(-np.log(exposures).mean())
     assert np.abs(gains / wanted[:, None] - 1).max() < 0.02
-    atlas, _, beyond = lay_out(mesh, scene.views, found, 1024)
+    beyond, edge = neighbours(mesh.faces)
+    atlas, _ = lay_out(mesh, scene.views, choose_views(found, beyond, edge), beyond, 1024)
     steps = {}
     solved = leveling._solved
 

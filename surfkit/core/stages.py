@@ -1,20 +1,27 @@
-"""Stages that are not repeated: each keeps what it came to, with a key of all that this depends on, and its time."""
+"""Work that is not repeated after an interruption: stages that keep their results, and folders of finished parts."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_json, write_json
+from surfkit.core.events import Warned, emit
+from surfkit.core.files import sweep
+from surfkit.core.lock import NAME as LOCK
 
 T = TypeVar("T")
 RECORD = "stages.json"
+KEY = "unfinished.json"
+"""What the parts in a folder belong to."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +84,40 @@ def key_of(*values: Any) -> str:
     """A digest of values that the codec knows."""
     text = json.dumps([dump(value) for value in values], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+@contextmanager
+def kept_parts(folder: Path, key: str) -> Iterator[None]:
+    """Within, there is a folder for finished parts of a work, which a later call with the same key finds again.
+
+    The folder is deleted when the work is done. Parts of another key are deleted at the beginning, and a line says so;
+    half-written files of dead processes are too. The caller sees to it that no other process works in the folder.
+
+    Raises:
+        BadInput: The folder has files of somebody else.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / KEY).exists():
+        if read_json(folder / KEY, dict[str, str]).get("key") != key:
+            emit(Warned(f"{folder}: what an interrupted command left there is of other inputs or settings; begun anew"))
+            _empty(folder)
+    elif _parts(folder):
+        raise BadInput(f"{folder}: it has files but no {KEY}, so they are not surfkit's; move the folder away")
+    write_json(folder / KEY, {"key": key})
+    sweep(folder)
+    yield
+    _empty(folder)
+    shutil.rmtree(folder)
+
+
+def _parts(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name not in (KEY, LOCK)]
+
+
+def _empty(folder: Path) -> None:
+    """Delete the parts. What they belong to stays until the last one is gone: this can be interrupted too."""
+    for path in _parts(folder):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
