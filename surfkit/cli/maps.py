@@ -27,7 +27,8 @@ class MapsOf:
 
     Rasters are Cloud Optimized GeoTIFFs in the coordinates of the data set, with its coordinate reference system. With
     --against, the heights of another mesh are subtracted. Needs `pip install 'surfkit[maps]'`. Examples: `surfkit maps
-    RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`.
+    RUN --gsd 0.1`, `surfkit maps RUN --against LAST_YEAR --products orthophoto`. When it is interrupted, the same
+    command goes on where it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]

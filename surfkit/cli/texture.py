@@ -28,6 +28,7 @@ class TextureOf:
     Each triangle takes its picture from one photograph that shows it whole, well, and in the colour that others show
     too; seams between photographs are levelled. The mesh is simplified first, which needs `pip install
     'surfkit[texture]'`. Examples: `surfkit texture RUN`, `surfkit texture RUN --formats glb --triangles 100000`.
+    When it is interrupted, the same command goes on where it stopped.
     """
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]

@@ -145,13 +145,14 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
         sweep(out, deep=False)
         try:
             with kept_parts(folder, key):
-                yield folder
-        except BadInput:  # the same command would come to it again
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+                try:
+                    yield folder
+                except BadInput:  # the same command would come to it again
+                    shutil.rmtree(folder, ignore_errors=True)
+                    raise
         except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
             full = shutil.disk_usage(out).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
-            if not full:
+            if isinstance(error, BadInput) or not full:
                 raise
             raise Fault(
                 f"{out}: the disk is full; the maps that are in it are whole: free some space, then do it again"

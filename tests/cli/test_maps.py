@@ -1,11 +1,15 @@
 """`surfkit maps`."""
 
 import json
+import signal
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from needs import needs
+from forks import started
+from interrupted import digests, kill_at
+from needs import needs, needs_native
 
 from surfkit.cli import main
 from surfkit.mesh.base import Mesh
@@ -57,6 +61,19 @@ def test_cells_are_as_large_as_pixels_and_the_cameras_say_what_is_up(run, capsys
     assert main(["maps", str(run), "--products", "orthophoto", "--gsd", "1"]) == 0
     names = sorted(path.name for path in (run / "maps").iterdir())
     assert names == ["dsm.tif", "maps.json", "notes.txt", "orthophoto.tif"], "no map of before beside new ones"
+
+
+@needs_native
+def test_maps_go_on_after_the_process_was_killed(run, tmp_path):
+    words = ["maps", str(run), "--gsd", "0.05", "--tile", "64", "--products", "orthophoto", "hillshade", "--out"]
+    assert main([*words, str(tmp_path / "whole")]) == 0
+    for what, done in (("drawing dsm", 3), ("shading", 2)):
+        process = started([*words, str(tmp_path / "out")], tmp_path / "log", before=partial(kill_at, what, done))
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL, (tmp_path / "log").read_text()
+        assert not (tmp_path / "out" / "maps.json").exists()
+    assert main([*words, str(tmp_path / "out")]) == 0
+    assert digests(tmp_path / "out") == digests(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,15 @@
 """`surfkit texture`."""
 
 import json
+import signal
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
-from needs import needs
+from forks import started
+from interrupted import digests, kill_at
+from needs import needs, needs_native
 
 from surfkit.cli import main
 from surfkit.mesh.base import Mesh
@@ -43,6 +47,21 @@ def test_a_run_gets_a_textured_mesh(run, capsys):
     assert main(["texture", str(run), "--formats", "glb", "--pictures", "png"]) == 0
     names = sorted(path.name for path in (run / "texture").iterdir())
     assert names == ["texture.json", "textured.glb"], "no file of before beside new ones"
+
+
+@needs_native
+def test_a_texture_goes_on_after_the_process_was_killed(run, tmp_path):
+    words = ["texture", str(run), "--size", "128", "--out"]
+    assert main([*words, str(tmp_path / "whole")]) == 0
+    for what in ("looking at photographs", "painting pages"):
+        process = started([*words, str(tmp_path / "out")], tmp_path / "log", before=partial(kill_at, what, 1))
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL, (tmp_path / "log").read_text()
+        assert not (tmp_path / "out").exists() and (tmp_path / "out.unfinished").is_dir()
+    assert main([*words, str(tmp_path / "out")]) == 0
+    assert not (tmp_path / "out.unfinished").exists()
+    found, expected = (digests(tmp_path / name) for name in ("out", "whole"))
+    assert found.pop("texture.json") and expected.pop("texture.json") and found == expected
 
 
 @pytest.mark.parametrize(
