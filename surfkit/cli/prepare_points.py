@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -42,9 +42,12 @@ class Points:
     features: int = 8192
     """About how many features are kept of a photograph."""
 
+    pairs: Literal["poses", "exhaustive"] = "poses"
+    """Which photographs are compared: each with those that stand near it and look at the same place, or all with all,
+    which takes the square of the time."""
+
     neighbours: int = 20
-    """How many photographs each is compared with, where there are more than 60: those nearest by GPS, else those that
-    look most like it."""
+    """How many photographs each is compared with, where not with all."""
 
     seed: int = 0
     """Of all that is drawn at random."""
@@ -63,7 +66,8 @@ class Points:
     def run(self) -> None:
         """Triangulate, and print the results."""
         data, scene = Data(self.data, layout=self.layout, images=self.images), self.scene
-        settings = Settings(longest=self.longest, features=self.features, neighbours=self.neighbours, seed=self.seed)
+        way = "auto" if self.pairs == "poses" else "exhaustive"
+        settings = Settings(self.longest, self.features, way, self.neighbours, seed=self.seed)
         reader_of(data)  # or one line that says what is wrong
         if scene.resolve().is_relative_to(self.data.resolve()):
             raise BadInput(f"--out {scene} lies in the data set {self.data}; name a folder outside")

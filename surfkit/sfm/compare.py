@@ -42,6 +42,7 @@ def compare(
     work: Path,
     settings: Settings,
     cameras: Mapping[str, Any] | None = None,
+    poses: Mapping[str, np.ndarray] | None = None,
 ) -> Compared:
     """Find features and compare photographs, as far as that is still to be done.
 
@@ -52,6 +53,7 @@ def compare(
         work: Folder of what the stages keep.
         settings: How.
         cameras: As for `match`.
+        poses: (4, 4) world_to_camera of each photograph, by its name, if they are known.
     """
     folder, database, listed = work / "features", work / "database.db", work / "pairs.json"
     counts = stages.run("features", "", lambda: find_features(photos, root, folder, settings))
@@ -62,11 +64,12 @@ def compare(
         return read_features(feature_file(folder, rich[at], settings)).descriptors
 
     def choose() -> list[Pair]:
-        pairs = choose_pairs(rich, settings, descriptors)
+        pairs = choose_pairs(rich, settings, descriptors, known)
         write_json(listed, pairs)
         return pairs
 
-    chosen = [settings.pairs, settings.neighbours, settings.seed]
+    known = None if poses is None else np.stack([poses[photo.name] for photo in rich])
+    chosen = [settings.pairs, settings.neighbours, settings.seed, known if known is None else known.tolist()]
     key = key_of(made_of, chosen, [[photo.exif.position, photo.exif.taken] for photo in rich])
     pairs = stages.run("pairs", key, choose, lambda: list(read_json(listed, tuple[Pair, ...])))
     key = key_of(made_of, pairs)

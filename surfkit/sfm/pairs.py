@@ -1,4 +1,5 @@
-"""Which photographs are compared: all of a small set, else neighbours by GPS, by time or name, or by likeness.
+"""Which photographs are compared: neighbours by their poses where these are known; else all of a small set, neighbours
+by GPS, by time or name, or by likeness.
 
 Likeness needs no vocabulary from elsewhere: a photograph is summed up by a vector of locally aggregated descriptors
 (VLAD; Jegou et al., CVPR 2010) over clusters of the set's own features.
@@ -25,18 +26,39 @@ STEPS = 3
 WORDS, SAMPLE, PER_PHOTO = 64, 20_000, 300
 """Clusters of descriptors; descriptors that they are made from; and that are taken of a photograph."""
 
+NEAREST = 8
+"""Neighbours that tell how far away what photographs show is."""
+NEAR_WEIGHT = 0.5
+"""Of a distance between two cameras, against one between the places that they look at."""
+SPREAD = 1.5
+"""Times as many neighbours, over which the farther half of those that are compared is spread."""
+OVERLAP = 4.0
+"""Times the distance to the last of the nearest: how far ahead parallel views are taken to look at least."""
+ALIKE, APART = 45.0, 75.0
+"""Degrees between viewing directions: up to which two photographs may tell that; from which they are not compared."""
+AT_ONCE = 4096
+"""Photographs whose candidates are looked at together."""
+
 Pair = tuple[int, int]
 
 
-def choose_pairs(photos: Sequence[Photo], settings: Settings, descriptors: Callable[[int], np.ndarray]) -> list[Pair]:
+def choose_pairs(
+    photos: Sequence[Photo],
+    settings: Settings,
+    descriptors: Callable[[int], np.ndarray],
+    poses: np.ndarray | None = None,
+) -> list[Pair]:
     """Positions of the photographs to compare, each pair once, the smaller first, in order.
 
     Args:
         photos: With enough features.
         settings: How they are chosen.
         descriptors: Gives the (K, 128) uint8 descriptors of a photograph by its position.
+        poses: (N, 4, 4) float64 world_to_camera, if they are known; `auto` goes by them.
     """
     way, count = settings.pairs, len(photos)
+    if way == "auto" and poses is not None:
+        return sorted(facing(poses, settings.neighbours))
     with_gps = sum(photo.exif.position is not None for photo in photos)
     if way == "auto":
         way = "exhaustive" if count <= SMALL else "gps" if with_gps >= WITH_GPS * count else "retrieval"
@@ -85,6 +107,48 @@ def near(photos: Sequence[Photo], count: int) -> set[Pair]:
         for other in row
         if placed[other] != at
     }
+
+
+def facing(poses: np.ndarray, count: int) -> set[Pair]:
+    """Each photograph with up to `count` that look at the same place from near by.
+
+    Half of them are its nearest neighbours in six dimensions: where a camera stands, and the place that it looks at.
+    The others are spread over those that come next, as the very nearest show little parallax. The time is that of a
+    search tree, N log N.
+
+    Args:
+        poses: (N, 4, 4) float64 world_to_camera.
+        count: Of neighbours.
+    """
+    turns = poses[:, :3, :3]
+    centres, views = -(turns.transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0], turns[:, 2]
+    places = np.hstack([NEAR_WEIGHT * centres, centres + distance_seen(centres, views) * views])
+    tree, most = cKDTree(places), min(round(SPREAD * count) + 1, len(poses))
+    near, pairs = (count + 1) // 2, set()
+    for start in range(0, len(poses), AT_ONCE):
+        _, found = tree.query(places[start : start + AT_ONCE], range(1, most + 1))
+        for at, row in enumerate(found, start):
+            row = row[(row != at) & (views[row] @ views[at] > np.cos(np.radians(APART)))]
+            rest = row[near:]
+            spread = np.linspace(0, len(rest) - 1, min(count - near, len(rest))).round().astype(int)
+            pairs |= {(min(at, other), max(at, other)) for other in [*row[:near].tolist(), *rest[spread].tolist()]}
+    return pairs
+
+
+def distance_seen(centres: np.ndarray, views: np.ndarray) -> float:
+    """About how far ahead cameras look at the same place as their neighbours: in the least squares, and at least so far
+    that neighbours with parallel views overlap, which tell nothing else.
+
+    Args:
+        centres: (N, 3) float64.
+        views: (N, 3) float64 unit vectors along the optical axes.
+    """
+    away, found = cKDTree(centres).query(centres, range(1, min(NEAREST + 1, len(centres)) + 1))
+    one, other = np.repeat(np.arange(len(centres)), found.shape[1]), found.ravel()
+    used = (views[one] * views[other]).sum(1) > np.cos(np.radians(ALIKE))
+    moved, turned = (values[other[used]] - values[one[used]] for values in (centres, views))
+    least, weight = OVERLAP * float(np.median(away[:, -1])), float((turned**2).sum())
+    return max(least, -float((moved * turned).sum()) / weight if weight > 1e-12 * len(centres) else 0.0)
 
 
 def alike(count: int, most: int, descriptors: Callable[[int], np.ndarray], seed: int) -> set[Pair]:

@@ -73,9 +73,9 @@ class TiePoints:
         stages = Stages(self.work)
         photos = stages.run("photographs", "", lambda: self._look(root, shots))
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
-        found = compare(stages, photos, root, self.work, self.settings, cameras)
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
+        found = compare(stages, photos, root, self.work, self.settings, cameras, poses)
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])
         models = self.work / "points"
         model = stages.run(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfkit.sfm.exif import Exif
-from surfkit.sfm.pairs import SMALL, alike, choose_pairs, in_order, near, sequence, vlad
+from surfkit.sfm.pairs import SMALL, alike, choose_pairs, distance_seen, facing, in_order, near, sequence, vlad
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
 
@@ -86,3 +86,68 @@ def test_few_photographs_in_every_way(way):
     for count in (0, 1, 2, 3):
         pairs = choose_pairs(photos(count), Settings(pairs=way), scenes(count, 1))
         assert set(pairs) == set(itertools.combinations(range(count), 2))
+
+
+def looking(centres, targets):
+    """(N, 4, 4) world_to_camera of cameras that stand at places and look at others, x level."""
+    forward = targets - centres
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, (0.0, 0.0, 1.0)) + 1e-9 * np.array([1.0, 0, 0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    found = np.tile(np.eye(4), (len(centres), 1, 1))
+    found[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    found[:, :3, 3] = -(found[:, :3, :3] @ centres[..., None])[..., 0]
+    return found
+
+
+def grid(side, spacing, height):
+    x, y = np.meshgrid(np.arange(side) * spacing, np.arange(side) * spacing)
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1)
+
+
+def test_around_an_object_the_next_ones_on_the_circle():
+    angle = np.arange(200) * np.pi / 100
+    centres = np.stack([50 * np.cos(angle), 50 * np.sin(angle), np.full(200, 30.0)], 1)
+    poses = looking(centres, np.zeros((200, 3)))
+    assert distance_seen(centres, poses[:, 2, :3]) == pytest.approx(np.hypot(50, 30))
+    apart = [min(two - one, 200 - two + one) for one, two in facing(poses, 20)]
+    assert min(apart) == 1 and max(apart) <= 20 and 200 * 10 <= len(apart) <= 200 * 20
+    assert all(apart.count(step) == 200 for step in range(1, 6)), "the nearest half"
+    assert sum(step > 10 for step in apart) > 200, "and some with more parallax"
+
+
+def test_cameras_that_look_down_go_by_their_positions():
+    centres = grid(20, 10.0, 80.0)
+    poses = looking(centres, centres - (0, 0, 80.0))
+    pairs = facing(poses, 8)
+    far = [np.linalg.norm(centres[one] - centres[two]) for one, two in pairs]
+    assert max(far) <= 40 and {(0, 1), (0, 20), (210, 211), (210, 230)} <= pairs
+
+
+def test_cameras_back_to_back_are_not_compared():
+    centres = np.repeat(grid(6, 1.0, 0.0)[:, [0, 2, 1]], 2, axis=0)
+    side = np.tile([10.0, -10.0], 36)
+    pairs = facing(looking(centres, centres + np.stack([0 * side, side, 0 * side], 1)), 12)
+    assert all(one % 2 == two % 2 for one, two in pairs) and len(pairs) > 72 * 6
+
+
+def test_five_cameras_of_a_drone_find_those_that_show_the_same_ground():
+    stations, height = grid(12, 15.0, 60.0), 60.0
+    tilts = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * height
+    centres = np.repeat(stations, 5, axis=0)
+    ahead = np.concatenate([np.tile(tilts, (len(stations), 1)), np.full((len(centres), 1), -height)], 1)
+    pairs = np.array(sorted(facing(looking(centres, centres + ahead), 20)))
+    apart = np.linalg.norm((centres + ahead)[pairs[:, 0]] - (centres + ahead)[pairs[:, 1]], axis=1)
+    assert np.mean(apart < height) > 0.95, "footprints of 60 m overlap"
+    plain = near(photos(len(centres), lambda at: (*(centres[at, :2] / 111e3), 60.0)), 20)
+    share = np.mean([np.linalg.norm((centres + ahead)[one] - (centres + ahead)[two]) < height for one, two in plain])
+    assert share < 0.8, "neighbours by position alone look elsewhere"
+
+
+def test_poses_are_what_auto_goes_by_and_thousands_take_seconds():
+    centres = grid(130, 10.0, 80.0)
+    poses = looking(centres, centres - (0, 0, 80.0))
+    pairs = choose_pairs(photos(len(centres)), Settings(neighbours=6), lambda at: 1 / 0, poses)
+    assert 3 * len(centres) < len(pairs) < 6 * len(centres) and pairs == sorted(set(pairs))
+    assert choose_pairs(photos(5), Settings(pairs="exhaustive"), lambda at: 1 / 0, poses[:5])[-1] == (3, 4)
+    assert facing(poses[:1], 6) == set() and facing(poses[:2], 6) == {(0, 1)}
