@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -11,11 +12,18 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
+from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh, Mesher, MeshInput
-from surfkit.mesh.simplify import require_open3d
 
 ENOUGH = 100
 """Fewest oriented points that make a surface."""
+
+
+def require_open3d(what: str) -> ModuleType:
+    """Open3D, which `what` needs; BadInput that says what to install where it cannot be loaded."""
+    with needed("open3d", what):
+        import open3d
+    return open3d
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -12,42 +11,26 @@ from surfkit.core.optional import needed
 from surfkit.mesh.base import Mesh
 
 
-def require_open3d(what: str = "--lods") -> ModuleType:
-    """Open3D, which `what` needs; BadInput that says what to install where it cannot be loaded."""
-    with needed("open3d", what):
-        import open3d
-    return open3d
-
-
-def simplify(mesh: Mesh, share: float) -> Mesh:
-    """The mesh with about a share of its triangles, by quadric error (Garland and Heckbert 1997, in Open3D)."""
-    open3d = require_open3d()
-    whole = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), open3d.utility.Vector3iVector(mesh.faces)
-    )
-    if mesh.colors is not None:
-        whole.vertex_colors = open3d.utility.Vector3dVector(mesh.colors / 255.0)
-    left = whole.simplify_quadric_decimation(max(1, round(share * len(mesh.faces))))
-    left.remove_degenerate_triangles()
-    left.remove_unreferenced_vertices()
-    colors = None
-    if mesh.colors is not None:
-        colors = (np.asarray(left.vertex_colors).clip(0, 1) * 255).round().astype(np.uint8)
-    vertices = np.asarray(left.vertices).astype(np.float32)
-    return replace(mesh, vertices=vertices, faces=np.asarray(left.triangles).astype(np.int32), colors=colors)
+def require_simplification(what: str) -> None:
+    """BadInput that says what to install, where the package that simplifies meshes cannot be loaded."""
+    with needed("fast_simplification", what):
+        import fast_simplification  # noqa: F401
 
 
 def simplify_to(mesh: Mesh, count: int) -> Mesh:
-    """The mesh with at most `count` triangles, by quadric error (fast-simplification), for meshes of any size: 10
-    million triangles take half a minute and 3 GB. A vertex gets the mean colour of those that it stands for.
+    """The mesh with at most `count` triangles, by quadric error (Garland and Heckbert 1997, in fast-simplification).
+
+    It is for meshes of any size: 10 million triangles take half a minute and 3 GB. A vertex gets the mean colour of
+    those that it stands for.
 
     Raises:
         BadInput: fast-simplification cannot be loaded.
     """
     if count >= len(mesh.faces):
         return mesh
-    with needed("fast_simplification", "simplifying a mesh"):
-        from fast_simplification import simplify as reduced
+    require_simplification("simplifying a mesh")
+    from fast_simplification import simplify as reduced
+
     # its first limits are lengths: a thousandth of an edge
     unit = 1 / max(_mean_edge(mesh), 1e-30)
     middle = mesh.vertices.mean(0, dtype=np.float64)

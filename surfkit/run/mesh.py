@@ -21,7 +21,7 @@ from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.files import Format, write_mesh
 from surfkit.mesh.fusion import TILES
 from surfkit.mesh.shade import from_above, shaded, up_of
-from surfkit.mesh.simplify import require_open3d, simplify
+from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.mesh.stereo import points
 from surfkit.method.base import Reconstruction
 from surfkit.primitives.drawing import drawn_by
@@ -80,7 +80,7 @@ class MeshOutput:
         if self.crop is not None and self.crop_box is not None:
             raise BadInput("--crop and --crop-box: give one of the two")
         if self.lods:
-            require_open3d()
+            require_simplification("--lods")
 
     def volume(self) -> Crop | None:
         """The crop, in the frame of the input."""
@@ -219,7 +219,7 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
     """Write the mesh in all formats and levels, and give the paths."""
     meshes = [("mesh", mesh)]
     for at, share in enumerate(delivery.lods, 1):
-        meshes.append((f"mesh-lod{at}", simplify(mesh, share)))
+        meshes.append((f"mesh-lod{at}", simplify_to(mesh, max(1, round(share * len(mesh.faces))))))
         emit(Progress("simplifying", at, len(delivery.lods)))
     for name, each in meshes:
         for kind in dict.fromkeys(delivery.formats):

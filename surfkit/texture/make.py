@@ -16,12 +16,11 @@ from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
 from surfkit.core.files import replacing_folder
 from surfkit.core.lock import locked
-from surfkit.core.optional import needed
 from surfkit.core.stages import kept_parts, key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.simplify import simplify_to
+from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.scene import Frame, View
@@ -178,7 +177,7 @@ def textured(
     What is known already can be given: `finer`, the mesh simplified before, and `region`, the regions of the tiles.
     Each step is kept in `kept` when it is finished, and not done again if it is there.
     """
-    refuse_missing()
+    require_simplification("simplifying a mesh")
     surface, frame = subject.surface, subject.frame
     sizes = pixel_sizes(surface, subject.views, frame)
     if np.isnan(sizes).all():
@@ -231,12 +230,6 @@ def coarser(
         made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
         mesh = made.paint.mesh
         yield made
-
-
-def refuse_missing() -> None:
-    """BadInput if the package that simplifies meshes is missing."""
-    with needed("fast_simplification", "simplifying a mesh"):
-        __import__("fast_simplification")
 
 
 def local_mesh(surface: Surface, frame: Frame) -> Mesh:

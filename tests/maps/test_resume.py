@@ -115,4 +115,3 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     with pytest.raises(BadInput, match="not surfkit's"):
         make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
     assert (tmp_path / WORK / "novel.txt").read_text() == "chapter 1"
-

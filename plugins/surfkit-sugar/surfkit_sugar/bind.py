@@ -25,7 +25,7 @@ from surfkit import (
     View,
     choice,
 )
-from surfkit.mesh.simplify import require_open3d, simplify
+from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit_sugar.bound import AdjacentNormals, MeshBound, sound
 from surfkit_sugar.density import Ellipsoids, gathered, whitened
 from surfkit_sugar.mesh import LevelSetPoisson
@@ -73,8 +73,8 @@ class BindToMesh(Refine):
             )
 
     def refuse_unfit(self, primitive: Primitive) -> None:
-        """See `Refine.refuse_unfit`; meshes are simplified with open3d."""
-        require_open3d("bind-to-mesh")
+        """See `Refine.refuse_unfit`; meshes are simplified with fast-simplification."""
+        require_simplification("bind-to-mesh")
 
     @property
     def meshers(self) -> tuple[Mesher, ...]:
@@ -106,8 +106,7 @@ class BindToMesh(Refine):
         if self.pixels == 0 or not len(mesh.faces):
             return mesh
         total = sum(view.camera.width * view.camera.height for view in views)
-        share = total / self.pixels / self.per_triangle / len(mesh.faces)
-        return mesh if share >= 1 else simplify(mesh, share)
+        return simplify_to(mesh, max(1, round(total / self.pixels / self.per_triangle)))
 
 
 def colors_near(splats: Splats, places: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from surfkit import BadInput, Mesh, Mesher, MeshInput
-from surfkit.mesh.poisson import ENOUGH, reconstructed, seen_pixels
-from surfkit.mesh.simplify import require_open3d, simplify
+from surfkit.mesh.poisson import ENOUGH, reconstructed, require_open3d, seen_pixels
+from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit_sugar.density import Ellipsoids, density, gathered, turned, whitened
 from surfkit_sugar.neighbours import nearest
 
@@ -22,7 +22,8 @@ CHUNK = 20_000
 @dataclass(frozen=True)
 class LevelSetPoisson(Mesher):
     """Points where rays first meet a level of the density, with its gradient as normals, then screened Poisson
-    reconstruction and fewer triangles (SuGaR, section 4.2); needs open3d."""
+    reconstruction and fewer triangles (SuGaR, section 4.2); needs open3d and
+    fast-simplification."""
 
     level: float = 0.3
     """Density of the surface; published: 0.3, also 0.1 and 0.5."""
@@ -69,6 +70,8 @@ class LevelSetPoisson(Mesher):
     def ready(self) -> None:
         """See `Mesher.ready`."""
         require_open3d("mesh:sugar")
+        if self.triangles:
+            require_simplification("mesh:sugar")
 
     def mesh(self, subject: MeshInput) -> Mesh:
         """See `Mesher.mesh`."""
@@ -88,8 +91,8 @@ class LevelSetPoisson(Mesher):
             )
         made = reconstructed(points, normals, colors, self.octree, self.thin, "mesh:sugar")
         count = len(made.faces)
-        if 0 < self.triangles < count:
-            made = simplify(made, self.triangles / count)
+        if self.triangles:
+            made = simplify_to(made, self.triangles)
         return replace(made, facts={"pixels": looked, "level_set_points": len(points), "triangles_before": count})
 
 

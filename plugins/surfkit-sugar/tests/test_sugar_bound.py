@@ -20,7 +20,8 @@ from surfkit.blocks.schedule import Compute
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
 from surfkit.export.ply import read_splats
-from surfkit.mesh.simplify import require_open3d
+from surfkit.mesh.poisson import require_open3d
+from surfkit.mesh.simplify import require_simplification
 from surfkit.pipeline import load_run, run
 from surfkit.primitives import Surfel2D
 from surfkit.raster.footprints import rotations
@@ -49,10 +50,18 @@ def offered():
 
 
 @pytest.fixture(scope="module")
-def open3d():
+def simplification():
+    """Skips where meshes cannot be simplified."""
+    try:
+        require_simplification("this test")
+    except BadInput as error:
+        pytest.skip(str(error))
+
+
+def needs_open3d() -> None:
     """Skips where Open3D cannot be loaded."""
     try:
-        return require_open3d("this test")
+        require_open3d("this test")
     except BadInput as error:
         pytest.skip(str(error))
 
@@ -191,7 +200,8 @@ def test_parts_that_need_a_mesh_say_so():
         MeshBound().moved({}, torch.zeros(0, 3))
 
 
-def test_the_parts_keep_to_the_contract(open3d):
+def test_the_parts_keep_to_the_contract(simplification):
+    needs_open3d()
     bound = MeshBound(sh_degree=1)
     check(bound)
     check(MeshBound(draws="surfel"))
@@ -235,7 +245,7 @@ def test_slivers_and_lone_vertices_are_left_out():
     assert torch.equal(left, vertices[[0, 2, 4]]) and faces.tolist() == [[0, 1, 2]]
 
 
-def test_meshes_are_simplified_to_the_pixels_there_are(open3d):
+def test_meshes_are_simplified_to_the_pixels_there_are(simplification):
     vertices, faces = grid(40)
     mesh = Mesh(vertices.float().numpy(), faces.to(torch.int32).numpy())
     views = mesh_input().views[:1]  # of 96 x 96 pixels
@@ -244,7 +254,7 @@ def test_meshes_are_simplified_to_the_pixels_there_are(open3d):
     assert BindToMesh(pixels=0.5).simplified(mesh, views) is mesh
 
 
-def test_recipes_that_densify_bound_splats_are_refused(open3d):
+def test_recipes_that_densify_bound_splats_are_refused(simplification):
     wrong = evolve(REFINED, "refine.0.stage.densify", ADC())
     with pytest.raises(BadInput, match="refine.0.stage.densify: the points of primitive mesh-bound can be neither"):
         wrong.refuse_unfit()
@@ -266,7 +276,7 @@ RECIPE = Recipe(
 
 
 @pytest.fixture(scope="module")
-def finished(open3d, data, tmp_path_factory):
+def finished(simplification, data, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "run"
     run(RECIPE, data, out, Compute("cpu"), EVERY)
     return out

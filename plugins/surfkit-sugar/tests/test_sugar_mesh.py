@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from surfkit import BadInput, Mesher, Splats, components
 from surfkit.core.registry import plugins
-from surfkit.mesh.simplify import require_open3d
+from surfkit.mesh.poisson import require_open3d
 from surfkit.testing import check
 from surfkit.testing.inputs import BALL_RADIUS, mesh_input, splats
 
