@@ -96,14 +96,20 @@ def broken(monkeypatch):
     monkeypatch.setattr(sys, "meta_path", [hidden.Broken(["open3d"], ImportError(hidden.LIBUSB)), *sys.meta_path])
 
 
-@pytest.mark.parametrize("words", [["mesh:poisson"], ["mesh:tsdf", "--lods", "0.5"]])
-def test_a_mesh_without_open3d_is_refused_in_one_line(broken, words, tmp_path, capsys):
-    command = ["mesh", str(tmp_path), *words]
-    assert main(command) == 2
+def test_a_mesh_without_open3d_is_refused_in_one_line(broken, tmp_path, capsys):
+    assert main(["mesh", str(tmp_path), "mesh:poisson"]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"surfkit: {'--lods' if '--lods' in words else words[0]} needs the package open3d, which ")
+    assert said.startswith("surfkit: mesh:poisson needs the package open3d, which ")
     assert "libusb-1.0.so.0" in said and "apt install " in said and "libusb-1.0-0" in said and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_levels_of_a_mesh_without_their_package_are_refused_in_one_line(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    assert main(["mesh", str(tmp_path), "mesh:tsdf", "--lods", "0.5"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("surfkit: --lods needs the package fast_simplification, ") and said.count("\n") == 1
+    assert "surfkit[texture]" in said and not list(tmp_path.iterdir())
 
 
 def test_training_does_not_begin_towards_a_mesh_that_cannot_be_made(broken, tmp_path, capsys):
