@@ -90,34 +90,45 @@ def key_of(*values: Any) -> str:
 def kept_parts(folder: Path, key: str) -> Iterator[None]:
     """Within, there is a folder for finished parts of a work, which a later call with the same key finds again.
 
-    The folder is deleted when the work is done. Parts of another key are deleted at the beginning, and a line says so;
-    half-written files of dead processes are too. The caller sees to it that no other process works in the folder.
+    The folder is deleted when the work is done, or nothing of it is finished. Parts of another key are deleted at the
+    beginning, and a line says so; half-written files of dead processes are too. The caller sees to it that no other
+    process works in the folder.
 
     Raises:
         BadInput: The folder has files of somebody else.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / KEY).exists():
-        if read_json(folder / KEY, dict[str, str]).get("key") != key:
-            emit(Warned(f"{folder}: what an interrupted command left there is of other inputs or settings; begun anew"))
-            _empty(folder)
-    elif _parts(folder):
+    ours = (folder / KEY).exists()
+    sweep(folder, deep=ours)
+    if ours and _key(folder) != key:
+        emit(Warned(f"{folder}: what an interrupted command left there is of other inputs or settings; begun anew"))
+        delete_parts(folder)
+    elif not ours and _parts(folder):
         raise BadInput(f"{folder}: it has files but no {KEY}, so they are not surfkit's; move the folder away")
     write_json(folder / KEY, {"key": key})
-    sweep(folder)
-    yield
-    _empty(folder)
-    shutil.rmtree(folder)
+    try:
+        yield
+        delete_parts(folder)
+    finally:
+        if not _parts(folder):
+            shutil.rmtree(folder)
 
 
-def _parts(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.name not in (KEY, LOCK)]
-
-
-def _empty(folder: Path) -> None:
-    """Delete the parts. What they belong to stays until the last one is gone: this can be interrupted too."""
+def delete_parts(folder: Path) -> None:
+    """Delete what is finished. What it belongs to stays until the last part is gone: this can be interrupted too."""
     for path in _parts(folder):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink()
+
+
+def _key(folder: Path) -> str | None:
+    try:
+        return read_json(folder / KEY, dict[str, str]).get("key")
+    except BadInput:
+        return None
+
+
+def _parts(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name not in (KEY, LOCK)]

@@ -20,7 +20,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
-from surfkit.core.stages import kept_parts
+from surfkit.core.stages import delete_parts, kept_parts
 from surfkit.maps.grid import Grid
 from surfkit.maps.rasters import BLOCK, Kind, Raster
 
@@ -148,7 +148,7 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
                 try:
                     yield folder
                 except BadInput:  # the same command would come to it again
-                    shutil.rmtree(folder, ignore_errors=True)
+                    delete_parts(folder)
                     raise
         except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
             full = shutil.disk_usage(out).free < LEAST_FREE or NOT_WRITTEN.search(str(error))

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from surfkit.core.check import BadInput
 from surfkit.core.files import replacing
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.scene.scene import View
@@ -78,20 +77,13 @@ def identity(surface: Surface) -> str:
 
 
 def seen(views: Sequence[View]) -> str:
-    """A digest of the cameras, photographs and masks of views: files by size and time.
-
-    Raises:
-        BadInput: A photograph is gone.
-    """
+    """A digest of the cameras, photographs and masks of views: files by size and time."""
     found = hashlib.sha256()
     for view in views:
         camera = view.camera
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         found.update(f"{view.name} {lens}".encode() + camera.world_to_camera.contiguous().numpy().tobytes())
         for path in (view.path, view.mask):
-            try:
-                facts = path and path.stat()
-            except OSError as error:
-                raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+            facts = path.stat() if path is not None and path.exists() else None
             found.update(f"{facts and (facts.st_size, facts.st_mtime_ns)}".encode())
     return found.hexdigest()

@@ -10,6 +10,7 @@ from needs import needs
 from town import town
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import PhotoSkipped
 from surfkit.core.lock import locked
 from surfkit.texture import deliver, make
 from surfkit.texture.keep import Kept
@@ -86,6 +87,14 @@ def test_only_what_is_the_same_goes_on(scene, tmp_path, monkeypatch, what):
     assert len(looks) == (0 if what == "nothing" else len(scene.views))
     assert len(said) == (what in ("setting", "mesh", "photograph"))
     assert (out / RECORD).exists() and not out.with_name(out.name + WORK).exists()
+
+
+def test_a_photograph_that_is_gone_is_passed_over(scene, tmp_path, monkeypatch):
+    scene.views[3].path.unlink()
+    said = []
+    monkeypatch.setattr(make, "emit", said.append)
+    made(scene, tmp_path / "out", replace(SETTINGS, formats=("glb",)))
+    assert [event.name for event in said if isinstance(event, PhotoSkipped)] == [scene.views[3].name]
 
 
 def test_a_second_process_is_refused(scene, tmp_path):
