@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +17,8 @@ from surfkit.view.shelf import MOST, Form
 from surfkit.view.subject import opened_subject
 
 PORTS = range(1, 65536)
+AWAKE_S = 0.2
+"""The main thread looks this often for a Ctrl-C that the system handed to another thread, which does not wake it."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class View:
                 if self.open:
                     page.open_browser()
                 try:
-                    threading.Event().wait()
+                    while not page.closing.wait(AWAKE_S):
+                        pass
                 except KeyboardInterrupt:
                     print("\nended")
 
