@@ -35,8 +35,9 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         wanted = _groups({name: spelling(PurePosixPath(name.replace("\\", "/"))) for name in lost})
         pairs = {same[0]: files[key][0] for key, same in wanted.items() if len(same) == 1 == len(files.get(key, ()))}
         found |= pairs
+        used = set(pairs.values())
         lost = [name for name in lost if name not in pairs]
-        spare = [path for path in spare if path not in pairs.values()]
+        spare = [path for path in spare if path not in used]
     _warn(folder, {name: path for name, path in found.items() if path not in taken})
     return found
 
