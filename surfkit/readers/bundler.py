@@ -17,6 +17,7 @@ from surfkit.readers.base import Reader
 from surfkit.readers.camera_files import (
     groups_of,
     leave_out,
+    one_file,
     photographs,
     pose_at,
     read_text,
@@ -80,13 +81,7 @@ class _Bundle:
     @classmethod
     def read(cls, data: Data) -> _Bundle:
         """The files of a data set, or BadInput."""
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            raise BadInput(
-                f"{data.path}: " + (f"several bundle files: {names}; leave one" if files else "no bundle.out")
-            )
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "bundle.out; copy it there, with list.txt")
         values = _values(path)
         cameras, points = (_count(path, value, len(values)) for value in values[:2])
         begin = 2 + 15 * cameras

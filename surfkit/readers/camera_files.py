@@ -1,4 +1,4 @@
-"""What readers of cameras of other programs share: numbers in text, poses, and the photographs that they name."""
+"""What readers of cameras of other programs share: their file, numbers in text, poses, and the photographs they name."""
 
 from __future__ import annotations
 
@@ -20,6 +20,24 @@ MOST = 1e30
 """Numbers beyond it are a mistake."""
 TURNED = 1e-3
 """Most that the entries of a rotation times its transpose are off those of the identity."""
+
+
+def one_file(root: Path, files: Sequence[Path], lacking: str) -> Path:
+    """The only one of the files of cameras in a folder.
+
+    Args:
+        root: The folder, for messages.
+        files: Those that were found.
+        lacking: What is missing if there are none, and how to get it.
+
+    Raises:
+        BadInput: There are none, or several.
+    """
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise BadInput(f"{root}: several files of cameras: {few([path.name for path in files])}; leave one")
+    raise BadInput(f"{root}: no {lacking}")
 
 
 def numbers(where: str, text: str | Sequence[str], count: int) -> np.ndarray:

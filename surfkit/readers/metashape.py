@@ -19,7 +19,7 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import leave_out, numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import leave_out, numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.geocentric import place_of
@@ -42,12 +42,7 @@ class Metashape(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"several files of cameras: {names}; leave one" if files else "no XML file of Metashape's cameras"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "XML file of Metashape's cameras; export them as Agisoft XML")
         chunk = _chunk(path)
         cameras = _cameras(path, chunk)
         found = photographs(data, [camera.get("label", "") for camera in cameras])

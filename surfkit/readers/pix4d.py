@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.transforms import points
@@ -53,12 +53,7 @@ class Pix4D(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"cameras of several projects: {names}; leave one" if files else f"no file *{CAMERAS}"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), f"file *{CAMERAS}; copy 1_initial/params of the project there")
         project = path.name.removesuffix(CAMERAS)
         cameras = _cameras(path)
         offset = _offset(path, project, cameras)

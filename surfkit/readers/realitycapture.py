@@ -18,7 +18,7 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.transforms import points
@@ -40,12 +40,7 @@ class RealityCapture(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"several files of cameras: {names}; leave one" if files else "no CSV file of camera parameters"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "CSV file of 'Internal/External camera parameters'; export it")
         rows = _rows(path)
         found = photographs(data, [row["name"] for row in rows])
         shots: list[Shot] = []

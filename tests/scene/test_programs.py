@@ -344,8 +344,15 @@ def test_two_exports_in_a_folder_need_a_choice(tmp_path):
     metashape(tmp_path)
     (tmp_path / "cameras.xml").rename(tmp_path / "b.xml")
     metashape(tmp_path)
-    with pytest.raises(BadInput, match="several files of cameras: b.xml, cameras.xml; leave one"):
+    with pytest.raises(BadInput, match="several files of cameras: 'b.xml', 'cameras.xml'; leave one"):
         read(Data(tmp_path, layout="metashape"))
+
+
+@pytest.mark.parametrize("layout", ["metashape", "pix4d", "realitycapture", "bundler"])
+def test_a_folder_without_cameras_of_the_chosen_layout(tmp_path, layout):
+    (tmp_path / "images").mkdir()
+    with pytest.raises(BadInput, match=r"no .*(file|bundle\.out).*; (export|copy) "):
+        read(Data(tmp_path, layout=layout))
 
 
 def test_photographs_beside_the_cameras_or_elsewhere(tmp_path):
