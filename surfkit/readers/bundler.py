@@ -15,6 +15,7 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.readers.base import Reader
 from surfkit.readers.camera_files import (
+    MOST,
     groups_of,
     leave_out,
     one_file,
@@ -89,7 +90,7 @@ class _Bundle:
             raise BadInput(f"{path}: cut off: numbers of {(len(values) - 2) // 15} of {cameras} cameras are there")
         names = _names(path, cameras)
         table, starts, counts = _points(path, values, begin, points)
-        good = np.isfinite(table).all(1) & (np.abs(table) < 1e30).all(1)
+        good = (np.abs(table) < MOST).all(1)
         kept = np.cumsum(good) - 1
         rows = np.repeat(np.where(good, kept, -1), counts)
         inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)

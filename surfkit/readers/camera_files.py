@@ -1,4 +1,4 @@
-"""What readers of cameras of other programs share: their file, numbers in text, poses, and the photographs they name."""
+"""What readers of cameras of other programs share: the file, numbers in text, poses, and photographs by their names."""
 
 from __future__ import annotations
 

@@ -156,13 +156,13 @@ def _offset(path: Path, project: str, cameras: list[_Camera]) -> np.ndarray:
         for line in read_text(full).splitlines()[1:]:
             words = line.rsplit(maxsplit=6)
             if len(words) == 7:
-                placed[words[0]] = numbers(f"{full}: {words[0]}", words[1:4], 3)
+                placed[words[0].replace("\\", "/")] = numbers(f"{full}: {words[0]}", words[1:4], 3)
         offsets = [placed[camera.name] - camera.centre for camera in cameras if camera.name in placed]
         if offsets:
             middle = np.median(offsets, axis=0)
             if np.abs(offsets - middle).max() > APART:
                 raise BadInput(f"{full}: its positions are not those of {path.name} and one offset; export both again")
-            return np.round(middle)
+            return np.round(middle, 3)
     emit(Warned(f"{path}: no {own.name} beside it: coordinates are those of the file, which may lack an offset"))
     return np.zeros(3)
 

@@ -55,8 +55,8 @@ def parse_wkt(where: str, text: str) -> Node:
     Raises:
         BadInput: It is none; names `where` it comes from.
     """
-    tokens, at = [], 0
-    while text[at:].strip():
+    tokens, at, text = [], 0, text.rstrip()
+    while at < len(text):
         found = TOKEN.match(text, at)
         if found is None:
             raise BadInput(f"{where}: no coordinate reference system: {text[at : at + 40]!r} in its text")

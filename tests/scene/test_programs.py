@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.export.ply import write_points
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read, read_capture, reader_of
+from surfkit.readers.wkt import parse_wkt
 from surfkit.run.notes import collect_notes
 
 from . import programs
@@ -121,16 +122,17 @@ def test_points_in_a_file_beside_the_cameras(tmp_path):
 
 
 def test_pix4d_on_the_map(tmp_path):
-    pix4d(tmp_path)
+    origin = ORIGIN + 0.25  # is nearly always a whole number, but need not be
+    pix4d(tmp_path, offset=origin)
     params = tmp_path / "1_initial/params"
     (params / "survey_wkt.prj").write_text(UTM32)
     scene = read(Data(tmp_path, test_every=0))
-    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:32632", 1.0, tuple(ORIGIN))
-    np.testing.assert_allclose(centres(scene), [ORIGIN + centre for _, centre in POSES.values()], atol=1e-6)
+    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:32632", 1.0, tuple(origin))
+    np.testing.assert_allclose(centres(scene), [origin + centre for _, centre in POSES.values()], atol=1e-6)
     (params / "survey_offset.xyz").unlink()
     lines = ["imageName X Y Z Omega Phi Kappa"]
     for name, (_, centre) in POSES.items():
-        lines.append(" ".join([name, *(f"{value:.6f}" for value in ORIGIN + centre), "0", "0", "0"]))
+        lines.append(" ".join([name, *(f"{value:.6f}" for value in origin + centre), "0", "0", "0"]))
     (params / "survey_calibrated_external_camera_parameters.txt").write_text("\n".join(lines))
     np.testing.assert_allclose(centres(read(Data(tmp_path, test_every=0))), centres(scene), atol=1e-5)
     (params / "survey_calibrated_external_camera_parameters.txt").unlink()
@@ -212,6 +214,19 @@ def test_metashape_on_the_map(tmp_path, text, crs, ellipsoid):
         np.testing.assert_allclose(
             np.asarray(shot.camera.img_from_cam(local)), project(f"{shot.name}.png", DOTS), atol=0.1
         )
+
+
+def test_a_long_text_of_coordinates_is_read_in_time_that_grows_with_it():
+    class Text(str):
+        copied = 0
+
+        def __getitem__(self, key):
+            found = super().__getitem__(key)
+            Text.copied += len(found)
+            return found
+
+    text = Text(f"PROJCS[{'1,' * 3000}{UTM32}]\n ")
+    assert parse_wkt("x", text).child("PROJCS").code == "EPSG:32632" and Text.copied < 10 * len(text)
 
 
 def test_metashape_in_local_coordinates(tmp_path):
