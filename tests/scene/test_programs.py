@@ -11,9 +11,11 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.export.ply import write_points
 from surfkit.readers.data import Data
+from surfkit.readers.geocentric import place_of
 from surfkit.readers.read import observations, read, read_capture, reader_of
 from surfkit.readers.wkt import parse_wkt
 from surfkit.run.notes import collect_notes
+from surfkit.scene.earth import geocentric
 
 from . import programs
 from .programs import (
@@ -227,6 +229,20 @@ def test_a_long_text_of_coordinates_is_read_in_time_that_grows_with_it():
 
     text = Text(f"PROJCS[{'1,' * 3000}{UTM32}]\n ")
     assert parse_wkt("x", text).child("PROJCS").code == "EPSG:32632" and Text.copied < 10 * len(text)
+
+
+def test_cameras_far_apart_on_the_map_are_told_how_far_the_earth_bends():
+    centres = geocentric(np.full(3, 47.0), 9.0 + np.array([-0.02, 0.0, 0.02]), np.full(3, 500.0))
+    with collect_notes() as kept:
+        place = place_of("x", UTM32, centres)
+    off = 0.5 * np.array([1521**2, 0, 1521**2]) / 6.388e6  # a parallel of a radius of 4,357 km; the Earth's is 6,388 km
+    heights = place.move.points(centres)[:, 2]
+    np.testing.assert_allclose(heights.max() - heights, off, atol=2e-3)
+    (said,) = (text for text in kept.texts if "the Earth is round" in text)
+    assert "outermost camera, coordinates are 0.18 m off" in said, said
+    with collect_notes() as kept:
+        place_of("x", UTM32, centres[1:])
+    assert not kept.texts
 
 
 def test_metashape_in_local_coordinates(tmp_path):
