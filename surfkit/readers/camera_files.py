@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,21 @@ def numbers(where: str, text: str | Sequence[str], count: int) -> np.ndarray:
 
 def read_text(path: Path) -> str:
     """What a text file says, or BadInput."""
-    try:
+    with _readable(path):
         return path.read_text(encoding="utf-8-sig")
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """The lines of a text file that may be larger than the memory, or BadInput."""
+    with _readable(path), path.open(encoding="utf-8-sig") as file:
+        yield from file
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """BadInput for a text file that cannot be read."""
+    try:
+        yield
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -87,8 +87,8 @@ def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
     if off > QUIET_M:
         emit(
             Warned(
-                f"{where}: the Earth is round, {flat.name!r} is flat: at the outermost camera, coordinates are {off:.2f} m "
-                "off; for less, export parts"
+                f"{where}: the Earth is round, {flat.name!r} is flat: at the outermost camera, coordinates are "
+                f"{off:.2f} m off; for less, export parts"
             )
         )
     return MapPlace(move, crs, unit)
