@@ -198,13 +198,17 @@ def local_mesh(surface: Surface, frame: Frame) -> Mesh:
     for at in range(0, len(surface), 1 << 20):
         part = slice(at, at + (1 << 20))
         vertices[part] = frame.to_local(surface.vertices(part))
+    faces, colors = np.asarray(surface.faces, np.int32), None
     names = ("red", "green", "blue")
-    colors = None
     if set(names) <= set(surface.rows.dtype.names or ()):
         colors = np.stack([surface.rows[name] for name in names], axis=1).astype(np.uint8)
     else:
         emit(Warned(f"{surface.path}: its vertices have no colours; what no photograph shows becomes grey"))
-    return Mesh(vertices, np.asarray(surface.faces, np.int32), colors)
+    good = np.isfinite(vertices).all(1)
+    if not good.all():  # no face has such a vertex, see `read_surface`
+        vertices, colors = vertices[good], None if colors is None else colors[good]
+        faces = (np.cumsum(good) - 1).astype(np.int32)[faces]
+    return Mesh(vertices, faces, colors)
 
 
 def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View]:

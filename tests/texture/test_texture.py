@@ -12,6 +12,7 @@ from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
+from surfkit.evaluate.geometry.surface import Surface
 from surfkit.export.glb import read_glb
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
@@ -416,6 +417,19 @@ def test_masks_hide(tmp_path):
     assert record["seen"] == 0 and record["photographs"] == 0
     _, colors = points_on(read_pieces(tmp_path / "out" / "textured.glb"))
     assert np.abs(colors - HIDDEN).max() <= 1
+
+
+def test_vertices_that_are_not_finite_are_left_out(tmp_path):
+    """As `read_surface` leaves them: no face names them, but they are still there."""
+    scene = town(tmp_path)
+    rows = np.concatenate([scene.surface.rows[:1], scene.surface.rows])
+    rows["x"][0] = np.nan
+    odd = replace(scene, surface=Surface("mesh.ply", rows, scene.surface.faces + 1))
+    settings = replace(PNG, formats=("obj",), triangles=200)
+    for each, out in ((scene, "plain"), (odd, "odd")):
+        made(each, tmp_path / out, settings)
+    plain, ours = ((tmp_path / out / "textured.obj").read_bytes() for out in ("plain", "odd"))
+    assert plain == ours
 
 
 def test_what_is_refused(tmp_path):
