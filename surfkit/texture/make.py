@@ -40,11 +40,9 @@ RECORD = "texture.json"
 TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
-"""Longer edges are halved: in texels, and in edges of a triangle of mean size."""
+"""Longer edges are halved: in texels, and in edges of a triangle of mean size; and those of a quarter of a page."""
 LEAST = 100
 """Triangles of a level of detail."""
-ROOM = 16
-"""Texels that a triangle on a page must leave free along each side."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ def textured(
         views = reduced(views, sizes, texel)
     mesh = prepared(local_mesh(surface, frame) if mesh is None else mesh, settings, texel * frame.scale)
     photos = Photographs(views, budget_bytes)
-    found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM)
+    found, gains, outliers = look_at_all(mesh, photos, settings.size // 2)  # so that each chart fits on a page
     atlas, region, beyond = lay_out(mesh, views, found, settings.size, region)
     levels = level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)
     return Textured(Paint(mesh, atlas, photos, gains, levels), region, texel, outliers)
@@ -231,7 +229,7 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
         mesh = simplify_to(mesh, wanted)
         emit(Progress("simplifying", 1, 1))
     edge = (area / max(wanted, 1) * 4 / 3**0.5) ** 0.5
-    return with_short_edges(mesh, max(LONGEST_PX * texel, LONGEST * edge))
+    return with_short_edges(mesh, min(max(LONGEST_PX * texel, LONGEST * edge), settings.size / 4 * texel))
 
 
 def look_at_all(mesh: Mesh, photos: Photographs, longest: float) -> tuple[Candidates, np.ndarray, int]:

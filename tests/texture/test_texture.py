@@ -20,8 +20,9 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
 from surfkit.texture import level as leveling
+from surfkit.texture import make
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
-from surfkit.texture.charts import packed, texels_of
+from surfkit.texture.charts import make_atlas, packed, texels_of
 from surfkit.texture.choose import choose_views
 from surfkit.texture.fill import paint
 from surfkit.texture.look import look, look_in_numpy, project, sight
@@ -343,6 +344,27 @@ def test_rectangles_do_not_overlap():
         assert sum(each.sum() for each in taken) == size.prod(1).sum()
 
 
+def test_the_largest_triangles_that_are_taken_fit_on_a_page(tmp_path):
+    """A strip in one photograph, whose triangles reach as far to both sides of one cell of charts as they may."""
+    side = 128
+    longest = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            make, "look_at_all", lambda mesh, photos, most: longest.append(most) or look_at_all(mesh, photos, 1)
+        )
+        made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",), size=side))
+    wide = longest[0]
+    x = np.array([30 - 2 * wide / 3, 30 + wide / 3, 30 + wide / 3, 2 - wide / 3, 2 - wide / 3, 2 + 2 * wide / 3])
+    corners = np.stack([x, [0, 0, 4, 4, 8, 8]], axis=1)
+    faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    places = corners[faces].astype(np.float32)
+    middle = np.floor(places.mean(1)[[0, 1, 3]] / (side // 4))
+    assert (middle == middle[0]).all(), "of one chart"
+    atlas = make_atlas(np.zeros(4, np.int32), places, np.zeros(4, np.int32), neighbours(faces)[0], side)
+    texels = atlas.texels(np.arange(4))
+    assert (texels >= 0).all() and (texels <= [atlas.pages[0].width, atlas.pages[0].height]).all()
+
+
 def test_neighbours_get_the_same_photograph():
     """A strip of triangles that two photographs show about as well, in turns: one of the two is chosen for all."""
     places, faces = sheet((0, 0, 0), np.array([40.0, 0, 0]), np.array([0, 1.0, 0]), 1.0)
@@ -430,6 +452,19 @@ def test_vertices_that_are_not_finite_are_left_out(tmp_path):
         made(each, tmp_path / out, settings)
     plain, ours = ((tmp_path / out / "textured.obj").read_bytes() for out in ("plain", "odd"))
     assert plain == ours
+
+
+def test_what_no_photograph_shows_fits_on_small_pages(tmp_path):
+    scene = town(tmp_path)
+    few = replace(scene, views=scene.views[:1])
+    record = made(few, tmp_path / "out", replace(PNG, formats=("glb",), size=128))
+    assert record["seen"] < 0.9 and set(map(tuple, record["pages"])) <= {(64, 64), (128, 64), (128, 128)}
+    corners, uv, page, images = read_pieces(tmp_path / "out" / "textured.glb")
+    middle, size = uv.mean(1), np.array([images[at].shape[1::-1] for at in page])
+    x, y = np.floor(middle * size * [1, -1] + size * [0, 1]).astype(int).T
+    shown = np.array([images[at][row, column] for at, row, column in zip(page, y, x, strict=True)])
+    under = (corners[..., 2] < 1e-6).all(1) & (np.abs(corners.mean(1)[:, :2] - [-0.5, 0]).max(1) < 1)
+    assert under.sum() > 10 and (shown[under] == HIDDEN).all(), "the ground under the box"
 
 
 def test_what_is_refused(tmp_path):
