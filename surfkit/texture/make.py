@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
 from surfkit.core.files import replacing_folder
@@ -25,7 +25,7 @@ from surfkit.scene.scene import Frame, View
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
 from surfkit.texture.choose import choose_views
-from surfkit.texture.deliver import Delivery, Textured, deliver
+from surfkit.texture.deliver import NAME, TILES, Delivery, Textured, deliver
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.level import level
 from surfkit.texture.look import project, sight
@@ -108,11 +108,10 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
 
     Raises:
         BadInput: A package is missing, or no photograph shows the mesh.
-        OSError: The folder holds other files.
+        OSError: There is a file, or a folder that holds other files.
     """
     began = time.perf_counter()
-    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
-        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
+    refuse_foreign(out)
     frame = subject.frame
     made = textured(subject, settings, budget_bytes)
     mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
@@ -182,6 +181,19 @@ def coarser(subject: Subject, settings: TextureSettings, budget_bytes: int, fine
         made = textured(subject, less, budget_bytes, mesh, fine.region.cut(depth))
         mesh = made.paint.mesh
         yield made
+
+
+def refuse_foreign(out: Path) -> None:
+    """OSError unless a folder is to be made, is empty, or has a textured mesh and nothing else: it will be replaced."""
+    if out.exists() and not out.is_dir():
+        raise OSError(errno.ENOTDIR, "a file; name a folder", str(out))
+    names = {path.name for path in out.iterdir()} if out.exists() else set()
+    if names and RECORD not in names:
+        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
+    if other := sorted(name for name in names - {RECORD, TILES} if not name.startswith(NAME)):
+        raise OSError(
+            errno.ENOTEMPTY, f"has files that are not of a textured mesh: {few(other)}; name another", str(out)
+        )
 
 
 def refuse_missing() -> None:

@@ -27,6 +27,13 @@ class Photographs:
         """(3, H, W) uint8."""
         return self.cache[number].numpy()
 
+    def close(self) -> None:
+        """Forget all of them; none can be asked for afterwards."""
+        for cache in (self.cache, self.masks):
+            if cache is not None:
+                cache.close()
+                cache.resize(0)
+
     def keep(self, number: int) -> np.ndarray | None:
         """(H, W) bool, or None for all of it."""
         if self.masks is None:

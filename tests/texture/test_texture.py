@@ -19,8 +19,8 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
+from surfkit.texture import candidates, make
 from surfkit.texture import level as leveling
-from surfkit.texture import make
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import make_atlas, packed, texels_of
 from surfkit.texture.choose import choose_views
@@ -382,6 +382,29 @@ def test_neighbours_get_the_same_photograph():
     assert np.flatnonzero(choose_views(found, beyond, edge) == NONE).tolist() == [3]
 
 
+def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
+    exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
+    scene = town(tmp_path, exposures=exposures, cell=0.25)
+    found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8), 1000)
+    monkeypatch.setattr(candidates, "ENOUGH", len(found.view) // 3)
+    some = exposure_gains(found, 12)
+    assert not np.array_equal(some, gains) and np.abs(some / gains - 1).max() < 0.02
+
+
+def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch):
+    kept, most = [], []
+
+    class Watched(Photographs):
+        def __init__(self, views, budget):
+            most.append(sum(each.cache.bytes for each in kept))
+            super().__init__(views, budget)
+            kept.append(self)
+
+    monkeypatch.setattr(make, "Photographs", Watched)
+    made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("tiles3d",), size=128))
+    assert len(most) > 2 and most == [0] * len(most)
+
+
 def test_gains_of_photographs_that_share_nothing_stay_one():
     found = Candidates(100)
     found.view[:50, 0], found.view[50:, 0], found.color[:] = 0, 1, 128
@@ -420,6 +443,9 @@ def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
     assert "textured.glb" not in record["files"] and "textured.obj" in record["files"]
     said = [event.text for event in told if isinstance(event, Warned)]
     assert len(said) == 1 and said[0].startswith("textured.glb is left out: ") and str(tmp_path) not in said[0]
+    with pytest.raises(BadInput, match="use the format tiles3d"):  # or nothing would be left, not even the one before
+        made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",)))
+    assert (tmp_path / "out" / "textured.obj").is_file()
 
 
 def test_masks_hide(tmp_path):
@@ -476,6 +502,12 @@ def test_what_is_refused(tmp_path):
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(OSError, match="name another"):
         made(scene, tmp_path / "mine")
+    (tmp_path / "mine" / "texture.json").write_text("{}")
+    with pytest.raises(OSError, match="has files that are not of a textured mesh: 'notes.txt'; name another"):
+        made(scene, tmp_path / "mine")
+    with pytest.raises(OSError, match="a file; name a folder"):
+        made(scene, tmp_path / "mine" / "notes.txt")
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
     away = replace(scene, surface=surface(0.5, (0, 0, 500.0)))
     with pytest.raises(BadInput, match="no photograph shows any of it"):
         made(away, tmp_path / "away")
