@@ -13,11 +13,12 @@ from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.surface import Surface, read_surface
-from surfkit.maps.make import RECORD, MapSettings, Subject, make_maps
+from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
+from surfkit.texture.make import Subject
 from surfkit.train.bars import bars
 
 

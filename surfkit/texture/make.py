@@ -84,7 +84,7 @@ class TextureSettings:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is textured.
+    """What is textured, or drawn on maps.
 
     Attributes:
         surface: The mesh, in the frame of the input.
@@ -94,7 +94,7 @@ class Subject:
 
     surface: Surface
     frame: Frame
-    views: Sequence[View]
+    views: Sequence[View] = ()
 
 
 def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_bytes: int) -> dict[str, Any]:

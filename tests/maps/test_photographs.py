@@ -7,8 +7,9 @@ import pytest
 from needs import needs
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
-from surfkit.maps.make import MapSettings, Subject, make_maps
+from surfkit.maps.make import MapSettings, make_maps
 from surfkit.maps.photographs import between
+from surfkit.texture.make import Subject
 
 rasterio = needs("rasterio")
 needs("fast_simplification")
