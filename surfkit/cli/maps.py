@@ -87,7 +87,7 @@ def mesh_of(path: Path) -> Surface:
     """The mesh in a file; BadInput for a cloud of points."""
     found = read_surface(path)
     if found.faces is None:
-        raise BadInput(f"{path}: a cloud of points; maps are drawn of a mesh")
+        raise BadInput(f"{path}: a cloud of points; name a mesh")
     return found
 
 

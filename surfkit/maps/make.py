@@ -27,7 +27,7 @@ from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Frame
-from surfkit.texture.make import Subject, TextureSettings, textured
+from surfkit.texture.make import Subject, TextureSettings, refuse_missing, textured
 from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
@@ -81,6 +81,8 @@ class MapSettings:
 
     def __post_init__(self) -> None:
         cache_bytes(self.memory, "--memory")
+        if self.colors == "photographs" and "orthophoto" not in self.products:
+            raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
         for name in ("gsd", "interval", "spacing"):
             value = getattr(self, name)
             if value != "auto" and not 0 < value < float("inf"):
@@ -101,6 +103,8 @@ class MapSettings:
             for package in ("rasterio", *PACKAGES.get(name, ())):
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
+        if self.colors == "photographs":
+            refuse_missing()
 
 
 def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface | None = None) -> dict[str, Any]:
