@@ -42,7 +42,7 @@ class Drawn:
 
     def __init__(self, mesh: Mesh, camera: Camera) -> None:
         fine = camera.resized(FINE * camera.width, FINE * camera.height)
-        places = project(mesh, fine)
+        places = project(mesh.vertices, fine)
         _, self.face = draw_faces(places, mesh.faces, fine.width, fine.height)
         self.there = self.face >= 0
         self.corners = mesh.faces[self.face[self.there]]

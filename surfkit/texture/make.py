@@ -29,7 +29,7 @@ from surfkit.texture.deliver import NAME, TILES, Delivery, Textured, deliver
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.level import level
 from surfkit.texture.look import project, sight
-from surfkit.texture.photographs import Photographs
+from surfkit.texture.photographs import Photographs, by_photograph
 from surfkit.texture.regions import Region, divide, middles
 from surfkit.texture.resolution import pixel_sizes
 from surfkit.texture.topology import neighbours, with_short_edges
@@ -266,9 +266,9 @@ def lay_out(
     beyond, edge = neighbours(mesh.faces)
     chosen = choose_views(found, beyond, edge)
     places = np.zeros((len(mesh.faces), 3, 2), np.float32)
-    for number in np.unique(chosen[chosen != NONE]).tolist():
-        mine = chosen == number
-        places[mine] = project(mesh, views[number].camera)[mesh.faces[mine], :2]
+    for number, rows in by_photograph(chosen):
+        corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3)
+        places[rows] = project(corners, views[number].camera)[:, :2].reshape(-1, 3, 2)
     where = middles(mesh)
     region = region or divide(where, texels_of(chosen, places), FULL * size**2)
     return make_atlas(chosen, places, region.of(where), beyond, size), region, beyond

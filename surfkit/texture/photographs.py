@@ -9,6 +9,15 @@ import numpy as np
 from surfkit.readers.masks import mask_cache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import View
+from surfkit.texture.candidates import NONE
+
+
+def by_photograph(view: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Each photograph of (n,) numbers, and the rows that have it, rising; those of NONE are left out."""
+    order = np.argsort(view, kind="stable")
+    order = order[view[order] != NONE]
+    numbers, starts = np.unique(view[order], return_index=True)
+    return list(zip(numbers.tolist(), np.split(order, starts[1:])[: len(numbers)], strict=True))
 
 
 class Photographs:

@@ -65,6 +65,8 @@ def test_the_mesh_has_the_rest(tmp_path):
     scene = town(tmp_path)
     record, colors, _, _ = orthophoto(replace(scene, views=scene.views[:1]), tmp_path / "maps")
     assert 0.1 < record["orthophoto"]["from_photographs"] < 0.9
+    small = orthophoto(replace(scene, views=scene.views[:1]), tmp_path / "small", replace(SETTINGS, tile=16))[1]
+    assert np.array_equal(small, colors), "some tiles have no cell that a photograph shows"
     from_mesh = np.abs(colors - HIDDEN).max(-1) <= 1
     assert from_mesh.mean() == pytest.approx(1 - record["orthophoto"]["from_photographs"], abs=0.03)
 

@@ -156,7 +156,7 @@ def test_sight_is_what_rays_see(tmp_path):
         share = is_seen(places.reshape(-1, 3), [number])[number].reshape(-1, 60).mean(1)
         told = np.zeros(len(share), bool)
         told[found.faces] = True
-        corners = project(mesh, view.camera)[mesh.faces].astype(float)
+        corners = project(mesh.vertices, view.camera)[mesh.faces].astype(float)
         pixels = texels_of(np.zeros(len(corners)), corners[:, :, :2]) / 1.5
         assert ((1 - share) * pixels)[told].max() < 2.5, "of what is told to be whole, hardly a pixel is hidden"
         assert told[share == 1].mean() > 0.95
@@ -216,7 +216,7 @@ def test_corrections_are_linear_between_vertices(tmp_path):
 def test_the_kernel_counts_as_numpy_does(tmp_path):
     scene = town(tmp_path, cell=0.13)
     mesh, view = local_mesh(scene.surface, scene.frame), scene.views[6]
-    places, photo = project(mesh, view.camera), Photographs(scene.views, 10**8)(6)
+    places, photo = project(mesh.vertices, view.camera), Photographs(scene.views, 10**8)(6)
     depth, _ = draw_faces(places, mesh.faces, view.camera.width, view.camera.height)
     depth[:40] = 0  # a mask
     ours = look(places, mesh.faces, photo, depth, 0.01)
