@@ -30,6 +30,7 @@ from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.level import level
 from surfkit.texture.look import project, sight
 from surfkit.texture.photographs import Photographs, by_photograph
+from surfkit.texture.pieces import Pieces
 from surfkit.texture.regions import Region, divide, middles
 from surfkit.texture.resolution import pixel_sizes
 from surfkit.texture.topology import neighbours, with_short_edges
@@ -246,14 +247,17 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
 
 def look_at_all(mesh: Mesh, photos: Photographs, longest: float) -> tuple[Candidates, np.ndarray, int]:
     """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
-    found, count = Candidates(len(mesh.faces)), len(photos.views)
+    found, count, pieces = Candidates(len(mesh.faces)), len(photos.views), Pieces(mesh)
     for number, view in enumerate(photos.views):
         try:
             picture, keep = photos(number), photos.keep(number)
         except BadInput as error:
             emit(PhotoSkipped(view.name, str(error)))
             continue
-        found.offer(number, sight(mesh, view.camera, picture, keep, longest))
+        part, rows = pieces.in_view(view.camera)
+        if len(rows):
+            shown = sight(part, view.camera, picture, keep, longest)
+            found.offer(number, replace(shown, faces=rows[shown.faces]))
         emit(Progress("looking at photographs", number + 1, count))
     gains = exposure_gains(found, count)
     return found, gains, found.refuse_outliers(gains)

@@ -19,7 +19,7 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
-from surfkit.texture import candidates, make
+from surfkit.texture import candidates, make, pieces
 from surfkit.texture import level as leveling
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import make_atlas, packed, texels_of
@@ -28,6 +28,7 @@ from surfkit.texture.fill import paint
 from surfkit.texture.look import look, look_in_numpy, project, sight
 from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture, textured
 from surfkit.texture.photographs import Photographs
+from surfkit.texture.pieces import Pieces
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
 
@@ -380,6 +381,26 @@ def test_neighbours_get_the_same_photograph():
     found.view[3] = NONE
     found.quality[3] = 0
     assert np.flatnonzero(choose_views(found, beyond, edge) == NONE).tolist() == [3]
+
+
+def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
+    """Small pieces give what one large one does; of a flight over a long strip, each photograph shows few of them."""
+    scene = town(tmp_path, cell=0.25)
+    mesh, photos = local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8)
+    whole = look_at_all(mesh, photos, 1000)
+    monkeypatch.setattr(pieces, "PIECE", 50)
+    parts = look_at_all(mesh, photos, 1000)
+    assert (whole[0].view == parts[0].view).all() and (whole[0].quality == parts[0].quality).all()
+    assert (whole[0].color == parts[0].color).all() and (whole[1] == parts[1]).all()
+    strip, faces = sheet((-100, -1, 0), np.array([200.0, 0, 0]), np.array([0, 2.0, 0]), 0.5)
+    divided = Pieces(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
+    for x in (-150.0, -99.0, 0.0, 60.0):
+        pose = torch.tensor([[1.0, 0, 0, -x], [0, -1, 0, 0], [0, 0, -1, 8], [0, 0, 0, 1]], dtype=torch.float64)
+        part, rows = divided.in_view(Camera(pose, 150.0, 150.0, 100.0, 100.0, 200, 200))
+        assert np.array_equal(part.vertices[part.faces], strip[faces[rows]].astype(np.float32))
+        shown = np.abs(strip[faces][..., 0] - x).min(1) < 8 * 100 / 150
+        assert np.isin(np.flatnonzero(shown), rows).all() and len(rows) < shown.sum() + 200
+        assert len(rows) == 0 if x == -150 else len(rows) > 0
 
 
 def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
