@@ -42,6 +42,8 @@ TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
 """Longer edges are halved: in texels, and in edges of a triangle of mean size; and those of a quarter of a page."""
+FINEST = 0.5
+"""Of the median pixel on the surface: smaller texels would show nothing more."""
 LEAST = 100
 """Triangles of a level of detail."""
 
@@ -161,8 +163,11 @@ def textured(
         raise BadInput(f"{surface.path}: no photograph shows any of it, so it has no texture")
     texel, views = float(np.nanmedian(sizes)), subject.views
     if settings.texel != "auto":
-        texel = settings.texel / (frame.metres or 1.0)
-        views = reduced(views, sizes, texel)
+        wanted = settings.texel / (frame.metres or 1.0)
+        if wanted < FINEST * texel:
+            emit(Warned(f"texels of {wanted:.3g} are finer than pixels, {texel:.3g} on the surface: these are taken"))
+        else:
+            texel, views = wanted, reduced(views, sizes, wanted)
     mesh = prepared(local_mesh(surface, frame) if mesh is None else mesh, settings, texel * frame.scale)
     photos = Photographs(views, budget_bytes)
     found, gains, outliers = look_at_all(mesh, photos, settings.size // 2)  # so that each chart fits on a page

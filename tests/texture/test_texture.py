@@ -456,6 +456,18 @@ def test_coarser_texels_and_fewer_triangles(tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["texture.json", "textured.glb"]
 
 
+def test_texels_are_no_finer_than_pixels(tmp_path, monkeypatch):
+    scene, told = town(tmp_path), []
+    monkeypatch.setattr("surfkit.texture.make.emit", told.append)
+    records = {}
+    for texel in ("auto", 1e-3, 1e9):
+        settings = TextureSettings(formats=("glb",), texel=texel, pictures="png")
+        records[texel] = {**made(scene, tmp_path / "out", settings), "seconds": 0}
+    assert records[1e-3] == records["auto"] and records[1e9]["texel"] == 1e9
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert said == ["texels of 0.001 are finer than pixels, 0.077 on the surface: these are taken"]
+
+
 def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr("surfkit.export.glb.MOST_BYTES", 20_000)
     told = []
