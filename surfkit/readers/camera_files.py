@@ -44,12 +44,13 @@ def one_file(root: Path, files: Sequence[Path], lacking: str) -> Path:
 def numbers(where: str, text: str | Sequence[str], count: int) -> np.ndarray:
     """(count,) float64 from words, or BadInput that names `where` they come from."""
     words = text.split() if isinstance(text, str) else text
+    wanted = "a finite number belongs" if count == 1 else f"{count} finite numbers belong"
     try:
         values = np.array([float(word) for word in words], np.float64)
     except (ValueError, TypeError) as error:
-        raise BadInput(f"{where}: {shorten(text)}, where {count} numbers belong") from error
+        raise BadInput(f"{where}: {shorten(text)}, where {wanted}") from error
     if len(values) != count or not (np.abs(values) < MOST).all():
-        raise BadInput(f"{where}: {shorten(text)}, where {count} finite numbers belong")
+        raise BadInput(f"{where}: {shorten(text)}, where {wanted}")
     return values
 
 

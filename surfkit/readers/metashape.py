@@ -47,18 +47,19 @@ class Metashape(Reader):
         cameras = _cameras(path, chunk)
         found = photographs(data, [camera.get("label", "") for camera in cameras])
         sensors = {sensor.get("id"): sensor for sensor in chunk.findall("sensors/sensor")}
-        lenses, known, shots = Lenses(path), {}, []
-        for camera in cameras:
-            label = camera.get("label", "")
-            if label not in found:
-                continue
+        lenses, known = Lenses(path), {}
+        for number in dict.fromkeys(camera.get("sensor_id") for camera in cameras):
             with leaving_out():
-                number = camera.get("sensor_id")
-                if number not in known:
-                    known[number] = _lens(f"{path}: sensor {number}", sensors.get(number))
-                lens = lenses.camera(f"{path}: sensor {number}", known[number])
-                shots.append(Shot(label, _pose(f"{path}: camera {label!r}", camera), lens, found[label]))
+                where = f"{path}: sensor {number}"
+                known[number] = lenses.camera(where, _lens(where, sensors.get(number)))
         lenses.tell()
+        shots = []
+        for camera in cameras:
+            label, number = camera.get("label", ""), camera.get("sensor_id")
+            if label in found and number in known:
+                with leaving_out():
+                    pose = _pose(f"{path}: camera {label!r}", camera)
+                    shots.append(Shot(label, pose, known[number], found[label]))
         return _placed(path, chunk, cameras[0].get("component_id"), Capture(shots, *points(data.path, {})))
 
 

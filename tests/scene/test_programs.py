@@ -8,6 +8,7 @@ import pytest
 from needs import needs
 from PIL import Image
 
+from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.export.ply import write_points
 from surfkit.readers.data import Data
@@ -312,11 +313,14 @@ def entry(*path, value):
         (partial(metashape, change=words("<f>190.0</f>", "<fx>190</fx>")), "sensor 0: no f in its calibration"),
         (
             partial(metashape, change=words("<f>190.0</f>", "<f>wide</f>")),
-            "sensor 0: f: 'wide', where 1 numbers belong",
+            "sensor 0: f: 'wide', where a finite number belongs",
         ),
         (partial(metashape, change=words("<f>190.0</f>", "<f>-1</f>")), "sensor 0: no lens has size 220 x 160"),
         (partial(metashape, change=words('<sensor id="0"', '<sensor id="1"')), "sensor 0: no calibration of it"),
-        (partial(metashape, change=words("<transform>", "<transform>1 ")), "camera 'IMG 1': '1 .*, where 16 .*numbers"),
+        (
+            partial(metashape, change=words("<transform>", "<transform>1 ")),
+            "camera 'IMG 1': '1 .*, where 16 finite numbers",
+        ),
         (partial(metashape, change=words("<transform>", "<transform>9")), "camera 'IMG 1': the pose is not a rotation"),
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "'IMG 1' stand for two photographs each"),
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 photographs are missing: 'IMG 5'"),
@@ -334,7 +338,7 @@ def entry(*path, value):
         (partial(pix4d, change=words("IMG 1.png 220", "IMG 1.png wide")), "is no photograph with its width and height"),
         (partial(pix4d, offset=(np.nan, 0, 0)), "survey_offset.xyz: 'nan 0 0.*', where 3 finite numbers belong"),
         (partial(realitycapture, change=words(",t1,t2", ",t1")), "it lacks t2; export it as"),
-        (partial(realitycapture, change=words(",12.0,", ",north,")), "IMG 1.png: .*, where 15 numbers belong"),
+        (partial(realitycapture, change=words(",12.0,", ",north,")), "IMG 1.png: .*, where 15 finite numbers belong"),
         (partial(realitycapture, change=words("IMG 2.png,", "IMG 2.png,1,")), "line 3 has 17 values, not 16"),
         (partial(realitycapture, f=0), "IMG 1.png: no lens has size 220 x 160"),
         (partial(bundler, change=words("v0.3", "v0.4")), "begins with '# Bundle file v0.4', not with"),
@@ -410,3 +414,15 @@ def test_where_a_bundle_file_and_its_list_may_lie(tmp_path):
         read(Data(tmp_path))
     (tmp_path / "flight.list.txt").rename(tmp_path / "list.txt")
     assert len(read(Data(tmp_path, test_every=0)).train) == 4
+
+
+def test_doctor_says_once_what_a_lens_lacks_and_what_to_do_without_points(tmp_path, capsys):
+    metashape(tmp_path)
+    assert main(["doctor", str(tmp_path), "--quick", "--probe", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 5 photographs are left out" in said and "spelt otherwise" not in said
+    assert "no sparse points" in said and "`surfkit prepare points` triangulates some" in said
+    metashape(tmp_path, change=words("<f>190.0</f>", "<f>wide</f>"))
+    assert main(["doctor", str(tmp_path), "--quick", "--probe", "0"]) == 2
+    said = capsys.readouterr().out
+    assert said.count("where a finite number belongs") == 1 and "more like it" not in said
