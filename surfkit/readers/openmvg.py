@@ -191,4 +191,5 @@ def _camera(where: str, kind: str, values: Mapping[str, Any]) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> BadInput:
-    return BadInput(f"{path}: damaged, or not of OpenMVG: {type(error).__name__} {shorten(str(error))}")
+    said = f"{type(error).__name__} {shorten(str(error))}"
+    return BadInput(f"{path}: damaged, or not of OpenMVG: {said}; convert the result again with ConvertSfM_DataFormat")

@@ -326,10 +326,13 @@ def entry(*path, value):
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 photographs are missing: 'IMG 5'"),
         (partial(metashape, change=lambda t: t.replace("transform", "nothing")), "all 5 photographs have no pose"),
         (partial(metashape, tail="<transform><scale>0</scale></transform>"), "transform of the chunk: its scale is 0"),
-        (partial(metashape, tail="<transform/><reference>PROJCS[</reference>"), "reference: the text .* is cut off"),
+        (
+            partial(metashape, tail="<transform/><reference>PROJCS[</reference>"),
+            "reference: no coordinate reference system: its text is cut off; export",
+        ),
         (
             partial(metashape, tail="<transform/><reference>x</reference>"),
-            "no coordinate reference system as well-known",
+            "no coordinate reference system: no well-known text; export it again",
         ),
         (partial(pix4d, change=words("0 0 1\n", "0 1 1\n")), "IMG 1.png: the camera matrix has entries below"),
         (partial(pix4d, change=words("radial distortion [3x1]", "fisheye poly [4x1]")), "only perspective cameras are"),
