@@ -30,6 +30,8 @@ from surfkit.scene.photos import photo_size
 
 PLACES = ("bundle.out", "bundle/bundle.out")
 """Where Bundler writes its file; other programs call it NAME.bundle.out."""
+HEAD, MOST_HEAD = "# Bundle file v0.3", 1000
+"""How the file begins, and bytes of its first line at most."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From Bundler's cameras (x right, y up, z backward) to x right, y down, z forward."""
 
@@ -140,18 +142,17 @@ def _files(root: Path) -> list[Path]:
 
 def _values(path: Path) -> np.ndarray:
     """All numbers of a bundle file."""
-    text = read_text(path)
-    head, _, body = text.partition("\n")
-    if not head.startswith("# Bundle file v0.3"):
-        raise BadInput(f"{path}: begins with {head[:40]!r}, not with '# Bundle file v0.3', the version that is read")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            values = np.fromstring(body, np.float64, sep=" ")
-        except (ValueError, DeprecationWarning) as error:
-            raise BadInput(
-                f"{path}: something that is no number lies among the numbers; copy the file whole"
-            ) from error
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("error")
+            head = file.readline(MOST_HEAD).decode("utf-8-sig", "replace")
+            values = np.fromfile(file, np.float64, sep=" ") if head.startswith(HEAD) else np.empty(0)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, DeprecationWarning) as error:
+        raise BadInput(f"{path}: something that is no number lies among the numbers; copy the file whole") from error
+    if not head.startswith(HEAD):
+        raise BadInput(f"{path}: begins with {head.strip()[:40]!r}, not with {HEAD!r}, the version that is read")
     if len(values) < 2:
         raise BadInput(f"{path}: cut off after the first line; copy it whole")
     return values
