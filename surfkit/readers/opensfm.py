@@ -14,7 +14,7 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
-from surfkit.readers.camera_files import read_lines, tracks_of
+from surfkit.readers.camera_files import MOST, read_lines, tracks_of
 from surfkit.readers.capture import Capture, Shot, Tracks, camera_of
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
@@ -76,7 +76,7 @@ def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
-    good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+    good = (np.abs(xyz) < MOST).all(1) & np.isfinite(rgb).all(1)
     rows = {number: row for row, number in enumerate(number for number, fine in zip(listed, good, strict=True) if fine)}
     capture = Capture(shots, xyz[good], rgb[good].astype(np.uint8))
     return _on_earth(capture, data.path, path.parent, model), rows, path.parent
