@@ -124,6 +124,23 @@ def test_points_in_a_file_beside_the_cameras(tmp_path):
     np.testing.assert_allclose(read_capture(Data(tmp_path), reader_of(Data(tmp_path))).xyz, DOTS, atol=1e-5)
 
 
+def test_positions_of_realitycapture_in_degrees_are_suspected(tmp_path):
+    def degrees(text):
+        head, *lines = text.splitlines()
+        split = [line.split(",") for line in lines]
+        for words in split:
+            words[1:3] = [str(8.9 + float(words[1]) / 75_000), str(47.5 + float(words[2]) / 111_000)]
+        return "\n".join([head, *map(",".join, split)])
+
+    for change, wanted in ((degrees, ["x and y differ by 0.00012 and heights by 4: if these are degrees"]), (str, [])):
+        realitycapture(tmp_path, change=change)
+        with collect_notes() as kept:
+            read(Data(tmp_path))
+        assert [
+            text.partition("csv: ")[2].partition(", export")[0] for text in kept.texts if "degrees" in text
+        ] == wanted
+
+
 def test_pix4d_on_the_map(tmp_path):
     origin = ORIGIN + 0.25  # is nearly always a whole number, but need not be
     pix4d(tmp_path, offset=origin)
