@@ -261,6 +261,11 @@ def test_cameras_far_apart_on_the_map_are_told_how_far_the_earth_bends():
     with collect_notes() as kept:
         place_of("x", UTM32, centres[1:])
     assert not kept.texts
+    pole = np.array([[0, 0, 6.4e6]])  # a camera that is wrong
+    with collect_notes() as kept:
+        place_of("x", UTM32, np.concatenate([np.tile(centres, (3000, 1)), pole]))
+    (said,) = kept.texts
+    assert re.search(r"coordinates are \d\.\d\d m off", said), said
 
 
 def test_metashape_in_local_coordinates(tmp_path):
