@@ -17,7 +17,8 @@ def by_photograph(view: np.ndarray) -> list[tuple[int, np.ndarray]]:
     order = np.argsort(view, kind="stable")
     order = order[view[order] != NONE]
     numbers, starts = np.unique(view[order], return_index=True)
-    return list(zip(numbers.tolist(), np.split(order, starts[1:])[: len(numbers)], strict=True))
+    parts = np.split(order, starts[1:])  # one, and not none, of no rows
+    return list(zip(numbers.tolist(), parts[: len(numbers)], strict=True))
 
 
 class Photographs:
