@@ -16,7 +16,7 @@ from surfkit.pipeline import opened
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.memory import cache_bytes
-from surfkit.texture.make import RECORD, Subject, TextureSettings, make_texture
+from surfkit.texture.make import RECORD, Subject, TextureSettings, make_texture, refuse_missing
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
 
@@ -51,6 +51,7 @@ class TextureOf:
 
     def run(self) -> None:
         """Make the textured mesh, and print what it is."""
+        refuse_missing()
         budget = cache_bytes(self.memory, "--memory")
         run = opened(self.run_folder)
         refuse_no_mesh(run)

@@ -22,13 +22,12 @@ from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
-from surfkit.maps.surface_model import draw_surface, has_colors, needs_double
+from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
-from surfkit.scene.scene import Frame, View
-from surfkit.texture.make import Subject as Textures
-from surfkit.texture.make import TextureSettings, textured
+from surfkit.scene.scene import Frame
+from surfkit.texture.make import Subject, TextureSettings, refuse_missing, textured
 from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
@@ -82,6 +81,8 @@ class MapSettings:
 
     def __post_init__(self) -> None:
         cache_bytes(self.memory, "--memory")
+        if self.colors == "photographs" and "orthophoto" not in self.products:
+            raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
         for name in ("gsd", "interval", "spacing"):
             value = getattr(self, name)
             if value != "auto" and not 0 < value < float("inf"):
@@ -102,21 +103,8 @@ class MapSettings:
             for package in ("rasterio", *PACKAGES.get(name, ())):
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What maps are drawn of.
-
-    Attributes:
-        surface: The mesh, in the frame of the input.
-        frame: Of the data set.
-        views: Training views.
-    """
-
-    surface: Surface
-    frame: Frame
-    views: Sequence[View] = ()
+        if self.colors == "photographs":
+            refuse_missing()
 
 
 def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface | None = None) -> dict[str, Any]:
@@ -135,21 +123,12 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     frame, surface = subject.frame, subject.surface
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
-    units = frame.metres or 1.0
-
-    def length(value: Length, automatic: float) -> float:
-        return automatic if value == "auto" else value / units
-
-    gsd = ground_sampling_distance(surface, subject.views, frame) if settings.gsd == "auto" else settings.gsd / units
-    grid = Grid.around(map_axes(up.direction), gsd, settings.bounds or bounds_of(surface, map_axes(up.direction)))
-    done = settings.names
-    if "orthophoto" in done and settings.colors == "mesh" and not has_colors(surface):
-        emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
-        done = tuple(name for name in done if name != "orthophoto")
+    grid = grid_of(subject, settings, map_axes(up.direction))
+    done = drawable(surface, settings)
     made = None
     if "orthophoto" in done and settings.colors == "photographs":
-        budget = cache_bytes(settings.memory, "--memory")
-        made = textured(Textures(surface, frame, subject.views), TextureSettings(texel=gsd * units), budget)
+        texture = TextureSettings(texel=grid.gsd * (frame.metres or 1.0))
+        made = textured(subject, texture, cache_bytes(settings.memory, "--memory"))
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     with workshop(out, (*files, RECORD)) as folder:
         if (out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
@@ -157,9 +136,8 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             for name in {*FILES.values()} - {*files}:
                 (out / name).unlink(missing_ok=True)
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
-        colors, photographs = FILES["orthophoto"] if "orthophoto" in done else None, None
-        if made is not None:
-            photographs = FromPhotographs(made, frame, sheet, settings.tile)
+        photographs = None if made is None else FromPhotographs(made, frame, sheet, settings.tile)
+        colors = FILES["orthophoto"] if "orthophoto" in done else None
         drawn = draw_surface(surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
         record = {
             "mesh": str(surface.path),
@@ -168,7 +146,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "up": up.source,
             "axes": grid.turn.tolist(),
             "metres_per_unit": frame.metres,
-            "gsd": gsd,
+            "gsd": grid.gsd,
             "bounds": list(grid.bounds),
             "size": [grid.width, grid.height],
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
@@ -176,20 +154,50 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         }
         if photographs is not None:
             record["orthophoto"] = {"from_photographs": round(photographs.cells / drawn.covered, 6)}
-        if "hillshade" in done:
-            draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], settings.tile)
-        if "contours" in done:
-            interval = length(settings.interval, even_interval(drawn.lowest, drawn.highest))
-            count = write_contours(sheet, FILES["dsm"], FILES["contours"], interval, settings.tile)
-            record["contours"] = {"interval": interval, "lines": count}
-        if "points" in done:
-            spacing = length(settings.spacing, gsd)
-            record["points"] = {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
+        record |= draw_products(subject, settings, sheet, drawn, done)
         if other is not None:
             record["difference"] = subtract(sheet, other, settings.tile, frame)
         record["files"] = files
         write_json(out / RECORD, record)
         emit(FileWritten(out / RECORD, "facts of the maps"))
+    return record
+
+
+def grid_of(subject: Subject, settings: MapSettings, turn: np.ndarray) -> Grid:
+    """The cells of the maps; `turn` is (3, 3), from the frame of the input to east, north and up."""
+    frame, surface = subject.frame, subject.surface
+    if settings.gsd == "auto":
+        gsd = ground_sampling_distance(surface, subject.views, frame)
+    else:
+        gsd = settings.gsd / (frame.metres or 1.0)
+    return Grid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+
+
+def drawable(surface: Surface, settings: MapSettings) -> tuple[str, ...]:
+    """Names of the products, but for an orthophoto that would have no colours, which a warning tells."""
+    if "orthophoto" not in settings.names or settings.colors == "photographs" or has_colors(surface):
+        return settings.names
+    emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
+    return tuple(name for name in settings.names if name != "orthophoto")
+
+
+def draw_products(
+    subject: Subject, settings: MapSettings, sheet: Sheet, drawn: Drawn, done: Sequence[str]
+) -> dict[str, Any]:
+    """Draw what follows from the surface model, and return what maps.json says of it."""
+    record: dict[str, Any] = {}
+    units = subject.frame.metres or 1.0
+    if "hillshade" in done:
+        draw_hillshade(sheet, FILES["dsm"], FILES["hillshade"], settings.tile)
+    if "contours" in done:
+        given = settings.interval
+        interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
+        count = write_contours(sheet, FILES["dsm"], FILES["contours"], interval, settings.tile)
+        record["contours"] = {"interval": interval, "lines": count}
+    if "points" in done:
+        spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
+        count = write_cloud(subject.surface, sheet, FILES["points"], spacing)
+        record["points"] = {"spacing": spacing, "points": count}
     return record
 
 
