@@ -1,0 +1,146 @@
+"""What all browsers that look at a training share: how far it is, curves, the pictures that it writes, the pause."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from surfkit.execute.state import BlockState
+from surfkit.train.watch import Watched
+from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
+from surfkit.view.studio import Studio
+
+if TYPE_CHECKING:
+    import viser
+
+NEWEST = "what runs now"
+COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+CHART_PX = 200
+"""Height of a chart."""
+PICTURE_PX = 1200
+"""Width of a picture that the run has written."""
+ELSEWHERE = "Other processes train these blocks: here are their losses, but no live picture, and no pause."
+PAUSED = "\n\n**Paused.**"
+NOTHING = "No step is made at the moment, so that there is no live picture, and nothing to pause."
+
+
+class LivePanel:
+    """Parts of the panel that are the same in every browser."""
+
+    def __init__(self, gui: viser.GuiApi, studio: Studio) -> None:
+        """Build them."""
+        self.gui, self.studio = gui, studio
+        self.follower: Follower | None = None
+        self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
+        self.picture_path: Path | None = None
+        self.status = gui.add_markdown("The run begins.")
+        self.button = gui.add_button("pause", visible=False)
+        self.button.on_click(lambda _: self._toggle())
+        self.of = gui.add_dropdown("curves of", (NEWEST,))
+        self.curves = gui.add_folder("Curves")
+        self.written = gui.add_folder("Last picture in progress/", expand_by_default=False, visible=False)
+        with self.written:
+            self.caption = gui.add_markdown("")
+            self.image = gui.add_image(np.full((2, 3, 3), 255, np.uint8))
+
+    def show(self, out: Path | None) -> None:
+        """Bring everything up to date with a run folder, and with the stage that runs in this process."""
+        stage = self.studio.stage
+        set_if_other(self.button, "visible", stage is not None)
+        set_if_other(self.button, "label", "go on" if self.studio.paused else "pause")
+        if out is None:
+            return
+        found, running = journals(out), running_blocks(out)
+        set_if_other(self.of, "options", (NEWEST, *sorted(found)))
+        folder = found.get(self.of.value) or (stage.folder if stage else next(reversed(found.values()), None))
+        if folder is not None:
+            self._follow(folder)
+        history = self.follower.history if self.follower else History()
+        shown = history if stage is None or self.follower.path.parent == stage.folder else History()
+        set_if_other(self.status, "content", in_words(shown, stage, running, self.studio))
+        self._show_written(out)
+
+    def _follow(self, folder: Path) -> None:
+        if self.follower is None or self.follower.path.parent != folder:
+            self.follower = Follower(folder)
+        if not self.follower.read() or not self.follower.history.rows:
+            return
+        losses = self.follower.history.losses()
+        self._chart("loss", losses.pop("step"), losses)
+        rows = {"training views": list(self.studio.psnrs[folder]), "held-out views": self.follower.history.held_out}
+        rows = {name: each for name, each in rows.items() if each}
+        if rows:
+            self._chart("PSNR, dB", *joined(rows))
+
+    def _chart(self, title: str, steps: np.ndarray, lines: dict[str, np.ndarray]) -> None:
+        """Draw lines over steps; a chart with other lines is a new one."""
+        data, names = (steps, *lines.values()), tuple(lines)
+        chart, before = self.charts.get(title, (None, ()))
+        if chart is not None and before == names:
+            chart.data = data
+            return
+        if chart is not None:
+            chart.remove()
+        series = (
+            {"label": "step"},
+            *({"label": n, "stroke": c, "width": 2} for n, c in zip(names, COLORS * len(names), strict=False)),
+        )
+        with self.curves:
+            chart = self.gui.add_uplot(data, series, title=title, scales={"x": {"time": False}}, height=CHART_PX)
+        self.charts[title] = chart, names
+
+    def _show_written(self, out: Path) -> None:
+        found = newest_pictures(out)
+        if not found or found[0] == self.picture_path:
+            return
+        with Image.open(found[0]) as image:
+            image.thumbnail((PICTURE_PX, PICTURE_PX))
+            self.image.image = np.asarray(image.convert("RGB"))
+        self.picture_path = found[0]
+        self.caption.content = f"{found[0].relative_to(out)}: photograph, render, depth, normals"
+        self.written.visible = True
+
+    def _toggle(self) -> None:
+        self.studio.pause(not self.studio.paused)
+        set_if_other(self.button, "label", "go on" if self.studio.paused else "pause")
+
+
+def in_words(history: History, stage: Watched | None, running: dict[int, BlockState], studio: Studio) -> str:
+    """How far a run is, in Markdown."""
+    if stage is not None:
+        return f"**{stage.title}** {numbers(history)}{PAUSED if studio.paused else ''}"
+    if running:
+        rows = [f"- block {at}: step {state.step:,} of {state.steps:,}" for at, state in running.items()]
+        return "\n".join([f"{ELSEWHERE}\n", *rows])
+    last = f"\n\nLast was **{history.title}** {numbers(history)}" if history.rows else ""
+    return NOTHING + last
+
+
+def numbers(history: History) -> str:
+    """Step, points, speed and loss."""
+    if not history.rows:
+        return "begins"
+    parts = [f"step {history.index:,} of {history.steps:,}"]
+    parts += [f"{history.points:,} points"] * (history.points > 0)
+    parts += [f"{speed:.1f} steps a second" for speed in [history.speed] if speed]
+    return ", ".join([*parts, f"loss {sum(history.rows[-1][1].values()):.4f}"])
+
+
+def joined(rows: dict[str, list[tuple[int, float]]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """(T,) all steps of some lines, and the (T,) values of each; NaN where it has none."""
+    steps = np.unique([index for each in rows.values() for index, _ in each])
+    values = {}
+    for name, each in rows.items():
+        at, value = np.array(each).T
+        values[name] = np.full(len(steps), np.nan)
+        values[name][np.searchsorted(steps, at)] = value
+    return steps.astype(np.float64), values
+
+
+def set_if_other(part: Any, name: str, value: Any) -> None:
+    """Set an attribute of a part of the panel; what is the same is not sent again."""
+    if getattr(part, name) != value:
+        setattr(part, name, value)
