@@ -30,7 +30,6 @@ from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
 from surfkit.train.material import CacheSettings
-from surfkit.view.live import live_view
 from surfkit.view.server import LOCAL, Address, refuse_wrong_port
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
@@ -165,6 +164,8 @@ class Train:
         if not self.view:
             self._train()
             return
+        from surfkit.view.live import live_view  # half a second of imports
+
         address = Address(self.view_host, self.view_port, "--view-")
         with live_view(address, self.view_share) as live:
             say(f"--view: the run is shown at {live.url}")
