@@ -57,9 +57,10 @@ class History:
             self.title = str(line["stage"]) if block is None else f"block {block}"
             self.steps, self.points = int(line["steps"]), int(line["points"])
         elif kind == "StepDone":
-            self.rows.append((int(line["index"]), {name: float(value) for name, value in line["losses"].items()}))
-            self.times.append(float(line["time"]))
+            row = int(line["index"]), {name: float(value) for name, value in line["losses"].items()}
             self.steps, self.points = int(line["steps"]), int(line["points"])
+            self.rows.append(row)
+            self.times.append(float(line["time"]))
         elif kind == "Measured" and line["psnr"]:
             self.held_out.append((int(line["index"]), float(np.mean(list(line["psnr"].values())))))
 
@@ -99,7 +100,7 @@ class Follower:
         for line in journal.lines(whole):
             try:
                 self.history.add(line)
-            except (KeyError, TypeError, ValueError):
+            except (AttributeError, KeyError, TypeError, ValueError):
                 continue  # a damaged line is a dot less
         return bool(whole)
 

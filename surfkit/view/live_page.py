@@ -148,7 +148,7 @@ class LivePage:
             image, told = self._beside_photograph(view, image, told)
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.index = drawing.index
-        self.told.content = f"After step {drawing.index:,}. {told}"
+        self.told.content = f"After step {drawing.index:,}: {told}"
         return drawing.seconds + time.perf_counter() - began
 
     @property
@@ -171,7 +171,9 @@ class LivePage:
                 self.photo = key, picture(view, "photograph", None, self.around.scene.frame)[0]
             except BadInput as error:
                 return framed([image], self.client.camera.aspect), f"{error}. {told}"
-        return framed([self.photo[1], image], self.client.camera.aspect), f"**{view.name}**{held}, and {told}"
+        return framed(
+            [self.photo[1], image], self.client.camera.aspect
+        ), f"**{view.name}**{held} beside the picture; {told}"
 
     def _changed(self) -> None:
         self._draw_cameras()

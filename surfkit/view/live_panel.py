@@ -33,7 +33,8 @@ class LivePanel:
     def __init__(self, gui: viser.GuiApi, studio: Studio) -> None:
         """Build them."""
         self.gui, self.studio = gui, studio
-        self.follower: Follower | None = None
+        self.followers: dict[Path, Follower] = {}
+        self.drawn: Path | None = None
         self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
         self.picture_path: Path | None = None
         self.status = gui.add_markdown("The run begins.")
@@ -54,26 +55,28 @@ class LivePanel:
         if out is None:
             return
         found, running = journals(out), running_blocks(out)
-        set_if_other(self.of, "options", (NEWEST, *sorted(found)))
-        folder = found.get(self.of.value) or (stage.folder if stage else next(reversed(found.values()), None))
-        if folder is not None:
-            self._follow(folder)
-        history = self.follower.history if self.follower else History()
-        shown = history if stage is None or self.follower.path.parent == stage.folder else History()
-        set_if_other(self.status, "content", in_words(shown, stage, running, self.studio))
+        set_if_other(self.of, "options", (NEWEST, *sorted(found, key=found.__getitem__)))
+        last = next(reversed(found), "")
+        here = f"block {min(running)}" if running else last  # of many that run, the same one all the time
+        now = stage.folder if stage is not None else found.get(here, out)
+        chosen = found.get(self.of.value, now)
+        self.followers = {folder: self.followers.get(folder) or Follower(folder) for folder in (now, chosen)}
+        fresh = {folder for folder, follower in self.followers.items() if follower.read()}
+        if (chosen in fresh or chosen != self.drawn) and self.followers[chosen].history.rows:
+            self._draw_curves(chosen)
+        set_if_other(self.status, "content", in_words(self.followers[now].history, stage, running, self.studio))
         self._show_written(out)
 
-    def _follow(self, folder: Path) -> None:
-        if self.follower is None or self.follower.path.parent != folder:
-            self.follower = Follower(folder)
-        if not self.follower.read() or not self.follower.history.rows:
-            return
-        losses = self.follower.history.losses()
+    def _draw_curves(self, folder: Path) -> None:
+        history, self.drawn = self.followers[folder].history, folder
+        losses = history.losses()
         self._chart("loss", losses.pop("step"), losses)
-        rows = {"training views": list(self.studio.psnrs[folder]), "held-out views": self.follower.history.held_out}
+        rows = {"training views": list(self.studio.psnrs[folder]), "held-out views": history.held_out}
         rows = {name: each for name, each in rows.items() if each}
         if rows:
             self._chart("PSNR, dB", *joined(rows))
+        elif (old := self.charts.pop("PSNR, dB", None)) is not None:  # of another stage
+            old[0].remove()
 
     def _chart(self, title: str, steps: np.ndarray, lines: dict[str, np.ndarray]) -> None:
         """Draw lines over steps; a chart with other lines is a new one."""
