@@ -27,6 +27,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.api import Maps
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
+from surfkit.refine import PruneAndRecover
 from surfkit.run.stage import Intervals
 from surfkit.train import checkpoint
 from surfkit.train.state import StageState
@@ -70,6 +71,8 @@ class Looking:
         self.told.append(stage.title)
 
     def look(self, index, psnr):
+        lines = (self.stage.folder / "events.jsonl").read_text().splitlines()
+        assert f'"index": {index},' in [line for line in lines if "StepDone" in line][-1], "the journal of this stage"
         for view in (*self.stage.scene.train[:2], *self.stage.scene.held_out[:1]):
             for geometry in (True, False):
                 self.drawn += len(self.stage.draw(view, geometry).present())
@@ -93,20 +96,22 @@ def equal(one, other):
 
 @needs_native
 @pytest.mark.parametrize("blocks", [False, True])
-def test_looking_changes_no_bit(data, recipe, tmp_path, blocks):
+def test_looking_changes_no_bit(data, recipe, tmp_path, capsys, blocks):
     if blocks:
         parts = {"partition": QuantileGrid((2, 1)), "assign": PictureShare(), "context": "frozen"}
-        recipe = replace(recipe, tune=recipe.pretrain, **parts)
+        refine = replace(PruneAndRecover(), stage=replace(PruneAndRecover().stage, steps=4))
+        recipe = replace(recipe, tune=recipe.pretrain, refine=(refine,), **parts)
     before = torch.random.get_rng_state()
     run(recipe, data, tmp_path / "alone", Compute("cpu"), QUIET)
     looking = Looking()
     with watched_by(looking):
         run(recipe, data, tmp_path / "watched", Compute("cpu"), QUIET)
+    assert "goes on without it" not in capsys.readouterr().err
     assert torch.equal(torch.random.get_rng_state(), before)
-    stages = ["pretrain", "block 0", "block 1"] if blocks else ["pretrain"]
+    stages = ["pretrain", *["block 0", "block 1", "refine0"] * blocks]
     assert looking.told == [word for stage in stages for word in (stage, "end")]
     assert looking.drawn > 6 * STEPS
-    for name in ["pretrain", *["blocks/000/tune", "blocks/001/tune"] * blocks]:
+    for name in ["pretrain", *["blocks/000/tune", "blocks/001/tune", "refine0"] * blocks]:
         one, other = (checkpoint.load(tmp_path / way / name / "checkpoint.safetensors") for way in ("alone", "watched"))
         assert equal(one, other), name
     clouds = [(tmp_path / way / "point_cloud.ply").read_bytes() for way in ("alone", "watched")]
