@@ -1,15 +1,17 @@
 """What the page of `surfkit train --view` costs a step: nobody looks, and somebody does.
 
-    python bench/live_view.py --rounds 9 --steps 40
+    python bench/live_view.py --rounds 30 --steps 20
 
 One process trains one model. Groups of steps take turns: without a page, with a page that no browser shows, and with
-one that a browser looks at which never rests. So they are of the same model and the same minutes, and the ratios of
-the medians of their times say what the page costs. The browser has no screen: it asks for pictures and reads them.
+one that a browser looks at which never rests. So they are of the same model and the same minutes, and the medians
+of the ratios of neighbours say what the page costs. CPU time is that of the process, the browser included: it has no
+screen, asks for pictures and reads them.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import threading
@@ -47,47 +49,52 @@ WAYS = ("no page", "nobody looks", "somebody looks")
 class Turns:
     """Has pages come and go between groups of steps, and keeps the times of the steps of each."""
 
-    def __init__(self, out: Path, rounds: int, steps: int, share: float) -> None:
-        self.out, self.rounds, self.steps, self.share = out, rounds, steps, share
-        self.times: dict[str, list[list[float]]] = defaultdict(list)
-        self.use, self.live, self.way, self.pictures = ExitStack(), None, "warm-up", 0
-        self.left = steps
+    def __init__(self, out: Path, steps: int, share: float) -> None:
+        self.out, self.steps, self.share = out, steps, share
+        self.wall: dict[str, list[list[float]]] = defaultdict(list)
+        self.cpu: dict[str, list[float]] = defaultdict(list)
+        self.use, self.live, self.way, self.made = ExitStack(), None, "warm-up", -1
 
     def begin(self, stage: Watched) -> None:
         """See `Watcher.begin`."""
-        self.stage, self.last = stage, time.perf_counter()
-        self.times[self.way].append([])
+        self.stage = stage
+        self.start()
 
     def look(self, index: int, psnr: float | None) -> None:
         """See `Watcher.look`; the time of a step has what its page does after it."""
         if self.live is not None:
             self.live.studio.look(index, psnr)
         now = time.perf_counter()
-        self.times[self.way][-1].append(now - self.last)
-        self.left -= 1
-        if self.left == 0:
+        self.wall[self.way][-1].append(now - self.last)
+        self.last = now
+        if len(self.wall[self.way][-1]) == self.steps:
+            self.cpu[self.way].append(time.process_time() - self.begun)
             self.turn()
-        self.last = time.perf_counter()
 
     def end(self) -> None:
         """See `Watcher.end`."""
         self.use.close()
 
     def turn(self) -> None:
-        """The next group of steps."""
-        made = sum(len(self.times[way]) for way in WAYS)
+        """The next group of steps: the ways in one order and in the other, in turn."""
         self.use.close()
-        self.live, self.left, self.way = None, self.steps, WAYS[made % len(WAYS)]
-        self.times[self.way].append([])
-        if self.way == "no page":
-            return
-        self.live = self.use.enter_context(live_view(Address(), self.share))
-        self.live.out = self.out
-        self.use.callback(lambda studio=self.live.studio: studio.end())
-        self.live.studio.begin(self.stage)
+        self.live, self.made = None, self.made + 1
+        lap, at = divmod(self.made, len(WAYS))
+        self.way = WAYS[at if lap % 2 == 0 else -1 - at]
+        if self.way != "no page":
+            self.live = self.use.enter_context(live_view(Address(), self.share))
+            self.live.out = self.out
+            self.use.callback(self.live.studio.end)
+            self.live.studio.begin(self.stage)
         if self.way == "somebody looks":
             self.use.enter_context(Somebody(self.live))
-        time.sleep(1.0)  # so that starting the page is no part of a step
+        time.sleep(0.5)  # so that starting and ending a page are no part of a step
+        self.start()
+
+    def start(self) -> None:
+        """The first step of a group begins."""
+        self.wall[self.way].append([])
+        self.last, self.begun = time.perf_counter(), time.process_time()
 
 
 class Somebody:
@@ -131,8 +138,8 @@ def watching(stage: Watched, steps: int = 20_000) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=9, help="groups of steps of each way")
-    parser.add_argument("--steps", type=int, default=40, help="of a group")
+    parser.add_argument("--rounds", type=int, default=30, help="groups of steps of each way")
+    parser.add_argument("--steps", type=int, default=20, help="of a group")
     parser.add_argument("--points", type=int, default=20_000)
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--share", type=float, default=0.3, help="--view-share")
@@ -145,26 +152,27 @@ def main() -> int:
         write_colmap(data, photograph(flight))
         recipe = with_steps(recipes()["2dgs"], total)
         recipe = replace(recipe, mesh=None, pretrain=replace(recipe.pretrain, densify=None))  # all steps are alike
-        turns = Turns(out, asked.rounds, asked.steps, asked.share)
+        turns = Turns(out, asked.steps, asked.share)
         with watched_by(turns):
             run(recipe, Data(data), out, Compute("cpu"), Intervals(checkpoint=total, pictures=0))
-    groups = {way: [median(times) for times in turns.times[way][: asked.rounds]] for way in WAYS}
-    whole = {way: [sum(times) for times in turns.times[way][: asked.rounds]] for way in WAYS}
+    walls = {way: [sum(times) for times in turns.wall[way][: asked.rounds]] for way in WAYS}
+    cpus = {way: turns.cpu[way][: asked.rounds] for way in WAYS}
+
+    def to_no_page(of: dict[str, list[float]]) -> dict[str, float]:
+        pairs = {way: zip(of[way], of["no page"], strict=True) for way in WAYS[1:]}
+        return {way: round(median([one / other for one, other in each]), 3) for way, each in pairs.items()}
+
     figures = {
         "points": asked.points,
         "pixels": [flight.width, flight.height],
         "steps of a group": asked.steps,
+        "groups of each way": asked.rounds,
         "share": asked.share,
-        "groups": {way: len(found) for way, found in groups.items()},
-        "median step, ms": {way: round(1000 * median(found), 2) for way, found in groups.items()},
-        "time of the steps, to no page": {
-            way: round(median([one / other for one, other in zip(whole[way], whole["no page"], strict=True)]), 4)
-            for way in WAYS[1:]
-        },
-        "median step, to no page": {
-            way: round(median([one / other for one, other in zip(groups[way], groups["no page"], strict=True)]), 4)
-            for way in WAYS[1:]
-        },
+        "load of the machine": round(os.getloadavg()[0], 1),
+        "step, ms": {way: round(1000 * median(found) / asked.steps, 1) for way, found in walls.items()},
+        "CPU time of a step, ms": {way: round(1000 * median(found) / asked.steps, 1) for way, found in cpus.items()},
+        "time, to no page": to_no_page(walls),
+        "CPU time, to no page": to_no_page(cpus),
         "being watched by a page that nobody looks at, µs a step": round(1e6 * watching(turns.stage), 1),
     }
     print(save("live_view", figures).read_text())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,9 @@ PICTURE_PX = 1200
 """Width of a picture that the run has written."""
 ELSEWHERE = "Other processes train these blocks: here are their losses, but no live picture, and no pause."
 PAUSED = "\n\n**Paused.**"
+ALONE = "The method makes these steps on its own: here are its losses, but no live picture, and no pause."
+FRESH_S = 30.0
+"""Since the last step of a method that still makes some."""
 NOTHING = "No step is made at the moment, so that there is no live picture, and nothing to pause."
 
 
@@ -118,7 +122,9 @@ def in_words(history: History, stage: Watched | None, running: dict[int, BlockSt
     if running:
         rows = [f"- block {at}: step {state.step:,} of {state.steps:,}" for at, state in running.items()]
         return "\n".join([f"{ELSEWHERE}\n", *rows])
-    last = f"\n\nLast was **{history.title}** {numbers(history)}" if history.rows else ""
+    if history.times and history.index < history.steps and time.time() - history.times[-1] < FRESH_S:
+        return f"**{history.title}** {numbers(history)}\n\n{ALONE}"
+    last = f"\n\nThe last stage was **{history.title}**, {numbers(history)}" if history.rows else ""
     return NOTHING + last
 
 

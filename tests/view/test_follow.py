@@ -1,6 +1,7 @@
 """What is read of a run while it goes on."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from surfkit.core.events import Measured, StageBegan, StepDone, emit
 from surfkit.execute.state import BlockState, state_path
 from surfkit.run.journal import record_events
 from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
-from surfkit.view.live_panel import ELSEWHERE, NOTHING, in_words, joined
+from surfkit.view.live_panel import ALONE, ELSEWHERE, NOTHING, in_words, joined
 from surfkit.view.studio import Studio
 
 
@@ -93,6 +94,16 @@ def test_blocks_of_other_processes(tmp_path):
     state_path(folder).write_text("{")
     assert not running_blocks(tmp_path)
     assert in_words(History(), None, {}, Studio()) == NOTHING
+
+
+def test_a_method_that_makes_its_own_steps():
+    history = History("field", 10, 0, [time.time()], [(7, {"sdf": 0.5})])
+    said = in_words(history, None, {}, Studio())
+    assert said == f"**field** step 7 of 10, loss 0.5000\n\n{ALONE}"
+    history.times[-1] -= 1000
+    assert in_words(history, None, {}, Studio()).startswith(NOTHING)
+    history.times[-1], history.steps = time.time(), 7
+    assert in_words(history, None, {}, Studio()).startswith(NOTHING)
 
 
 def test_the_last_pictures(tmp_path):
