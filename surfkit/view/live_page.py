@@ -84,7 +84,7 @@ class LivePage:
         self.dirty, self.index, self.drawn = True, -1, 0.0
         self.photo: tuple[tuple[str, int], np.ndarray] | None = None
         gui = client.gui
-        with gui.add_folder("Live picture"):
+        with gui.add_folder("Live picture", order=2):
             self.kind = gui.add_dropdown("show", get_args(Kind))
             self.place = gui.add_dropdown("from", get_args(Place))
             self.number = gui.add_number("camera", 1, min=1, max=1, step=1)

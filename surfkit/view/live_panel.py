@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 NEWEST = "what runs now"
 COLORS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
-CHART_PX = 200
+CHART_PX = 160
 """Height of a chart."""
 PICTURE_PX = 1200
 """Width of a picture that the run has written."""
@@ -41,12 +42,13 @@ class LivePanel:
         self.drawn: Path | None = None
         self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
         self.picture_path: Path | None = None
-        self.status = gui.add_markdown("The run begins.")
-        self.button = gui.add_button("pause", visible=False)
+        gui.configure_theme(control_layout="collapsible", show_share_button=False, show_logo=False)
+        self.status = gui.add_markdown("The run begins.", order=0)
+        self.button = gui.add_button("pause", visible=False, order=1)
         self.button.on_click(lambda _: self._toggle())
-        self.of = gui.add_dropdown("curves of", (NEWEST,))
-        self.curves = gui.add_folder("Curves")
-        self.written = gui.add_folder("Last picture in progress/", expand_by_default=False, visible=False)
+        self.of = gui.add_dropdown("curves of", (NEWEST,), order=3)  # 2: the live picture, of each browser
+        self.curves = gui.add_folder("Curves", order=4)
+        self.written = gui.add_folder("Last picture in progress/", order=5, expand_by_default=False, visible=False)
         with self.written:
             self.caption = gui.add_markdown("")
             self.image = gui.add_image(np.full((2, 3, 3), 255, np.uint8))
@@ -74,16 +76,18 @@ class LivePanel:
     def _draw_curves(self, folder: Path) -> None:
         history, self.drawn = self.followers[folder].history, folder
         losses = history.losses()
-        self._chart("loss", losses.pop("step"), losses)
-        rows = {"training views": list(self.studio.psnrs[folder]), "held-out views": history.held_out}
-        rows = {name: each for name, each in rows.items() if each}
-        if rows:
-            self._chart("PSNR, dB", *joined(rows))
-        elif (old := self.charts.pop("PSNR, dB", None)) is not None:  # of another stage
-            old[0].remove()
+        self._chart(0, "loss", losses.pop("step"), losses)
+        rows = {"training": list(self.studio.psnrs[folder]), "held-out": history.held_out}
+        for place, (what, each) in enumerate(rows.items(), start=1):
+            title = f"PSNR of {what} views, dB"
+            if each:
+                steps, values = np.array(each, np.float64).T
+                self._chart(place, title, steps, {"dB": values})
+            elif (old := self.charts.pop(title, None)) is not None:  # of another stage
+                old[0].remove()
 
-    def _chart(self, title: str, steps: np.ndarray, lines: dict[str, np.ndarray]) -> None:
-        """Draw lines over steps; a chart with other lines is a new one."""
+    def _chart(self, place: int, title: str, steps: np.ndarray, lines: dict[str, np.ndarray]) -> None:
+        """Draw lines over steps; a chart with other lines is a new one, in the same place."""
         data, names = (steps, *lines.values()), tuple(lines)
         chart, before = self.charts.get(title, (None, ()))
         if chart is not None and before == names:
@@ -91,12 +95,18 @@ class LivePanel:
             return
         if chart is not None:
             chart.remove()
-        series = (
-            {"label": "step"},
-            *({"label": n, "stroke": c, "width": 2} for n, c in zip(names, COLORS * len(names), strict=False)),
-        )
+        strokes = itertools.cycle(COLORS)
+        series = ({"label": "step"}, *({"label": name, "stroke": next(strokes), "width": 2} for name in names))
         with self.curves:
-            chart = self.gui.add_uplot(data, series, title=title, scales={"x": {"time": False}}, height=CHART_PX)
+            chart = self.gui.add_uplot(
+                data,
+                series,
+                title=title,
+                scales={"x": {"time": False}},
+                legend={"show": len(names) > 1},
+                height=CHART_PX,
+                order=place,
+            )
         self.charts[title] = chart, names
 
     def _show_written(self, out: Path) -> None:
@@ -136,17 +146,6 @@ def numbers(history: History) -> str:
     parts += [f"{history.points:,} points"] * (history.points > 0)
     parts += [f"{speed:.1f} steps a second" for speed in [history.speed] if speed]
     return ", ".join([*parts, f"loss {sum(history.rows[-1][1].values()):.4f}"])
-
-
-def joined(rows: dict[str, list[tuple[int, float]]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """(T,) all steps of some lines, and the (T,) values of each; NaN where it has none."""
-    steps = np.unique([index for each in rows.values() for index, _ in each])
-    values = {}
-    for name, each in rows.items():
-        at, value = np.array(each).T
-        values[name] = np.full(len(steps), np.nan)
-        values[name][np.searchsorted(steps, at)] = value
-    return steps.astype(np.float64), values
 
 
 def set_if_other(part: Any, name: str, value: Any) -> None:

@@ -11,7 +11,7 @@ from surfkit.core.events import Measured, StageBegan, StepDone, emit
 from surfkit.execute.state import BlockState, state_path
 from surfkit.run.journal import record_events
 from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
-from surfkit.view.live_panel import ALONE, ELSEWHERE, NOTHING, in_words, joined
+from surfkit.view.live_panel import ALONE, ELSEWHERE, NOTHING, in_words
 from surfkit.view.studio import Studio
 
 
@@ -112,13 +112,6 @@ def test_the_last_pictures(tmp_path):
         (tmp_path / "progress" / name).parent.mkdir(parents=True)
         (tmp_path / "progress" / name).write_bytes(b"")
     assert newest_pictures(tmp_path) == [tmp_path / "progress" / "001000" / "sub" / "b.png"]
-
-
-def test_lines_over_all_steps():
-    steps, lines = joined({"a": [(1, 10.0), (3, 30.0)], "b": [(2, 20.0), (3, 31.0)]})
-    assert steps.tolist() == [1, 2, 3]
-    assert np.array_equal(lines["a"], [10, np.nan, 30], equal_nan=True)
-    assert np.array_equal(lines["b"], [np.nan, 20, 31], equal_nan=True)
 
 
 @pytest.mark.parametrize("count", [2, 5000])

@@ -343,7 +343,9 @@ def drive(url, seen):
     """What a user does while a run goes on: waits for pictures and curves, pauses, and has it stopped."""
     browser = Browser(url)
     browser.wait_for(backgrounds, 60)
-    browser.wait_for(lambda b: {"loss", "PSNR, dB"} <= {row.get("title") for row in b.gui.values()}, 60)
+    browser.wait_for(
+        lambda b: {"loss", "PSNR of training views, dB"} <= {row.get("title") for row in b.gui.values()}, 60
+    )
     browser.press("pause")
     browser.wait_for(lambda b: any("**Paused.**" in text for text in b.texts()))
     seen += browser.texts()
