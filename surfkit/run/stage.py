@@ -177,11 +177,13 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     at, intervals, meter = job.stage, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
     emit(StageBegan(at.name, steps, len(state.points), state.index + 1, at.block))
-    clock = Stopwatch(state)
+    clock, draw = Stopwatch(state), live_drawing(job, trainer, state)
     with (
         graceful() as request,
         Display(at.title, steps) as display,
-        watched(Watched(at.title, at.journal, job.scene, live(job, trainer, state), lambda: request.asked)) as look,
+        watched(
+            Watched(at.title, at.journal, job.scene, live_drawing(job, trainer, state), lambda: request.asked)
+        ) as look,
     ):
         for done in trainer.run(state, clock):
             display.show(done)
@@ -263,7 +265,7 @@ def drawing(stage: RunStage, state: StageState, rasterizer: Rasterizer, geometry
     return lambda view: draws.render(splats, view.camera, near, geometry).maps
 
 
-def live(job: StageJob, trainer: Trainer, state: StageState) -> Callable[[View, bool], Maps]:
+def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable[[View, bool], Maps]:
     """A function that renders the points of a stage as they are when it is called, with those that are frozen."""
     at = job.stage
 

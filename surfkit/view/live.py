@@ -49,10 +49,12 @@ class Live:
     def __init__(self, page: Served, share: float) -> None:
         """Serve; at most a `share` of the time of the training goes into pictures."""
         self.page, self.share, self.url = page, share, page.url
-        self.studio, self.out = Studio(), None
+        self.studio = Studio()
+        self.out: Path | None = None
         self.around: Surroundings | None = None
         self.pages: dict[int, LivePage] = {}
-        self.wake, self.failed = threading.Event(), set()
+        self.wake = threading.Event()
+        self.failed: set[str] = set()
         self.panel = LivePanel(page.viser.gui, self.studio)
         page.viser.on_client_connect(self._connected)
         page.viser.on_client_disconnect(lambda client: self.pages.pop(client.client_id, None))
@@ -91,8 +93,10 @@ class Live:
                 self._carefully("pictures", lambda stage=stage: self._enter(stage))
             due = [page for page in pages if page.wants(now)] if stage is not None else []
             if due and (now >= free or self.studio.paused):
-                took = self._carefully("pictures", min(due, key=lambda page: page.drawn).draw)
-                free = time.monotonic() + rest(took or 0.0, self.share)
+                page, spent = min(due, key=lambda page: page.drawn), self.studio.spent
+                self._carefully("pictures", page.draw)
+                took = self.studio.spent - spent + time.perf_counter() - page.received  # not the wait for the step
+                free = time.monotonic() + rest(took, self.share)
                 continue
             self.wake.wait(CHECK_S if pages else None)
             self.wake.clear()
@@ -116,18 +120,17 @@ class Live:
             if self.pages:
                 self._carefully("panel", lambda: self.panel.show(self.out))
 
-    def _carefully(self, what: str, action: Callable[[], float | None]) -> float | None:
+    def _carefully(self, what: str, action: Callable[[], None]) -> None:
         """Do it; what fails is told once, and costs no more than this part of the page."""
         try:
-            return action()
+            action()
         except BadInput:  # the page says it
-            return None
+            pass
         except Exception as error:
             if what not in self.failed:
                 self.failed.add(what)
                 said = " ".join(f"{type(error).__name__}: {error}".split())
                 say(f"surfkit: {WHAT}: {what}: {said}; the training goes on")
-            return None
 
 
 def rest(seconds: float, share: float) -> float:

@@ -75,13 +75,19 @@ class Surroundings:
 
 
 class LivePage:
-    """The panel of one browser, and its picture."""
+    """The panel of one browser, and its picture.
+
+    Attributes:
+        around: The scene; None before it is known.
+        drawn: When the last picture was done, seconds of `time.monotonic`.
+        received: When the training had drawn it, seconds of `time.perf_counter`.
+    """
 
     def __init__(self, studio: Studio, client: viser.ClientHandle, wake: threading.Event) -> None:
         """Build the panel; `wake` is set when a picture is wanted."""
         self.studio, self.client, self.wake = studio, client, wake
         self.around: Surroundings | None = None
-        self.dirty, self.index, self.drawn = True, -1, 0.0
+        self.dirty, self.index, self.drawn, self.received = True, -1, 0.0, 0.0
         self.photo: tuple[tuple[str, int], np.ndarray] | None = None
         gui = client.gui
         with gui.add_folder("Live picture", order=2):
@@ -118,15 +124,15 @@ class LivePage:
             return False
         return self.dirty or (self.index != self.studio.index and now - self.drawn >= REFRESH_S)
 
-    def draw(self) -> float:
-        """Have the picture drawn, and show it; seconds of work that it took, of the training and here.
+    def draw(self) -> None:
+        """Have the picture drawn, and show it.
 
         Raises:
             BadInput: There is no stage to draw, or it draws no such maps.
         """
         self.dirty, self.index = False, self.studio.index
         try:
-            return self._draw()
+            self._draw()
         except BadInput as error:
             self.told.content = str(error)
             raise
@@ -136,20 +142,21 @@ class LivePage:
         finally:
             self.drawn = time.monotonic()
 
-    def _draw(self) -> float:
+    def _draw(self) -> None:
         around, kind = self.around, self.kind.value
         chosen = self._chosen if self.place.value == THERE else None
         camera = self._camera() if chosen is None else chosen.camera.fitted(int(self.longest.value))
         view = replace(chosen, camera=camera) if chosen is not None else view_of(camera)
-        drawing = self.studio.draw(view, kind != "render")
-        began = time.perf_counter()
+        try:
+            drawing = self.studio.draw(view, kind != "render")
+        finally:
+            self.received = time.perf_counter()
         image, told = picture(view, kind, lambda _: drawing.maps, around.scene.frame)
         if chosen is not None:
             image, told = self._beside_photograph(view, image, told)
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.index = drawing.index
         self.told.content = f"After step {drawing.index:,}: {told}"
-        return drawing.seconds + time.perf_counter() - began
 
     @property
     def _chosen(self) -> View:

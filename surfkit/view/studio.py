@@ -27,12 +27,10 @@ class Drawing:
     Attributes:
         maps: On the CPU.
         index: The step before.
-        seconds: For which the training has waited.
     """
 
     maps: Maps
     index: int
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,7 @@ class Studio:
         stage: The one whose steps are made in this process; None at other times.
         index: Its last step.
         paused: Whether it waits until it is asked to go on.
+        spent: Seconds for which it has waited for pictures so far.
         psnrs: By folder of a journal, steps and PSNR of the training views about then, dB.
     """
 
@@ -60,7 +59,7 @@ class Studio:
         """Nothing runs yet."""
         self.changed = threading.Condition()
         self.stage: Watched | None = None
-        self.index, self.paused = 0, False
+        self.index, self.paused, self.spent = 0, False, 0.0
         self.order: Order | None = None
         self.psnrs: dict[Path, list[tuple[int, float]]] = defaultdict(list)
 
@@ -121,9 +120,15 @@ class Studio:
             drawn = self.stage.draw(order.view, order.geometry)
             maps = Maps(**{name: value.detach().cpu() for name, value in drawn.present().items()})
         except Exception as error:  # also that memory ran out: a picture less, and the training goes on
-            order.made.set_exception(error)
+            failed = error.with_traceback(None)  # whose frames hold memory
+            self.spent += time.perf_counter() - began
+            order.made.set_exception(failed)
             return
-        order.made.set_result(Drawing(maps, self.index, time.perf_counter() - began))
+        except BaseException:  # a second Ctrl-C
+            order.made.set_exception(BadInput("the run was stopped"))
+            raise
+        self.spent += time.perf_counter() - began
+        order.made.set_result(Drawing(maps, self.index))
 
     def _wait(self) -> None:
         title = self.stage.title

@@ -173,10 +173,10 @@ class Training:
                 look(self.index, 20.0)
 
     def draw(self, view, geometry):
-        if self.error:
-            raise self.error
         time.sleep(self.draw_s)
         self.drawn.append((self.index, view, geometry))
+        if self.error:
+            raise self.error
         camera = view.camera
         color = torch.full((3, camera.height, camera.width), self.index % 100 / 100)
         plane = torch.full((camera.height, camera.width), 2.0)
@@ -257,14 +257,15 @@ def test_while_nobody_looks_nothing_is_drawn(scene, tmp_path):
         assert before and len(training.drawn) == before
 
 
-@pytest.mark.parametrize("share", [0.1, 0.6])
-def test_pictures_take_their_share_of_the_time(scene, tmp_path, share):
+@pytest.mark.parametrize(("share", "error"), [(0.1, None), (0.6, None), (0.3, RuntimeError("no memory"))])
+def test_pictures_take_their_share_of_the_time(scene, tmp_path, share, error):
     needs("viser")
     draw_s = 0.05
     with live_view(Address(), share) as page, Training(page.studio, scene, tmp_path, 0.001, draw_s) as training:
         browser = Browser(page.url)
         browser.wait_for(backgrounds)
         browser.set("pixels", 160)
+        training.error = error
         before, began = len(training.drawn), time.monotonic()
         for z in range(60):  # somebody who never rests
             browser.stand(float(z))
