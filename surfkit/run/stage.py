@@ -181,9 +181,7 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     with (
         graceful() as request,
         Display(at.title, steps) as display,
-        watched(
-            Watched(at.title, at.journal, job.scene, live_drawing(job, trainer, state), lambda: request.asked)
-        ) as look,
+        watched(Watched(at.title, at.journal, job.scene, draw, lambda: request.asked)) as look,
     ):
         for done in trainer.run(state, clock):
             display.show(done)

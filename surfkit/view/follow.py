@@ -107,7 +107,7 @@ class Follower:
 
 def journals(out: Path) -> dict[str, Path]:
     """Folders of the journals of a run by what they are of, the one that was written last at the end."""
-    found = [out, *out.glob("partition"), *out.glob("blocks/[0-9]*"), *out.glob("refine[0-9]*")]
+    found = [out, *out.glob("partition"), *block_folders(out), *out.glob("refine[0-9]*")]
     times = {}
     for folder in found:
         try:
@@ -123,10 +123,15 @@ def _name(out: Path, folder: Path) -> str:
     return f"block {int(folder.name)}" if folder.parent.name == "blocks" else folder.name
 
 
+def block_folders(out: Path) -> list[Path]:
+    """Folders of the blocks, by number."""
+    return sorted(path for path in out.glob("blocks/[0-9]*") if path.name.isdecimal())
+
+
 def running_blocks(out: Path) -> dict[int, BlockState]:
     """Blocks that are being trained, by any process, by number."""
     found = {}
-    for folder in sorted(out.glob("blocks/[0-9]*")):
+    for folder in block_folders(out):
         try:
             state = read_state(folder)
         except (BadInput, OSError):

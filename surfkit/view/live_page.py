@@ -80,7 +80,7 @@ class LivePage:
     Attributes:
         around: The scene; None before it is known.
         drawn: When the last picture was done, seconds of `time.monotonic`.
-        received: When the training had drawn it, seconds of `time.perf_counter`.
+        received: When the training had drawn it, or had been asked in vain, seconds of `time.perf_counter`.
     """
 
     def __init__(self, studio: Studio, client: viser.ClientHandle, wake: threading.Event) -> None:
@@ -130,7 +130,7 @@ class LivePage:
         Raises:
             BadInput: There is no stage to draw, or it draws no such maps.
         """
-        self.dirty, self.index = False, self.studio.index
+        self.dirty, self.index, self.received = False, self.studio.index, time.perf_counter()
         try:
             self._draw()
         except BadInput as error:
@@ -172,15 +172,14 @@ class LivePage:
 
     def _beside_photograph(self, view: View, image: np.ndarray, told: str) -> tuple[np.ndarray, str]:
         """The photograph at the left of a picture of its camera, in the shape of the window."""
-        key, held = (view.name, view.camera.width), " (held out)" * (view.name in self.around.held_out)
+        key, aspect = (view.name, view.camera.width), self.client.camera.aspect
         if self.photo is None or self.photo[0] != key:
             try:
                 self.photo = key, picture(view, "photograph", None, self.around.scene.frame)[0]
             except BadInput as error:
-                return framed([image], self.client.camera.aspect), f"{error}. {told}"
-        return framed(
-            [self.photo[1], image], self.client.camera.aspect
-        ), f"**{view.name}**{held} beside the picture; {told}"
+                return framed([image], aspect), f"{error}. {told}"
+        held = " (held out)" if view.name in self.around.held_out else ""
+        return framed([self.photo[1], image], aspect), f"**{view.name}**{held} beside the picture; {told}"
 
     def _changed(self) -> None:
         self._draw_cameras()

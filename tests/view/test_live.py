@@ -1,6 +1,7 @@
 """A training that is looked at: it comes to the same bits, can be paused, and outlives whatever fails on the page."""
 
 import os
+import re
 import signal
 import socket
 import sys
@@ -36,7 +37,8 @@ from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 from surfkit.view import live
 from surfkit.view.live import live_view, rest
 from surfkit.view.live_page import Surroundings, framed
-from surfkit.view.server import Address
+from surfkit.view.screen import WORLD
+from surfkit.view.server import Address, listen
 from surfkit.view.studio import Studio
 
 STEPS = 24
@@ -300,12 +302,15 @@ def test_a_page_of_a_training(scene, tmp_path):
         browser.wait_for(lambda b: any("near is pale" in text for text in b.texts()))
         browser.set("cameras", True)
         browser.wait_for(lambda b: "/cameras" in b.names())
-        browser.set("from", "a training camera")
-        name = scene.train[0].name
+        camera, name = scene.train[2].camera, scene.train[2].name
+        ahead = camera.world_to_camera[2, :3].numpy()
+        browser.click((camera.centre.numpy() - 0.01 * ahead) * WORLD, ahead)
         browser.wait_for(lambda b: any(name in text and "beside the picture" in text for text in b.texts()))
         browser.wait_for(lambda b: "/cameras" not in b.names())
         assert training.drawn[-1][1].name == name
-        browser.set("go to", "previous")
+        browser.set("go to", "next")
+        browser.wait_for(lambda b: any(scene.train[3].name in text for text in b.texts()))
+        browser.set("camera", len(scene.train) + len(scene.held_out))
         last = scene.held_out[-1].name
         browser.wait_for(lambda b: any(last in text and "(held out)" in text for text in b.texts()))
         other = Browser(page.url)
@@ -342,16 +347,16 @@ def test_the_first_view_shows_the_scene(scene):
 
 def drive(url, seen):
     """What a user does while a run goes on: waits for pictures and curves, pauses, and has it stopped."""
-    browser = Browser(url)
-    browser.wait_for(backgrounds, 60)
-    browser.wait_for(
-        lambda b: {"loss", "PSNR of training views, dB"} <= {row.get("title") for row in b.gui.values()}, 60
-    )
-    browser.press("pause")
-    browser.wait_for(lambda b: any("**Paused.**" in text for text in b.texts()))
-    seen += browser.texts()
-    os.kill(os.getpid(), signal.SIGINT)
-    browser.close()
+    browser, charts = Browser(url), {"loss", "PSNR of training views, dB"}
+    try:
+        browser.wait_for(backgrounds, 60)
+        browser.wait_for(lambda b: charts <= {row.get("title") for row in b.gui.values()}, 60)
+        browser.press("pause")
+        browser.wait_for(lambda b: any("**Paused.**" in text for text in b.texts()))
+        seen += browser.texts()
+    finally:
+        os.kill(os.getpid(), signal.SIGINT)
+        browser.close()
 
 
 @needs_native
@@ -371,32 +376,46 @@ def test_a_run_with_a_page(data, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().err
     assert "shown at http://127.0.0.1:" in said and "the page ends with the run" in said
     assert any(text.startswith("**pretrain** step ") and "points" in text for text in seen), seen
+    listen(Address(port=int(re.search(r"127\.0\.0\.1:(\d+)", said)[1]))).close()
     state = checkpoint.load(out / "pretrain" / "checkpoint.safetensors")
     assert f"stopped after step {state.index} of" in said and "paused on the page" in said
 
 
-def test_what_cannot_be_viewed_is_refused(data, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "run"
-    words = ["train", "recipe:2dgs", "--data", str(data.path), "--out", str(out)]
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        cases = {
-            ("--view", "--view-port", "0"): "--view-port 0: give 1 to 65535",
-            ("--view", "--view-share", "0"): "--view-share 0: give a share above 0",
-            ("--view", "--view-share", "1.5"): "--view-share 1.5",
-            ("--view-port", "8080"): "--view-port: there is no page without --view",
-            ("--view-share=0.2",): "--view-share=0.2: there is no page without --view",
-            ("--view", "--view-port", str(port)): f"--view-port {port}: Address already in use; give another",
-            ("--view", "--view-host", "198.51.100.7"): "--view-host 198.51.100.7: ",
-        }
-        for more, said in cases.items():
-            if "--view" in more and more[1:] and more[1] != "--view-share" and more[-1] != "0":
-                needs("viser")
-            assert main([*words, *more]) == 2, more
-            error = capsys.readouterr().err
-            assert error.startswith("surfkit: ") and error.count("\n") == 1 and said in error, error
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert main([*words, "--view"]) == 2
+def refusal(capsys, data, out, *words):
+    """The one line in which a command is refused, before anything is written."""
+    assert main(["train", "recipe:2dgs", "--data", str(data.path), "--out", str(out), *words]) == 2, words
     error = capsys.readouterr().err
-    assert "surfkit train --view needs the package viser" in error and "pip install 'surfkit[view]'" in error
-    assert error.count("\n") == 1 and not out.exists()
+    assert error.startswith("surfkit: ") and error.count("\n") == 1 and not out.exists(), error
+    return error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--view", "--view-port", "0"], "--view-port 0: give 1 to 65535"),
+        (["--view", "--view-share", "0"], "--view-share 0: give a share above 0"),
+        (["--view", "--view-share", "1.5"], "--view-share 1.5: "),
+        (["--view", "--view-share", "nan"], "--view-share nan: "),
+        (["--view-port", "8080"], "--view-port: there is no page without --view"),
+        (["--view-share=0.2"], "--view-share=0.2: there is no page without --view"),
+    ],
+)
+def test_options_without_sense_are_refused(data, tmp_path, capsys, words, said):
+    assert said in refusal(capsys, data, tmp_path / "run", *words)
+
+
+def test_addresses_that_cannot_be_had_are_refused(data, tmp_path, capsys):
+    needs("viser")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        said = refusal(capsys, data, tmp_path / "run", "--view", "--view-port", port)
+    assert f"--view-port {port}: Address already in use; give another" in said
+    assert "--view-host 198.51.100.7: " in refusal(
+        capsys, data, tmp_path / "run", "--view", "--view-host", "198.51.100.7"
+    )
+
+
+def test_without_viser_one_line_says_what_to_install(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    said = refusal(capsys, data, tmp_path / "run", "--view")
+    assert "surfkit train --view needs the package viser" in said and "pip install 'surfkit[view]'" in said
