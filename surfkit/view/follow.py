@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.execute.state import BlockState, read_state
+from surfkit.execute.state import STALE_S, BlockState, read_state
 from surfkit.report.curves import thinned
 from surfkit.run import journal
 
@@ -136,7 +137,7 @@ def running_blocks(out: Path) -> dict[int, BlockState]:
             state = read_state(folder)
         except (BadInput, OSError):
             continue
-        if state.status == "running":
+        if state.status == "running" and time.time() - state.heard < STALE_S:
             found[int(folder.name)] = state
     return found
 

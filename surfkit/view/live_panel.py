@@ -134,7 +134,7 @@ def in_words(history: History, stage: Watched | None, running: dict[int, BlockSt
         return "\n".join([f"{ELSEWHERE}\n", *rows])
     if history.times and history.index < history.steps and time.time() - history.times[-1] < FRESH_S:
         return f"**{history.title}** {numbers(history)}\n\n{ALONE}"
-    last = f"\n\nThe last stage was **{history.title}**, {numbers(history)}" if history.rows else ""
+    last = f"\n\n**{history.title}** {numbers(history)}" if history.rows else ""
     return NOTHING + last
 
 

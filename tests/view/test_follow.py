@@ -80,7 +80,9 @@ def block(out, index, **state):
 def test_blocks_of_other_processes(tmp_path):
     (tmp_path / "events.jsonl").write_text("")
     block(tmp_path, 2, status="done", step=40, steps=40)
-    folder = block(tmp_path, 10, status="running", step=1234, steps=5000)
+    folder = block(tmp_path, 10, status="running", step=1234, steps=5000, heard=time.time())
+    block(tmp_path, 11, status="running", heard=time.time() - 1000)
+    (tmp_path / "blocks" / "000-copy").mkdir()
     (tmp_path / "blocks" / "plan.json").write_text("{}")
     assert journals(tmp_path)["block 10"] == folder and set(journals(tmp_path)) == {
         "whole scene",

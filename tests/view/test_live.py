@@ -1,5 +1,6 @@
 """A training that is looked at: it comes to the same bits, can be paused, and outlives whatever fails on the page."""
 
+import json
 import os
 import re
 import signal
@@ -63,23 +64,27 @@ def recipe():
 
 
 class Looking:
-    """Draws everything after every step."""
+    """Draws everything after every step, and takes its time."""
 
     def __init__(self):
-        self.told, self.drawn = [], 0
+        self.told, self.drawn, self.looked = [], 0, 0.0
 
     def begin(self, stage):
-        self.stage = stage
+        self.stage, self.began, self.looked = stage, time.perf_counter(), 0.0
         self.told.append(stage.title)
 
     def look(self, index, psnr):
+        began = time.perf_counter()
         lines = (self.stage.folder / "events.jsonl").read_text().splitlines()
         assert f'"index": {index},' in [line for line in lines if "StepDone" in line][-1], "the journal of this stage"
         for view in (*self.stage.scene.train[:2], *self.stage.scene.held_out[:1]):
             for geometry in (True, False):
                 self.drawn += len(self.stage.draw(view, geometry).present())
+        time.sleep(0.01)
+        self.looked += time.perf_counter() - began
 
     def end(self):
+        self.training = time.perf_counter() - self.began - self.looked
         self.told.append("end")
 
 
@@ -116,6 +121,9 @@ def test_looking_changes_no_bit(data, recipe, tmp_path, capsys, blocks):
     for name in ["pretrain", *["blocks/000/tune", "blocks/001/tune", "refine0"] * blocks]:
         one, other = (checkpoint.load(tmp_path / way / name / "checkpoint.safetensors") for way in ("alone", "watched"))
         assert equal(one, other), name
+    lines = [json.loads(line) for line in (looking.stage.folder / "events.jsonl").read_text().splitlines()]
+    ended = [line["seconds"] for line in lines if line["event"] == "StageEnded"]
+    assert ended[-1] < looking.training + 0.02, "looking does not count"
     clouds = [(tmp_path / way / "point_cloud.ply").read_bytes() for way in ("alone", "watched")]
     assert clouds[0] == clouds[1]
 
