@@ -84,11 +84,8 @@ def test_blocks_of_other_processes(tmp_path):
     block(tmp_path, 11, status="running", heard=time.time() - 1000)
     (tmp_path / "blocks" / "000-copy").mkdir()
     (tmp_path / "blocks" / "plan.json").write_text("{}")
-    assert journals(tmp_path)["block 10"] == folder and set(journals(tmp_path)) == {
-        "whole scene",
-        "block 2",
-        "block 10",
-    }
+    found = journals(tmp_path)
+    assert found["block 10"] == folder and set(found) == {"whole scene", "block 2", "block 10", "block 11"}
     running = running_blocks(tmp_path)
     assert list(running) == [10]
     said = in_words(History(), None, running, Studio())
