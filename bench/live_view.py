@@ -39,9 +39,9 @@ from surfkit.train.progress import Display
 from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
+from surfkit.view.control import Control
 from surfkit.view.live import Live, live_view
 from surfkit.view.server import Address
-from surfkit.view.studio import Studio
 
 WAYS = ("no page", "nobody looks", "somebody looks")
 
@@ -63,7 +63,7 @@ class Turns:
     def look(self, index: int, psnr: float | None) -> None:
         """See `Watcher.look`; the time of a step has what its page does after it."""
         if self.live is not None:
-            self.live.studio.look(index, psnr)
+            self.live.control.look(index, psnr)
         now = time.perf_counter()
         self.wall[self.way][-1].append(now - self.last)
         self.last = now
@@ -84,8 +84,8 @@ class Turns:
         if self.way != "no page":
             self.live = self.use.enter_context(live_view(Address(), self.share))
             self.live.out = self.out
-            self.use.callback(self.live.studio.end)
-            self.live.studio.begin(self.stage)
+            self.use.callback(self.live.control.end)
+            self.live.control.begin(self.stage)
         if self.way == "somebody looks":
             self.use.enter_context(Somebody(self.live))
         time.sleep(0.5)  # so that starting and ending a page are no part of a step
@@ -127,9 +127,9 @@ class Somebody:
 def watching(stage: Watched, steps: int = 20_000) -> float:
     """Seconds of a step that the loop of the training takes for a page without a browser."""
     clock = Stopwatch(StageState(Points.fresh({}, {}), Order(1), torch.Generator()))
-    display, studio = Display("bench", steps), Studio()
+    display, control = Display("bench", steps), Control()
     began = time.perf_counter()
-    with watched_by(studio), watched(stage) as look:
+    with watched_by(control), watched(stage) as look:
         for index in range(steps):
             with clock.stopped(), display.paused():
                 look(index, 20.0)

@@ -5,7 +5,7 @@
             run(recipe, data, out)
 
 Two threads serve the page and do nothing while no browser is connected. One orders pictures, which the training draws
-between two steps (`surfkit.view.studio`); the other reads the journals of the run folder, whoever writes them.
+between two steps (`surfkit.view.control`); the other reads the journals of the run folder, whoever writes them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.train.watch import Watched, watched_by
+from surfkit.view.control import Control
 from surfkit.view.live_page import LivePage, Surroundings
 from surfkit.view.live_panel import LivePanel
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, Served, served
-from surfkit.view.studio import Studio
 
 if TYPE_CHECKING:
     import viser
@@ -43,19 +43,19 @@ class Live:
 
     Attributes:
         url: Of the page, with its token.
-        studio: Draws, and holds the training.
+        control: Draws, and holds the training.
     """
 
     def __init__(self, page: Served, share: float) -> None:
         """Serve; at most a `share` of the time of the training goes into pictures."""
         self.page, self.share, self.url = page, share, page.url
-        self.studio = Studio()
+        self.control = Control()
         self.out: Path | None = None
         self.around: Surroundings | None = None
         self.pages: dict[int, LivePage] = {}
         self.wake = threading.Event()
         self.failed: set[str] = set()
-        self.panel = LivePanel(page.viser.gui, self.studio)
+        self.panel = LivePanel(page.viser.gui, self.control)
         page.viser.on_client_connect(self._connected)
         page.viser.on_client_disconnect(lambda client: self.pages.pop(client.client_id, None))
         actions = {"pictures": self._draw_pictures, "panel": self._tell}
@@ -67,7 +67,7 @@ class Live:
     def following(self, out: Path) -> Iterator[None]:
         """Within, the page shows the run in a folder, and the stages that run in this thread."""
         self.out = out
-        with watched_by(self.studio):
+        with watched_by(self.control):
             yield
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class Live:
             thread.join(CLOSE_S)
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        page = LivePage(self.studio, client, self.wake)
+        page = LivePage(self.control, client, self.wake)
         if self.around is not None:
             page.enter(self.around)
         self.pages[client.client_id] = page
@@ -88,14 +88,14 @@ class Live:
         """Order one picture after the other, and rest after each so that the share is kept."""
         free = 0.0
         while not self.page.closing.is_set():
-            now, stage, pages = time.monotonic(), self.studio.stage, list(self.pages.values())
+            now, stage, pages = time.monotonic(), self.control.stage, list(self.pages.values())
             if pages and stage is not None:
                 self._carefully("pictures", lambda stage=stage: self._enter(stage))
             due = [page for page in pages if page.wants(now)] if stage is not None else []
-            if due and (now >= free or self.studio.paused):
-                page, spent = min(due, key=lambda page: page.drawn), self.studio.spent
+            if due and (now >= free or self.control.paused):
+                page, spent = min(due, key=lambda page: page.drawn), self.control.spent
                 self._carefully("pictures", page.draw)
-                took = self.studio.spent - spent + time.perf_counter() - page.received  # not the wait for the step
+                took = self.control.spent - spent + time.perf_counter() - page.received  # not the wait for the step
                 free = time.monotonic() + rest(took, self.share)
                 continue
             self.wake.wait(CHECK_S if pages else None)

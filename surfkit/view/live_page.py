@@ -17,12 +17,12 @@ from surfkit.render.frames import view_of
 from surfkit.render.path import beside, middle_of, up_of
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene, View
+from surfkit.view.control import Control
 from surfkit.view.layers import TRAINED, frustum_lines, typical_size
 from surfkit.view.photographs import TURNING
 from surfkit.view.picking import corners_of, hit_camera
 from surfkit.view.pictures import picture
 from surfkit.view.screen import WORLD, pose_of, ray_of, stand_at, telling, whole_view
-from surfkit.view.studio import Studio
 
 if TYPE_CHECKING:
     import viser
@@ -83,9 +83,9 @@ class LivePage:
         received: When the training had drawn it, or had been asked in vain, seconds of `time.perf_counter`.
     """
 
-    def __init__(self, studio: Studio, client: viser.ClientHandle, wake: threading.Event) -> None:
+    def __init__(self, control: Control, client: viser.ClientHandle, wake: threading.Event) -> None:
         """Build the panel; `wake` is set when a picture is wanted."""
-        self.studio, self.client, self.wake = studio, client, wake
+        self.control, self.client, self.wake = control, client, wake
         self.around: Surroundings | None = None
         self.dirty, self.index, self.drawn, self.received = True, -1, 0.0, 0.0
         self.photo: tuple[tuple[str, int], np.ndarray] | None = None
@@ -122,7 +122,7 @@ class LivePage:
         """Whether it is time for another picture: one has moved, or steps were made meanwhile."""
         if self.around is None:
             return False
-        return self.dirty or (self.index != self.studio.index and now - self.drawn >= REFRESH_S)
+        return self.dirty or (self.index != self.control.index and now - self.drawn >= REFRESH_S)
 
     def draw(self) -> None:
         """Have the picture drawn, and show it.
@@ -130,7 +130,7 @@ class LivePage:
         Raises:
             BadInput: There is no stage to draw, or it draws no such maps.
         """
-        self.dirty, self.index, self.received = False, self.studio.index, time.perf_counter()
+        self.dirty, self.index, self.received = False, self.control.index, time.perf_counter()
         try:
             self._draw()
         except BadInput as error:
@@ -148,7 +148,7 @@ class LivePage:
         camera = self._camera() if chosen is None else chosen.camera.fitted(int(self.longest.value))
         view = replace(chosen, camera=camera) if chosen is not None else view_of(camera)
         try:
-            drawing = self.studio.draw(view, kind != "render")
+            drawing = self.control.draw(view, kind != "render")
         finally:
             self.received = time.perf_counter()
         image, told = picture(view, kind, lambda _: drawing.maps, around.scene.frame)

@@ -12,8 +12,8 @@ from PIL import Image
 
 from surfkit.execute.state import BlockState
 from surfkit.train.watch import Watched
+from surfkit.view.control import Control
 from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
-from surfkit.view.studio import Studio
 
 if TYPE_CHECKING:
     import viser
@@ -35,9 +35,9 @@ NOTHING = "No step is made at the moment, so that there is no live picture, and 
 class LivePanel:
     """Parts of the panel that are the same in every browser."""
 
-    def __init__(self, gui: viser.GuiApi, studio: Studio) -> None:
+    def __init__(self, gui: viser.GuiApi, control: Control) -> None:
         """Build them."""
-        self.gui, self.studio = gui, studio
+        self.gui, self.control = gui, control
         self.followers: dict[Path, Follower] = {}
         self.drawn: Path | None = None
         self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
@@ -55,9 +55,9 @@ class LivePanel:
 
     def show(self, out: Path | None) -> None:
         """Bring everything up to date with a run folder, and with the stage that runs in this process."""
-        stage = self.studio.stage
+        stage = self.control.stage
         set_if_other(self.button, "visible", stage is not None)
-        set_if_other(self.button, "label", "go on" if self.studio.paused else "pause")
+        set_if_other(self.button, "label", "go on" if self.control.paused else "pause")
         if out is None:
             return
         found, running = journals(out), running_blocks(out)
@@ -70,14 +70,14 @@ class LivePanel:
         fresh = {folder for folder, follower in self.followers.items() if follower.read()}
         if (chosen in fresh or chosen != self.drawn) and self.followers[chosen].history.rows:
             self._draw_curves(chosen)
-        set_if_other(self.status, "content", in_words(self.followers[now].history, stage, running, self.studio))
+        set_if_other(self.status, "content", in_words(self.followers[now].history, stage, running, self.control))
         self._show_written(out)
 
     def _draw_curves(self, folder: Path) -> None:
         history, self.drawn = self.followers[folder].history, folder
         losses = history.losses()
         self._chart(0, "loss", losses.pop("step"), losses)
-        rows = {"training": list(self.studio.psnrs[folder]), "held-out": history.held_out}
+        rows = {"training": list(self.control.psnrs[folder]), "held-out": history.held_out}
         for place, (what, each) in enumerate(rows.items(), start=1):
             title = f"PSNR of {what} views, dB"
             if each:
@@ -121,14 +121,14 @@ class LivePanel:
         self.written.visible = True
 
     def _toggle(self) -> None:
-        self.studio.pause(not self.studio.paused)
-        set_if_other(self.button, "label", "go on" if self.studio.paused else "pause")
+        self.control.pause(not self.control.paused)
+        set_if_other(self.button, "label", "go on" if self.control.paused else "pause")
 
 
-def in_words(history: History, stage: Watched | None, running: dict[int, BlockState], studio: Studio) -> str:
+def in_words(history: History, stage: Watched | None, running: dict[int, BlockState], control: Control) -> str:
     """How far a run is, in Markdown."""
     if stage is not None:
-        return f"**{stage.title}** {numbers(history)}{PAUSED if studio.paused else ''}"
+        return f"**{stage.title}** {numbers(history)}{PAUSED if control.paused else ''}"
     if running:
         rows = [f"- block {at}: step {state.step:,} of {state.steps:,}" for at, state in running.items()]
         return "\n".join([f"{ELSEWHERE}\n", *rows])

@@ -10,9 +10,9 @@ from surfkit.core.codec import dump
 from surfkit.core.events import Measured, StageBegan, StepDone, emit
 from surfkit.execute.state import BlockState, state_path
 from surfkit.run.journal import record_events
+from surfkit.view.control import Control
 from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
 from surfkit.view.live_panel import ALONE, ELSEWHERE, NOTHING, in_words
-from surfkit.view.studio import Studio
 
 
 def step(index, **losses):
@@ -88,21 +88,21 @@ def test_blocks_of_other_processes(tmp_path):
     assert found["block 10"] == folder and set(found) == {"whole scene", "block 2", "block 10", "block 11"}
     running = running_blocks(tmp_path)
     assert list(running) == [10]
-    said = in_words(History(), None, running, Studio())
+    said = in_words(History(), None, running, Control())
     assert said.startswith(ELSEWHERE) and "block 10: step 1,234 of 5,000" in said
     state_path(folder).write_text("{")
     assert not running_blocks(tmp_path)
-    assert in_words(History(), None, {}, Studio()) == NOTHING
+    assert in_words(History(), None, {}, Control()) == NOTHING
 
 
 def test_a_method_that_makes_its_own_steps():
     history = History("field", 10, 0, [time.time()], [(7, {"sdf": 0.5})])
-    said = in_words(history, None, {}, Studio())
+    said = in_words(history, None, {}, Control())
     assert said == f"**field** step 7 of 10, loss 0.5000\n\n{ALONE}"
     history.times[-1] -= 1000
-    assert in_words(history, None, {}, Studio()).startswith(NOTHING)
+    assert in_words(history, None, {}, Control()).startswith(NOTHING)
     history.times[-1], history.steps = time.time(), 7
-    assert in_words(history, None, {}, Studio()).startswith(NOTHING)
+    assert in_words(history, None, {}, Control()).startswith(NOTHING)
 
 
 def test_the_last_pictures(tmp_path):

@@ -36,11 +36,11 @@ from surfkit.train.state import StageState
 from surfkit.train.views import Order
 from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 from surfkit.view import live
+from surfkit.view.control import Control
 from surfkit.view.live import live_view, rest
 from surfkit.view.live_page import Surroundings, framed
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, listen
-from surfkit.view.studio import Studio
 
 STEPS = 24
 QUIET = Intervals(checkpoint=10, pictures=0)
@@ -159,8 +159,8 @@ def test_time_in_which_the_clock_is_stopped_does_not_count():
 class Training:
     """Steps in a thread, each of which takes a while; pictures are one colour, that of the number of the step."""
 
-    def __init__(self, studio, scene, folder, step_s=0.002, draw_s=0.0):
-        self.studio, self.step_s, self.draw_s = studio, step_s, draw_s
+    def __init__(self, control, scene, folder, step_s=0.002, draw_s=0.0):
+        self.control, self.step_s, self.draw_s = control, step_s, draw_s
         self.stage = Watched("pretrain", folder, scene, self.draw, lambda: self.stopping)
         self.stopping, self.index, self.drawn, self.over, self.error = False, 0, [], threading.Event(), None
         self.thread = threading.Thread(target=self.run)
@@ -171,12 +171,12 @@ class Training:
 
     def __exit__(self, *_):
         self.over.set()
-        self.studio.pause(False)
+        self.control.pause(False)
         self.thread.join(10)
         assert not self.thread.is_alive()
 
     def run(self):
-        with watched_by(self.studio), watched(self.stage) as look:
+        with watched_by(self.control), watched(self.stage) as look:
             while not self.over.is_set():
                 time.sleep(self.step_s)
                 self.index += 1
@@ -194,45 +194,45 @@ class Training:
 
 
 def test_what_is_ordered_is_drawn_between_two_steps(scene, tmp_path):
-    studio, view = Studio(), scene.train[0]
+    control, view = Control(), scene.train[0]
     with pytest.raises(BadInput, match="no step is being made"):
-        studio.draw(view, True)
-    with Training(studio, scene, tmp_path) as training:
-        made = [studio.draw(view, geometry) for geometry in (True, False)]
+        control.draw(view, True)
+    with Training(control, scene, tmp_path) as training:
+        made = [control.draw(view, geometry) for geometry in (True, False)]
         assert [each.index for each in made] == [index for index, _, _ in training.drawn]
         assert [geometry for _, _, geometry in training.drawn] == [True, False]
         assert float(made[0].maps.color[0, 0, 0]) == pytest.approx(made[0].index % 100 / 100)
         training.error = MemoryError("none left")
         with pytest.raises(MemoryError):
-            studio.draw(view, True)
+            control.draw(view, True)
         before = training.index
         time.sleep(0.1)
         assert training.index > before, "the training goes on"
-    assert studio.stage is None
+    assert control.stage is None
 
 
 def test_an_order_that_comes_too_late_is_given_back(scene, tmp_path):
-    studio = Studio()
-    studio.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
-    threading.Timer(0.1, studio.end).start()
+    control = Control()
+    control.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
+    threading.Timer(0.1, control.end).start()
     with pytest.raises(BadInput, match="no step is being made"):
-        studio.draw(scene.train[0], True)
+        control.draw(scene.train[0], True)
 
 
 def test_a_pause_holds_the_training_and_pictures_go_on(scene, tmp_path, capsys):
-    studio = Studio()
-    with Training(studio, scene, tmp_path) as training:
+    control = Control()
+    with Training(control, scene, tmp_path) as training:
         time.sleep(0.05)
-        studio.pause(True)
+        control.pause(True)
         time.sleep(0.1)
         at = training.index
-        assert studio.draw(scene.train[0], False).index == at
+        assert control.draw(scene.train[0], False).index == at
         time.sleep(0.1)
         assert training.index == at
-        studio.pause(False)
+        control.pause(False)
         time.sleep(0.1)
         assert training.index > at
-        studio.pause(True)
+        control.pause(True)
         time.sleep(0.1)
         at, training.stopping = training.index, True
         time.sleep(0.3)
@@ -242,17 +242,17 @@ def test_a_pause_holds_the_training_and_pictures_go_on(scene, tmp_path, capsys):
 
 
 def test_psnr_of_steps_that_are_made_again(scene, tmp_path):
-    studio = Studio()
-    studio.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
+    control = Control()
+    control.begin(Watched("pretrain", tmp_path, scene, None, lambda: False))
     for index, value in ((10, 20.0), (20, 21.0), (25, 1.0), (30, 22.0), (20, 23.0)):
-        studio.look(index, value)
-    studio.look(30, None)
-    assert studio.psnrs[tmp_path] == [(10, 20.0), (20, 23.0)]
+        control.look(index, value)
+    control.look(30, None)
+    assert control.psnrs[tmp_path] == [(10, 20.0), (20, 23.0)]
 
 
 def test_while_nobody_looks_nothing_is_drawn(scene, tmp_path):
     needs("viser")
-    with live_view(Address(), 0.5) as page, Training(page.studio, scene, tmp_path) as training:
+    with live_view(Address(), 0.5) as page, Training(page.control, scene, tmp_path) as training:
         time.sleep(0.5)
         assert not training.drawn and training.index > 50
         browser = Browser(page.url)
@@ -271,7 +271,7 @@ def test_while_nobody_looks_nothing_is_drawn(scene, tmp_path):
 def test_pictures_take_their_share_of_the_time(scene, tmp_path, share, error):
     needs("viser")
     draw_s = 0.05
-    with live_view(Address(), share) as page, Training(page.studio, scene, tmp_path, 0.001, draw_s) as training:
+    with live_view(Address(), share) as page, Training(page.control, scene, tmp_path, 0.001, draw_s) as training:
         browser = Browser(page.url)
         browser.wait_for(backgrounds)
         browser.set("pixels", 160)
@@ -295,7 +295,7 @@ def backgrounds(browser):
 
 def test_a_page_of_a_training(scene, tmp_path):
     needs("viser")
-    with live_view(Address(), 1.0) as page, Training(page.studio, scene, tmp_path) as training:
+    with live_view(Address(), 1.0) as page, Training(page.control, scene, tmp_path) as training:
         browser = Browser(page.url)
         browser.wait_for(backgrounds)
         browser.wait_for(lambda b: any("After step" in text and "drawn by surfkit" in text for text in b.texts()))

@@ -42,7 +42,7 @@ class Order:
     made: Future[Drawing] = field(default_factory=Future)
 
 
-class Studio:
+class Control:
     """Draws in the thread of the training what a page orders from another thread; one picture between two steps.
 
     While nobody orders anything, it costs a step some comparisons.
