@@ -5,7 +5,8 @@
 
 textured.glb, as trimesh reads it, and mesh.ply of the run are drawn into each held-out view, four samples a pixel, and
 compared with the photograph where both are there. A mesh of as many triangles as the textured one, with the mean
-colours of the vertices, is the third. Writes bench/results/texture.json, and pictures with --pictures FOLDER.
+colours of the vertices, is the third. Writes bench/results/texture.json with --keep, and pictures with --pictures
+FOLDER.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from machine import save
 from PIL import Image
 
 from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.maps.photographs import between
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.mesh.simplify import simplify_to
@@ -40,7 +42,7 @@ class Drawn:
 
     def __init__(self, mesh: Mesh, camera: Camera) -> None:
         fine = camera.resized(FINE * camera.width, FINE * camera.height)
-        places = project(mesh, fine)
+        places = project(mesh.vertices, fine)
         _, self.face = draw_faces(places, mesh.faces, fine.width, fine.height)
         self.there = self.face >= 0
         self.corners = mesh.faces[self.face[self.there]]
@@ -72,15 +74,13 @@ class Textured:
         scene = trimesh.load(path, process=False)
         vertices, faces, self.uv, self.page, self.images, start = [], [], [], [], [], 0
         for node in scene.graph.nodes_geometry:
-            matrix, name = scene.graph[node]
-            piece = scene.geometry[name]
+            piece = scene.geometry[scene.graph[node][1]]  # as it is in the file, not turned to y up
             vertices.append(piece.vertices)
             faces.append(piece.faces + start)
             start += len(piece.vertices)
             self.uv.append(piece.visual.uv)
             self.page.append(np.full(len(piece.faces), len(self.images)))
             self.images.append(np.asarray(piece.visual.material.baseColorTexture.convert("RGB")))
-        del matrix  # from the file to y up: the file has the axes of the data set
         xyz = np.concatenate(vertices) + np.array(frame.shift)
         self.mesh = Mesh(frame.to_local(xyz).astype(np.float32), np.concatenate(faces).astype(np.int32))
         self.uv, self.page = np.concatenate(self.uv), np.concatenate(self.page)
@@ -92,21 +92,10 @@ class Textured:
         color = np.zeros((len(uv), 3))
         for number, image in enumerate(self.images):
             some = page == number
-            color[some] = sampled(image, uv[some])
+            height, width = image.shape[:2]
+            x, y = uv[some, 0] * width, (1 - uv[some, 1]) * height  # trimesh counts v from below
+            color[some] = between(image.transpose(2, 0, 1), x, y)
         return drawn.picture(color)
-
-
-def sampled(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """(n, 3) colours between the four nearest texels; trimesh counts v from below."""
-    height, width = image.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    p, q = (x - left)[:, None], (y - top)[:, None]
-
-    def at(i: int, j: int) -> np.ndarray:
-        return image[(top + i).clip(0, height - 1), (left + j).clip(0, width - 1)].astype(np.float64)
-
-    return (1 - q) * ((1 - p) * at(0, 0) + p * at(0, 1)) + q * ((1 - p) * at(1, 0) + p * at(1, 1))
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
@@ -117,16 +106,9 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 def gradient(picture: np.ndarray, where: np.ndarray) -> float:
     """Mean absolute difference of the grey of neighbouring pixels, a measure of sharpness."""
     grey = picture.mean(2)
-    return float(
-        np.mean(
-            [
-                np.abs(np.diff(grey, axis=i))[
-                    where[1:, :] & where[:-1, :] if i == 0 else where[:, 1:] & where[:, :-1]
-                ].mean()
-                for i in (0, 1)
-            ]
-        )
-    )
+    down = np.abs(np.diff(grey, axis=0))[where[1:] & where[:-1]]
+    across = np.abs(np.diff(grey, axis=1))[where[:, 1:] & where[:, :-1]]
+    return float((down.mean() + across.mean()) / 2)
 
 
 def main() -> None:

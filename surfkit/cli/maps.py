@@ -13,11 +13,12 @@ from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.surface import Surface, read_surface
-from surfkit.maps.make import RECORD, MapSettings, Subject, make_maps
+from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
+from surfkit.texture.make import Subject
 from surfkit.train.bars import bars
 
 
@@ -87,7 +88,7 @@ def mesh_of(path: Path) -> Surface:
     """The mesh in a file; BadInput for a cloud of points."""
     found = read_surface(path)
     if found.faces is None:
-        raise BadInput(f"{path}: a cloud of points; maps are drawn of a mesh")
+        raise BadInput(f"{path}: a cloud of points; name a mesh")
     return found
 
 

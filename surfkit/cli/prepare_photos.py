@@ -14,8 +14,8 @@ from surfkit.core.codec import load, read_json
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.run.notes import collect_notes
-from surfkit.sfm.prepare import PICTURE, REPORT, WORK, Preparation
-from surfkit.sfm.settings import Settings
+from surfkit.sfm.prepare import PICTURE, Preparation
+from surfkit.sfm.settings import REPORT, WORK, Settings
 from surfkit.train.bars import bars
 
 SHOWN = 10

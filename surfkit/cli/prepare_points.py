@@ -16,8 +16,8 @@ from surfkit.core.lock import locked
 from surfkit.readers.data import Data
 from surfkit.readers.read import reader_of
 from surfkit.run.notes import collect_notes
-from surfkit.sfm.settings import Settings
-from surfkit.sfm.tie_points import WORK, TiePoints
+from surfkit.sfm.settings import WORK, Settings
+from surfkit.sfm.tie_points import TiePoints
 from surfkit.train.bars import bars
 
 

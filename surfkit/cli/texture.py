@@ -12,6 +12,7 @@ from surfkit.cli.evaluate import refuse_no_mesh
 from surfkit.cli.maps import mesh_of
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
+from surfkit.mesh.simplify import require_simplification
 from surfkit.pipeline import opened
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
@@ -52,6 +53,7 @@ class TextureOf:
 
     def run(self) -> None:
         """Make the textured mesh, and print what it is."""
+        require_simplification("simplifying a mesh")
         budget = cache_bytes(self.memory, "--memory")
         run = opened(self.run_folder)
         refuse_no_mesh(run)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +18,7 @@ from surfkit.cli.prepare_photos import Photos, settings_of
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
+from surfkit.core.events import say
 from surfkit.core.registry import choice
 from surfkit.execute.base import Executor, Inline
 from surfkit.pipeline import run, with_steps
@@ -28,11 +30,14 @@ from surfkit.report.tensorboard import tensorboard
 from surfkit.run.folder import Run
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
 from surfkit.train.material import CacheSettings
+from surfkit.view.server import LOCAL, Address, refuse_wrong_port
 
 EXAMPLE = Path(surfkit.__file__).parents[1] / "examples" / "boruszyn"
 
 BLOCKS_ONLY = re.compile(r"--(tune\.|assign\.|min-views|context)|(tune\.|assign:)")
 """Arguments that apply to blocks only."""
+VIEW_ONLY = re.compile(r"--view[-_](host|port|share)")
+"""Arguments that apply to the page only."""
 
 
 def named_recipe() -> str:
@@ -87,6 +92,21 @@ class Train:
     """Also write losses, points, memory and held-out PSNR for TensorBoard, to tensorboard/ in the run folder, with one
     subfolder for each block and each refinement."""
 
+    view: bool = False
+    """Serve a page on this machine while the run goes on: a live picture, losses and PSNR, and a button that pauses.
+    Its address, which is printed, ends in a random token. Needs `pip install 'surfkit[view]'`."""
+
+    view_host: str = LOCAL
+    """Address to serve the page at. 0.0.0.0 lets other machines connect, if they have the token; nothing is
+    encrypted."""
+
+    view_port: int | None = None
+    """Port to serve the page at. Default: the first free one from 8080 on."""
+
+    view_share: float = 0.3
+    """Share of the time that live pictures may take, above 0 and at most 1. They are drawn between two steps, and only
+    while a browser shows the page. They do not change the result."""
+
     cache: str = "auto"
     """Memory for photographs, masks and depth priors, such as 4GB or 500MB; auto is half of the free memory. It does
     not change the result. When the run is out of memory, it is lowered automatically."""
@@ -123,6 +143,7 @@ class Train:
             raise BadInput(f"--checkpoint-every {self.checkpoint_every}: give 1 or more steps")
         if self.pictures_every is not None and self.pictures_every < 0:
             raise BadInput(f"--pictures-every {self.pictures_every}: give 0 (none) or more steps")
+        self._refuse_wrong_view()
         if self.recipe.partition is None and (idle := [word for word in ARGV.get() if BLOCKS_ONLY.match(word)]):
             raise BadInput(
                 f"{idle[0]}: the recipe does not divide the scene into blocks, so this has no effect; add "
@@ -131,12 +152,35 @@ class Train:
         if not self.folder:  # the words of the command line are only known while it is parsed
             object.__setattr__(self, "folder", named_recipe())
 
+    def _refuse_wrong_view(self) -> None:
+        refuse_wrong_port(self.view_port, "--view-port")
+        if not 0 < self.view_share <= 1:
+            raise BadInput(f"--view-share {self.view_share:g}: give a share above 0, and at most 1")
+        if not self.view and (idle := [word for word in ARGV.get() if VIEW_ONLY.match(word)]):
+            raise BadInput(f"{idle[0]}: there is no page without --view, so this has no effect; add --view")
+
     def run(self) -> None:
         """Train, and print the results."""
+        if not self.view:
+            self._train()
+            return
+        from surfkit.view.live import live_view  # half a second of imports
+
+        address = Address(self.view_host, self.view_port, "--view-")
+        with live_view(address, self.view_share) as live:
+            say(f"--view: the run is shown at {live.url}")
+            if not address.is_local:
+                say("--view: whoever has this address can look and pause; what is sent is not encrypted")
+            try:
+                self._train(live.following)
+            finally:
+                say("--view: the page ends with the run")
+
+    def _train(self, following: Callable[[Path], AbstractContextManager[None]] = nullcontext) -> None:
         data = self.reading.of(self._with_cameras(self._data()))
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
-        with tensorboard(out) if self.tensorboard else nullcontext():
+        with following(out), tensorboard(out) if self.tensorboard else nullcontext():
             intervals = Intervals(self.checkpoint_every, self.pictures_every)
             caches = CacheSettings(
                 self.cache, self.resized_copies, None if self.no_prepare else self.prepare_cache, self.gpu_cache

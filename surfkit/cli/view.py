@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,11 +12,12 @@ from surfkit.core.check import BadInput
 from surfkit.raster.select import Device
 from surfkit.run.notes import collect_notes
 from surfkit.view.page import show
-from surfkit.view.server import LOCAL, Address, require_viser, served
+from surfkit.view.server import LOCAL, Address, refuse_wrong_port, require_viser, served
 from surfkit.view.shelf import MOST, Form
 from surfkit.view.subject import opened_subject
 
-PORTS = range(1, 65536)
+AWAKE_S = 0.2
+"""The main thread looks this often for a Ctrl-C that the system handed to another thread, which does not wake it."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ class View:
     """Device for rendering: auto, cpu, cuda, cuda:1, or a rasterizer by its name (`surfkit components rasterizer`)."""
 
     def __post_init__(self) -> None:
-        if self.port is not None and self.port not in PORTS:
-            raise BadInput(f"--port {self.port}: give {PORTS[0]} to {PORTS[-1]}")
+        refuse_wrong_port(self.port, "--port")
         if self.most < 1:
             raise BadInput(f"--most {self.most}: give 1 or more")
         if self.out is not None and self.out.is_file():
@@ -82,7 +81,8 @@ class View:
                 if self.open:
                     page.open_browser()
                 try:
-                    threading.Event().wait()
+                    while not page.closing.wait(AWAKE_S):
+                        pass
                 except KeyboardInterrupt:
                     print("\nended")
 

@@ -215,9 +215,10 @@ def _split(gathered: Gathered) -> list[Finding]:
     if shots and train == shots:
         text = "no photograph is kept from training, so the quality cannot be measured; see --test-every"
         found.append(Finding("note", "no-held-out", text))
-    if shots and not len(gathered.capture.xyz) and not gathered.findings:
-        text = f"there are no sparse points: training would start from {RANDOM_POINTS:,} random ones; triangulate some"
-        found.append(Finding("warning", "no-points", text))
+    wrong = any(finding.level == "error" for finding in gathered.findings)
+    if shots and not len(gathered.capture.xyz) and not wrong:
+        text = f"there are no sparse points: training would start from {RANDOM_POINTS:,} random ones"
+        found.append(Finding("warning", "no-points", f"{text}; `surfkit prepare points` triangulates some"))
     return found
 
 

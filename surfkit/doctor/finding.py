@@ -41,7 +41,7 @@ def from_errors(what: str, errors: Iterable[BadInput], level: Level = "error") -
     for error in errors:
         text = " ".join(str(error).split())
         groups.setdefault(_VARYING.sub("*", text), []).append(text)
-    return [_told(level, what, texts) for texts in groups.values()]
+    return [_told(level, what, list(dict.fromkeys(texts))) for texts in groups.values()]
 
 
 def of_each(what: str, faults: Mapping[str, str], cure: str = "", level: Level = "error") -> list[Finding]:

@@ -25,13 +25,13 @@ from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
+from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
-from surfkit.scene.scene import Frame, View
+from surfkit.scene.scene import Frame
 from surfkit.texture.keep import Kept, identity, seen
-from surfkit.texture.make import Subject as Textures
-from surfkit.texture.make import TextureSettings, textured
+from surfkit.texture.make import Subject, TextureSettings, textured
 from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
@@ -85,6 +85,8 @@ class MapSettings:
 
     def __post_init__(self) -> None:
         cache_bytes(self.memory, "--memory")
+        if self.colors == "photographs" and "orthophoto" not in self.products:
+            raise BadInput("--colors photographs: --products leaves the orthophoto out; add it, or leave --colors out")
         for name in ("gsd", "interval", "spacing"):
             value = getattr(self, name)
             if value != "auto" and not 0 < value < float("inf"):
@@ -105,21 +107,8 @@ class MapSettings:
             for package in ("rasterio", *PACKAGES.get(name, ())):
                 with needed(package, "surfkit maps" if package == "rasterio" else f"--products {name}"):
                     __import__(package)
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What maps are drawn of.
-
-    Attributes:
-        surface: The mesh, in the frame of the input.
-        frame: Of the data set.
-        views: Training views.
-    """
-
-    surface: Surface
-    frame: Frame
-    views: Sequence[View] = ()
+        if self.colors == "photographs":
+            require_simplification("simplifying a mesh")
 
 
 def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface | None = None) -> dict[str, Any]:
@@ -139,17 +128,8 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     frame, surface = subject.frame, subject.surface
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
-    units = frame.metres or 1.0
-
-    def length(value: Length, automatic: float) -> float:
-        return automatic if value == "auto" else value / units
-
-    gsd = ground_sampling_distance(surface, subject.views, frame) if settings.gsd == "auto" else settings.gsd / units
-    grid = Grid.around(map_axes(up.direction), gsd, settings.bounds or bounds_of(surface, map_axes(up.direction)))
-    done = settings.names
-    if "orthophoto" in done and settings.colors == "mesh" and not has_colors(surface):
-        emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
-        done = tuple(name for name in done if name != "orthophoto")
+    grid = grid_of(subject, settings, map_axes(up.direction))
+    done = drawable(surface, settings)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
@@ -169,7 +149,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "up": up.source,
             "axes": grid.turn.tolist(),
             "metres_per_unit": frame.metres,
-            "gsd": gsd,
+            "gsd": grid.gsd,
             "bounds": list(grid.bounds),
             "size": [grid.width, grid.height],
             "covered": round(drawn.covered / (grid.width * grid.height), 6),
@@ -177,14 +157,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         }
         if "orthophoto" in done and settings.colors == "photographs":
             record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
-        if "hillshade" in done:
-            sheet.once([FILES["hillshade"]], lambda: shade(sheet, settings.tile))
-        if "contours" in done:
-            interval = length(settings.interval, even_interval(drawn.lowest, drawn.highest))
-            record["contours"] = sheet.once([FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
-        if "points" in done:
-            spacing = length(settings.spacing, gsd)
-            record["points"] = sheet.once([FILES["points"]], lambda: scatter(surface, sheet, spacing))
+        record |= draw_products(subject, settings, sheet, drawn, done)
         if other is not None:
             record["difference"] = subtract(sheet, other, settings.tile, frame)
         record["files"] = files
@@ -198,8 +171,7 @@ def draw(subject: Subject, settings: MapSettings, sheet: Sheet, files: Sequence[
     photographs, colored = None, FILES["orthophoto"] in files
     if colored and settings.colors == "photographs":
         texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
-        textures = Textures(subject.surface, subject.frame, subject.views)
-        made = textured(textures, TextureSettings(texel=texel), budget, Kept(sheet.folder))
+        made = textured(subject, TextureSettings(texel=texel), budget, Kept(sheet.folder))
         photographs = FromPhotographs(made, subject.frame, sheet, settings.tile)
     if (sheet.out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
         (sheet.out / RECORD).unlink()
@@ -207,6 +179,42 @@ def draw(subject: Subject, settings: MapSettings, sheet: Sheet, files: Sequence[
             (sheet.out / name).unlink(missing_ok=True)
     colors = FILES["orthophoto"] if colored else None
     return draw_surface(subject.surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
+
+
+def grid_of(subject: Subject, settings: MapSettings, turn: np.ndarray) -> Grid:
+    """The cells of the maps; `turn` is (3, 3), from the frame of the input to east, north and up."""
+    frame, surface = subject.frame, subject.surface
+    if settings.gsd == "auto":
+        gsd = ground_sampling_distance(surface, subject.views, frame)
+    else:
+        gsd = settings.gsd / (frame.metres or 1.0)
+    return Grid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+
+
+def drawable(surface: Surface, settings: MapSettings) -> tuple[str, ...]:
+    """Names of the products, but for an orthophoto that would have no colours, which a warning tells."""
+    if "orthophoto" not in settings.names or settings.colors == "photographs" or has_colors(surface):
+        return settings.names
+    emit(Warned(f"{surface.path}: its vertices have no colours, so there is no orthophoto"))
+    return tuple(name for name in settings.names if name != "orthophoto")
+
+
+def draw_products(
+    subject: Subject, settings: MapSettings, sheet: Sheet, drawn: Drawn, done: Sequence[str]
+) -> dict[str, Any]:
+    """Draw what follows from the surface model, and return what maps.json says of it."""
+    record: dict[str, Any] = {}
+    units = subject.frame.metres or 1.0
+    if "hillshade" in done:
+        sheet.once([FILES["hillshade"]], lambda: shade(sheet, settings.tile))
+    if "contours" in done:
+        given = settings.interval
+        interval = even_interval(drawn.lowest, drawn.highest) if given == "auto" else given / units
+        record["contours"] = sheet.once([FILES["contours"]], lambda: trace(sheet, interval, settings.tile))
+    if "points" in done:
+        spacing = sheet.grid.gsd if settings.spacing == "auto" else settings.spacing / units
+        record["points"] = sheet.once([FILES["points"]], lambda: scatter(subject.surface, sheet, spacing))
+    return record
 
 
 def shade(sheet: Sheet, side: int) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from surfkit.maps.bins import corners_of, sort_faces
 from surfkit.maps.geotiff import Sheet
 from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
 from surfkit.scene.scene import Frame
-from surfkit.texture.candidates import NONE as UNSEEN
 from surfkit.texture.deliver import Textured
+from surfkit.texture.photographs import by_photograph
 
 NEAR = 3.0
 """Cells of height by which the textured mesh, which is simplified, may differ from the surface model, to be what is
@@ -51,16 +51,13 @@ class FromPhotographs:
             near = np.abs(ours.height - buffer.height) <= NEAR * self.bins.grid.gsd
         cells = np.flatnonzero(near & (ours.face != NONE) & (buffer.face != NONE))
         face = ours.face.reshape(-1)[cells]
-        view = self.paint.atlas.view[face]
-        order = np.argsort(view, kind="stable")
-        order = order[view[order] != UNSEEN]
-        numbers, starts = np.unique(view[order], return_index=True)
-        self.paint.photos.expect(numbers)
-        for number, some in zip(numbers, np.split(order, starts[1:]), strict=True):
+        parts = by_photograph(self.paint.atlas.view[face])
+        self.paint.photos.expect([number for number, _ in parts])
+        for number, some in parts:
             for at in range(0, len(some), CELLS):
                 rows = some[at : at + CELLS]
-                image.reshape(4, -1)[:3, cells[rows]] = self._colors(int(number), buffer, cells[rows], face[rows]).T
-        return len(order)
+                image.reshape(4, -1)[:3, cells[rows]] = self._colors(number, buffer, cells[rows], face[rows]).T
+        return sum(len(some) for _, some in parts)
 
     def _colors(self, number: int, buffer: ZBuffer, cells: np.ndarray, face: np.ndarray) -> np.ndarray:
         """(n, 3) uint8 colours of cells in a photograph, between its pixels."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -20,7 +21,7 @@ class Report:
         not_finite: Triangles dropped because of a vertex that is not finite.
         degenerate: Triangles dropped that have no area.
         cropped: Triangles outside the crop.
-        clusters: Connected parts before the small ones were dropped.
+        clusters: Groups of triangles before the small ones were dropped; see `clusters`.
         clusters_kept: Those that stayed.
         clustered: Triangles dropped with small clusters.
         triangles: Left.
@@ -49,7 +50,9 @@ Inside = Callable[[np.ndarray], np.ndarray]
 """Which of (M, 3) local positions lie in a crop."""
 
 
-def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_edges: int = 0) -> tuple[Mesh, Report]:
+def clean(
+    mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_edges: int = 0, gap: float = 0.0
+) -> tuple[Mesh, Report]:
     """The mesh without what is no surface, and what was left out.
 
     Args:
@@ -58,6 +61,7 @@ def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_
         least: Triangles that a cluster must have to stay; if none has, the largest stays.
         inside: The crop; a triangle stays if its middle does.
         hole_edges: Holes of up to so many edges are filled.
+        gap: See `clusters`.
 
     Raises:
         BadInput: Nothing is left.
@@ -74,7 +78,7 @@ def clean(mesh: Mesh, most: int, least: int, inside: Inside | None = None, hole_
     if not len(mesh.faces):
         what = "all lie outside the crop: is it in the frame of the input?" if cropped else "none is whole"
         raise BadInput(f"no triangle of the mesh is left: {what}")
-    labels, sizes = clusters(mesh)
+    labels, sizes = clusters(mesh, gap)
     large = _large(sizes, most, least)
     mesh, clustered = _keep(mesh, large[labels])
     mesh, closed = close_holes(_referenced(mesh), hole_edges)
@@ -89,17 +93,42 @@ def _large(sizes: np.ndarray, most: int, least: int) -> np.ndarray:
     return sizes >= min(bound, ranked[0])
 
 
-def clusters(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(F,) number of the connected part of each triangle, and (C,) triangles of each part; a shared vertex connects."""
+def clusters(mesh: Mesh, gap: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) number of the cluster of each triangle, and (C,) triangles of each cluster; a shared vertex connects.
+
+    Args:
+        mesh: Any.
+        gap: Also what lies in touching cells of a grid connects, in median lengths of an edge: a wall that few views
+            see at an angle comes in pieces with gaps of a voxel, which are no loose parts. 0 has no grid.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    a = np.concatenate([mesh.faces[:, 0], mesh.faces[:, 1]])
-    b = np.concatenate([mesh.faces[:, 1], mesh.faces[:, 2]])
-    links = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(len(mesh.vertices),) * 2)
+    node, near = _cells(mesh, gap) if gap else (np.arange(len(mesh.vertices)), np.zeros((0, 2), np.int64))
+    a, b, c = node[mesh.faces.T]
+    ends = np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), near])
+    links = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(int(node.max()) + 1,) * 2)
     _, parts = connected_components(links, directed=False)
-    _, labels, sizes = np.unique(parts[mesh.faces[:, 0]], return_inverse=True, return_counts=True)
+    _, labels, sizes = np.unique(parts[a], return_inverse=True, return_counts=True)
     return labels, sizes
+
+
+def _cells(mesh: Mesh, gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) number of the cell of each vertex, and (L, 2) the pairs of cells in use that touch."""
+    places = mesh.vertices.astype(np.float64)
+    places -= places.min(0)
+    edge = np.median(np.linalg.norm(places[mesh.faces[:, 0]] - places[mesh.faces[:, 1]], axis=1))
+    side = max(gap * edge, places.max() / 2**20)  # so that the numbers of cells fit 64 bits
+    cells = (places / side).astype(np.int64) + 1
+    _, rows, columns = cells.max(0) + 2  # none beyond touches one at the other end
+    used, node = np.unique((cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2], return_inverse=True)
+    near = []
+    for x, y, z in product((-1, 0, 1), repeat=3):
+        if (step := (x * rows + y) * columns + z) > 0:
+            at = np.minimum(np.searchsorted(used, used + step), len(used) - 1)
+            found = np.flatnonzero(used[at] == used + step)
+            near.append(np.stack([found, at[found]], 1))
+    return node, np.concatenate(near)
 
 
 def boundaries(mesh: Mesh) -> tuple[int, float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.readers.camera_files import MOST
 from surfkit.readers.capture import camera_of
 
 SAMPLES = 41
@@ -18,8 +19,6 @@ QUIET_PX, MOST_PX = 0.1, 0.5
 """Differences between both that are not told of, and the largest that is accepted, pixels."""
 WIDEST = 10.0
 """Rays farther than this from the axis, as x / z, are not looked at."""
-MOST = 1e30
-"""Numbers beyond it are a mistake."""
 
 
 @dataclass(frozen=True)

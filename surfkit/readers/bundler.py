@@ -15,8 +15,10 @@ import numpy as np
 from surfkit.core.check import BadInput, leaving_out
 from surfkit.readers.base import Reader
 from surfkit.readers.camera_files import (
+    MOST,
     groups_of,
     leave_out,
+    one_file,
     photographs,
     pose_at,
     read_text,
@@ -28,6 +30,8 @@ from surfkit.scene.photos import photo_size
 
 PLACES = ("bundle.out", "bundle/bundle.out")
 """Where Bundler writes its file; other programs call it NAME.bundle.out."""
+HEAD, MOST_HEAD = "# Bundle file v0.3", 1000
+"""How the file begins, and bytes of its first line at most."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From Bundler's cameras (x right, y up, z backward) to x right, y down, z forward."""
 
@@ -80,13 +84,7 @@ class _Bundle:
     @classmethod
     def read(cls, data: Data) -> _Bundle:
         """The files of a data set, or BadInput."""
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            raise BadInput(
-                f"{data.path}: " + (f"several bundle files: {names}; leave one" if files else "no bundle.out")
-            )
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "bundle.out; copy it there, with list.txt")
         values = _values(path)
         cameras, points = (_count(path, value, len(values)) for value in values[:2])
         begin = 2 + 15 * cameras
@@ -94,7 +92,7 @@ class _Bundle:
             raise BadInput(f"{path}: cut off: numbers of {(len(values) - 2) // 15} of {cameras} cameras are there")
         names = _names(path, cameras)
         table, starts, counts = _points(path, values, begin, points)
-        good = np.isfinite(table).all(1) & (np.abs(table) < 1e30).all(1)
+        good = (np.abs(table) < MOST).all(1)
         kept = np.cumsum(good) - 1
         rows = np.repeat(np.where(good, kept, -1), counts)
         inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -144,18 +142,17 @@ def _files(root: Path) -> list[Path]:
 
 def _values(path: Path) -> np.ndarray:
     """All numbers of a bundle file."""
-    text = read_text(path)
-    head, _, body = text.partition("\n")
-    if not head.startswith("# Bundle file v0.3"):
-        raise BadInput(f"{path}: begins with {head[:40]!r}, not with '# Bundle file v0.3', the version that is read")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        try:
-            values = np.fromstring(body, np.float64, sep=" ")
-        except (ValueError, DeprecationWarning) as error:
-            raise BadInput(
-                f"{path}: something that is no number lies among the numbers; copy the file whole"
-            ) from error
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("error")
+            head = file.readline(MOST_HEAD).decode("utf-8-sig", "replace")
+            values = np.fromfile(file, np.float64, sep=" ") if head.startswith(HEAD) else np.empty(0)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, DeprecationWarning) as error:
+        raise BadInput(f"{path}: something that is no number lies among the numbers; copy the file whole") from error
+    if not head.startswith(HEAD):
+        raise BadInput(f"{path}: begins with {head.strip()[:40]!r}, not with {HEAD!r}, the version that is read")
     if len(values) < 2:
         raise BadInput(f"{path}: cut off after the first line; copy it whole")
     return values

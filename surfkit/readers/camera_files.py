@@ -1,9 +1,10 @@
-"""What readers of cameras of other programs share: numbers in text, poses, and the photographs that they name."""
+"""What readers of cameras of other programs share: the file, numbers in text, poses, and photographs by their names."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,22 +23,54 @@ TURNED = 1e-3
 """Most that the entries of a rotation times its transpose are off those of the identity."""
 
 
+def one_file(root: Path, files: Sequence[Path], lacking: str) -> Path:
+    """The only one of the files of cameras in a folder.
+
+    Args:
+        root: The folder, for messages.
+        files: Those that were found.
+        lacking: What is missing if there are none, and how to get it.
+
+    Raises:
+        BadInput: There are none, or several.
+    """
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise BadInput(f"{root}: several files of cameras: {few([path.name for path in files])}; leave one")
+    raise BadInput(f"{root}: no {lacking}")
+
+
 def numbers(where: str, text: str | Sequence[str], count: int) -> np.ndarray:
     """(count,) float64 from words, or BadInput that names `where` they come from."""
     words = text.split() if isinstance(text, str) else text
+    wanted = "a finite number belongs" if count == 1 else f"{count} finite numbers belong"
     try:
         values = np.array([float(word) for word in words], np.float64)
     except (ValueError, TypeError) as error:
-        raise BadInput(f"{where}: {shorten(text)}, where {count} numbers belong") from error
+        raise BadInput(f"{where}: {shorten(text)}, where {wanted}") from error
     if len(values) != count or not (np.abs(values) < MOST).all():
-        raise BadInput(f"{where}: {shorten(text)}, where {count} finite numbers belong")
+        raise BadInput(f"{where}: {shorten(text)}, where {wanted}")
     return values
 
 
 def read_text(path: Path) -> str:
     """What a text file says, or BadInput."""
-    try:
+    with _readable(path):
         return path.read_text(encoding="utf-8-sig")
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """The lines of a text file that may be larger than the memory, or BadInput."""
+    with _readable(path), path.open(encoding="utf-8-sig") as file:
+        yield from file
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """BadInput for a text file that cannot be read."""
+    try:
+        yield
     except OSError as error:
         raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -19,7 +19,7 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import leave_out, numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import leave_out, numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.geocentric import place_of
@@ -42,28 +42,24 @@ class Metashape(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"several files of cameras: {names}; leave one" if files else "no XML file of Metashape's cameras"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "XML file of Metashape's cameras; export them as Agisoft XML")
         chunk = _chunk(path)
         cameras = _cameras(path, chunk)
         found = photographs(data, [camera.get("label", "") for camera in cameras])
         sensors = {sensor.get("id"): sensor for sensor in chunk.findall("sensors/sensor")}
-        lenses, known, shots = Lenses(path), {}, []
-        for camera in cameras:
-            label = camera.get("label", "")
-            if label not in found:
-                continue
+        lenses, known = Lenses(path), {}
+        for number in dict.fromkeys(camera.get("sensor_id") for camera in cameras):
             with leaving_out():
-                number = camera.get("sensor_id")
-                if number not in known:
-                    known[number] = _lens(f"{path}: sensor {number}", sensors.get(number))
-                lens = lenses.camera(f"{path}: sensor {number}", known[number])
-                shots.append(Shot(label, _pose(f"{path}: camera {label!r}", camera), lens, found[label]))
+                where = f"{path}: sensor {number}"
+                known[number] = lenses.camera(where, _lens(where, sensors.get(number)))
         lenses.tell()
+        shots = []
+        for camera in cameras:
+            label, number = camera.get("label", ""), camera.get("sensor_id")
+            if label in found and number in known:
+                with leaving_out():
+                    pose = _pose(f"{path}: camera {label!r}", camera)
+                    shots.append(Shot(label, pose, known[number], found[label]))
         return _placed(path, chunk, cameras[0].get("component_id"), Capture(shots, *points(data.path, {})))
 
 

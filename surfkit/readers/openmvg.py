@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.codec import read_json
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown
-from surfkit.readers.camera_files import groups_of, leave_out, numbers, photographs, pose_at, tracks_of
+from surfkit.readers.camera_files import MOST, groups_of, leave_out, numbers, photographs, pose_at, tracks_of
 from surfkit.readers.capture import Capture, Shot, Tracks, shorten
 from surfkit.readers.data import Data
 
@@ -138,13 +138,12 @@ class _File:
             pixels = np.array([sight[2:] for sight in sights], np.float64).reshape(-1, 2) + CENTRE
         except DAMAGED as error:
             raise _damaged(self.path, error) from error
-        good = (np.abs(xyz) < 1e30).all(1)
+        good = (np.abs(xyz) < MOST).all(1)
         kept = np.where(good, np.cumsum(good) - 1, -1)
-        listed: dict[str, list[int]] = {}
-        for at, sight in enumerate(sights):
-            if good[sight[0]] and np.isfinite(pixels[at]).all():
-                listed.setdefault(sight[1], []).append(at)
         rows = np.array([sight[0] for sight in sights], np.int64)
+        listed: dict[str, list[int]] = {}
+        for at in np.flatnonzero(good[rows] & np.isfinite(pixels).all(1)).tolist():
+            listed.setdefault(sights[at][1], []).append(at)
         return xyz[good], {name: (kept[rows[at]], pixels[at]) for name, at in listed.items()}
 
     def _lenses(self) -> dict[Any, Any]:
@@ -192,4 +191,5 @@ def _camera(where: str, kind: str, values: Mapping[str, Any]) -> Any:
 
 
 def _damaged(path: Path, error: Exception) -> BadInput:
-    return BadInput(f"{path}: damaged, or not of OpenMVG: {type(error).__name__} {shorten(str(error))}")
+    said = f"{type(error).__name__} {shorten(str(error))}"
+    return BadInput(f"{path}: damaged, or not of OpenMVG: {said}; convert the result again with ConvertSfM_DataFormat")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
-from surfkit.readers.camera_files import read_text, tracks_of
+from surfkit.readers.camera_files import MOST, read_lines, tracks_of
 from surfkit.readers.capture import Capture, Shot, Tracks, camera_of
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
@@ -75,7 +76,7 @@ def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise BadInput(f"{path}: damaged, or not of OpenSfM: {type(error).__name__} {error}") from error
-    good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
+    good = (np.abs(xyz) < MOST).all(1) & np.isfinite(rgb).all(1)
     rows = {number: row for row, number in enumerate(number for number, fine in zip(listed, good, strict=True) if fine)}
     capture = Capture(shots, xyz[good], rgb[good].astype(np.uint8))
     return _on_earth(capture, data.path, path.parent, model), rows, path.parent
@@ -88,20 +89,20 @@ def _seen(path: Path, capture: Capture, rows: Mapping[str, int]) -> dict[str, tu
     shares of the longer side.
     """
     sizes = {shot.name: (shot.camera.width, shot.camera.height) for shot in capture.shots}
-    seen: dict[str, tuple[list[int], list[tuple[str, str]]]] = {name: ([], []) for name in sizes}
-    for line in read_text(path).splitlines():
+    seen = {name: (array("q"), array("d")) for name in sizes}
+    for line in read_lines(path):  # there are thousands for each photograph
         words = line.split("\t", 5)
         if len(words) > 4 and words[0] in seen and words[1] in rows:
             seen[words[0]][0].append(rows[words[1]])
-            seen[words[0]][1].append((words[3], words[4]))
+            try:
+                seen[words[0]][1].extend((float(words[3]), float(words[4])))
+            except ValueError as error:
+                raise BadInput(
+                    f"{path}: a place in {words[0]!r} is no number; run OpenSfM again, or delete the file"
+                ) from error
     found = {}
     for name, (at, places) in seen.items():
-        try:
-            shares = np.array(places, np.float64).reshape(-1, 2)
-        except ValueError as error:
-            raise BadInput(
-                f"{path}: a place in {name!r} is no number; run OpenSfM again, or delete the file"
-            ) from error
+        shares = np.array(places, np.float64).reshape(-1, 2)
         good = np.isfinite(shares).all(1)
         pixels = shares * max(sizes[name]) + np.array(sizes[name]) / 2
         found[name] = (np.array(at, np.int64)[good], pixels[good])

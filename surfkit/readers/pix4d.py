@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.transforms import points
@@ -53,12 +53,7 @@ class Pix4D(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"cameras of several projects: {names}; leave one" if files else f"no file *{CAMERAS}"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), f"file *{CAMERAS}; copy 1_initial/params of the project there")
         project = path.name.removesuffix(CAMERAS)
         cameras = _cameras(path)
         offset = _offset(path, project, cameras)
@@ -161,13 +156,13 @@ def _offset(path: Path, project: str, cameras: list[_Camera]) -> np.ndarray:
         for line in read_text(full).splitlines()[1:]:
             words = line.rsplit(maxsplit=6)
             if len(words) == 7:
-                placed[words[0]] = numbers(f"{full}: {words[0]}", words[1:4], 3)
+                placed[words[0].replace("\\", "/")] = numbers(f"{full}: {words[0]}", words[1:4], 3)
         offsets = [placed[camera.name] - camera.centre for camera in cameras if camera.name in placed]
         if offsets:
             middle = np.median(offsets, axis=0)
             if np.abs(offsets - middle).max() > APART:
                 raise BadInput(f"{full}: its positions are not those of {path.name} and one offset; export both again")
-            return np.round(middle)
+            return np.round(middle, 3)
     emit(Warned(f"{path}: no {own.name} beside it: coordinates are those of the file, which may lack an offset"))
     return np.zeros(3)
 

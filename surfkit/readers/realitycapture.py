@@ -9,16 +9,17 @@ roll right wing down.
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from surfkit.core.check import BadInput, leaving_out
+from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import numbers, photographs, pose_at, read_text
+from surfkit.readers.camera_files import numbers, one_file, photographs, pose_at, read_text
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.transforms import points
@@ -28,6 +29,8 @@ FILM_MM = 36.0
 COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 NEWER = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 """What RealityScan calls columns of RealityCapture."""
+FLAT = 0.02
+"""Of the range of heights: a smaller range of x and y is probably one of degrees."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
 
@@ -40,12 +43,7 @@ class RealityCapture(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        files = _files(data.path)
-        if len(files) != 1:
-            names = ", ".join(file.name for file in files)
-            what = f"several files of cameras: {names}; leave one" if files else "no CSV file of camera parameters"
-            raise BadInput(f"{data.path}: {what}")
-        path = files[0]
+        path = one_file(data.path, _files(data.path), "CSV file of 'Internal/External camera parameters'; export it")
         rows = _rows(path)
         found = photographs(data, [row["name"] for row in rows])
         shots: list[Shot] = []
@@ -55,6 +53,7 @@ class RealityCapture(Reader):
                 with leaving_out():
                     shots.append(_shot(path, row, found[row["name"]], lenses))
         lenses.tell()
+        _tell_degrees(path, shots)
         return Capture(shots, *points(data.path, {}))
 
 
@@ -112,6 +111,21 @@ def _shot(path: Path, row: Mapping[str, str], photo: Path, lenses: Lenses) -> Sh
     axes = _turn(2, -value["heading"]) @ _turn(0, value["pitch"]) @ _turn(1, value["roll"])  # camera to world
     place = np.array([value["x"], value["y"], value["alt"]])
     return Shot(row["name"], pose_at(where, FLIP @ axes.T, place), lens, photo)
+
+
+def _tell_degrees(path: Path, shots: Sequence[Shot]) -> None:
+    """A warning if positions look like longitudes and latitudes: the file does not say what they are."""
+    if len(shots) < 2:
+        return
+    centres = np.stack([-shot.pose[:3, :3].T @ shot.pose[:3, 3] for shot in shots])
+    east, north, up = np.ptp(centres, axis=0)
+    if (np.abs(centres[:, :2]) <= (180, 90)).all() and max(east, north) < FLAT * up:
+        emit(
+            Warned(
+                f"{path}: x and y differ by {max(east, north):.2g} and heights by {up:.2g}: if these are degrees, "
+                "export in a projected or a local coordinate system"
+            )
+        )
 
 
 def _turn(axis: int, degrees: float) -> np.ndarray:

@@ -55,16 +55,16 @@ def parse_wkt(where: str, text: str) -> Node:
     Raises:
         BadInput: It is none; names `where` it comes from.
     """
-    tokens, at = [], 0
-    while text[at:].strip():
+    tokens, at, text = [], 0, text.rstrip()
+    while at < len(text):
         found = TOKEN.match(text, at)
         if found is None:
-            raise BadInput(f"{where}: no coordinate reference system: {text[at : at + 40]!r} in its text")
+            raise _damaged(where, f"{text[at : at + 40]!r} in its text")
         tokens.append(found)
         at = found.end()
     node, used = _node(where, tokens, 0, 0)
     if used != len(tokens):
-        raise BadInput(f"{where}: no coordinate reference system: something follows its last bracket")
+        raise _damaged(where, "something follows its last bracket")
     return node
 
 
@@ -72,7 +72,7 @@ def _node(where: str, tokens: list[re.Match[str]], at: int, depth: int) -> tuple
     """The node that begins at a token, and the token after it."""
     opens = [token[4] for token in tokens[at + 1 : at + 2]]
     if at >= len(tokens) or tokens[at][2] is None or opens not in (["["], ["("]) or depth > NESTED:
-        raise BadInput(f"{where}: no coordinate reference system as well-known text")
+        raise _damaged(where, "no well-known text")
     values: list[str] = []
     children: list[Node] = []
     here = at + 2
@@ -88,4 +88,8 @@ def _node(where: str, tokens: list[re.Match[str]], at: int, depth: int) -> tuple
         else:
             values.append(next(part for part in token.groups() if part is not None))
             here += 1
-    raise BadInput(f"{where}: the text of the coordinate reference system is cut off")
+    raise _damaged(where, "its text is cut off")
+
+
+def _damaged(where: str, why: str) -> BadInput:
+    return BadInput(f"{where}: no coordinate reference system: {why}; export it again")

@@ -39,7 +39,7 @@ SURFACE = Recipe(
     ),
     # Depth that other views confirm is averaged over less: neither side of a wall takes from the other. Splats begin
     # two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface.
-    mesh=TSDF(truncation_voxels=2.5, least_views=0.1, largest_px=32.0, trust=Agreement(alone=0.1)),
+    mesh=TSDF(truncation_voxels=2.5, least_views=0.1, largest_px=64.0, trust=Agreement(alone=0.1)),
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference.

@@ -58,6 +58,11 @@ class RunStage:
         return self.out / self.name
 
     @property
+    def journal(self) -> Path:
+        """Folder of its journal: refinements count their steps anew, and have their own."""
+        return self.out if self.refine is None else self.folder
+
+    @property
     def checkpoint(self) -> Path:
         """The state of the optimisation."""
         return self.folder / "checkpoint.safetensors"

@@ -85,6 +85,11 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [line for _, line in _lines(path)]
 
 
+def lines(part: bytes) -> list[dict[str, Any]]:
+    """The same of a part of a journal."""
+    return [line for _, line in _parsed(part.decode("utf-8", "replace"))]
+
+
 def remove_steps(path: Path, first: int) -> None:
     """Remove the events of step `first` and of all later ones, and incomplete lines."""
     if not path.exists():
@@ -97,10 +102,12 @@ def remove_steps(path: Path, first: int) -> None:
 
 
 def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    if not path.exists():
-        return []
+    return _parsed(path.read_text(encoding="utf-8", errors="replace")) if path.exists() else []
+
+
+def _parsed(journal: str) -> list[tuple[str, dict[str, Any]]]:
     found = []
-    for text in path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True):
+    for text in journal.splitlines(keepends=True):
         try:
             line = from_json(text)
         except BadInput:

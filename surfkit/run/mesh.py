@@ -57,6 +57,10 @@ class MeshOutput:
     least_triangles: int = 50
     """Also drop clusters of connected triangles with fewer triangles than this."""
 
+    cluster_gap: float = 3.0
+    """Clusters with a gap of about this many median edge lengths count as one: thin walls come in pieces. 0: only
+    triangles that share vertices."""
+
     hole_edges: int = 0
     """Fill holes of up to this many edges; 0 leaves all open."""
 
@@ -71,6 +75,8 @@ class MeshOutput:
         for name in ("clusters", "least_triangles"):
             if getattr(self, name) < 1:
                 raise BadInput(f"--{name.replace('_', '-')} {getattr(self, name)}: give 1 or more")
+        if not 0 <= self.cluster_gap <= 100:
+            raise BadInput(f"--cluster-gap {self.cluster_gap:g}: give 0 to 100")
         if not 0 <= self.hole_edges <= 1000:
             raise BadInput(f"--hole-edges {self.hole_edges}: give 0 to 1000")
         if wrong := [share for share in self.lods if not 0 < share < 1]:
@@ -164,7 +170,8 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
     facts = plain_facts(maker_of(run, mesher), raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))
-    mesh, report = clean(raw, delivery.clusters, delivery.least_triangles, inside, delivery.hole_edges)
+    least = delivery.clusters, delivery.least_triangles
+    mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
     del raw
     delete_meshes(run)
     written = list(write_files(run, mesh, delivery, subject))

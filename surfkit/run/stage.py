@@ -18,11 +18,11 @@ from surfkit.evaluate.images.measure import Draw
 from surfkit.evaluate.images.progress_pictures import ProgressPictures
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Points
-from surfkit.raster.api import Rasterizer
+from surfkit.raster.api import Maps, Rasterizer
 from surfkit.raster.select import Device, select
 from surfkit.run.folder import Run, RunStage
 from surfkit.scene.memory import free_bytes
-from surfkit.scene.scene import Scene
+from surfkit.scene.scene import Scene, View
 from surfkit.start.base import InitialModel
 from surfkit.train import checkpoint
 from surfkit.train.faults import MOST_HALVINGS, Diverged, NotFinite, is_out_of_memory, out_of_memory
@@ -33,6 +33,7 @@ from surfkit.train.progress import Display
 from surfkit.train.sparing import lowered
 from surfkit.train.stage import Trainer
 from surfkit.train.state import StageState
+from surfkit.train.watch import Stopwatch, Watched, watched
 
 CHECKPOINT_EVERY = 500
 WATCH_EVERY = 10
@@ -176,8 +177,13 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
     at, intervals, meter = job.stage, job.intervals, job.meter
     steps, seconds = trainer.stage.steps, state.seconds
     emit(StageBegan(at.name, steps, len(state.points), state.index + 1, at.block))
-    with graceful() as request, Display(at.title, steps) as display:
-        for done in trainer.run(state):
+    clock, draw = Stopwatch(state), live_drawing(job, trainer, state)
+    with (
+        graceful() as request,
+        Display(at.title, steps) as display,
+        watched(Watched(at.title, at.journal, job.scene, draw, lambda: request.asked)) as look,
+    ):
+        for done in trainer.run(state, clock):
             display.show(done)
             meter.step(state, job.given, trainer.uploads)
             if done.index % WATCH_EVERY == 0 and (free := free_bytes()) < LEAST_FREE:
@@ -190,6 +196,9 @@ def take_steps(job: StageJob, trainer: Trainer, state: StageState, along: Progre
                 save(at, state, meter)
             if is_over:
                 break
+            if look is not None:
+                with clock.stopped(), display.paused():
+                    look(done.index, display.psnr.value if display.psnr.count else None)
     if request.asked:
         say(f"stopped after step {state.index} of {steps}; the same command goes on from there")
         raise KeyboardInterrupt
@@ -252,6 +261,18 @@ def drawing(stage: RunStage, state: StageState, rasterizer: Rasterizer, geometry
     splats, near = stage.primitive.activate(stage.stage.finished(state), state.sh_degree), stage.stage.near
     draws = drawn_by(stage.primitive, rasterizer)
     return lambda view: draws.render(splats, view.camera, near, geometry).maps
+
+
+def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable[[View, bool], Maps]:
+    """A function that renders the points of a stage as they are when it is called, with those that are frozen."""
+    at = job.stage
+
+    def draw(view: View, geometry: bool) -> Maps:
+        with job.meter.adding("pictures"):
+            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), state.sh_degree))
+            return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
+
+    return draw
 
 
 def select_rasterizer(device: Device) -> tuple[Rasterizer, str]:

@@ -22,7 +22,7 @@ SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
 def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The file of each name that has one, by name; one note lists all that are spelt otherwise.
 
-    Another spelling counts when it fits one file only and no other name.
+    Another spelling counts when it fits one file only and no other name. A name without an ending is no other spelling.
     """
     found = {name: path for name in names if (path := folder / name.replace("\\", "/")).is_file()}
     lost = [name for name in names if name not in found]
@@ -35,9 +35,11 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
         wanted = _groups({name: spelling(PurePosixPath(name.replace("\\", "/"))) for name in lost})
         pairs = {same[0]: files[key][0] for key, same in wanted.items() if len(same) == 1 == len(files.get(key, ()))}
         found |= pairs
+        used = set(pairs.values())
         lost = [name for name in lost if name not in pairs]
-        spare = [path for path in spare if path not in pairs.values()]
-    _warn(folder, {name: path for name, path in found.items() if path not in taken})
+        spare = [path for path in spare if path not in used]
+    otherwise = {name: path for name, path in found.items() if path not in taken}
+    _warn(folder, {name: path for name, path in otherwise.items() if path != folder / f"{name}{path.suffix}"})
     return found
 
 

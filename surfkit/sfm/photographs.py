@@ -13,11 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput, few
+from surfkit.core.codec import read_json
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.scene.names import PICTURES
 from surfkit.scene.photos import open_picture, photo_size, read_draft
 from surfkit.sfm.exif import Exif, read_exif
 
+PHOTOGRAPHS = "photographs.json"
+"""File of what was found."""
 OTHER = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
 """Photographs that Pillow does not decode."""
 DRAFT_PX = 512
@@ -80,16 +83,29 @@ def look(folder: Path, known: Sequence[Photo] = ()) -> list[Photo]:
         emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
     if not paths:
         raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
+    return look_at(folder, paths, known)
+
+
+def look_at(folder: Path, paths: Sequence[Path], known: Sequence[Photo] = ()) -> list[Photo]:
+    """Some photographs below a folder, in the order of `paths`; `known` as for `look`."""
     before = {photo.name: photo for photo in known}
     found = []
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
         for photo in pool.map(lambda path: _look_unless_known(folder, path, before), paths):
             found.append(photo)
             emit(Progress("looking at photographs", len(found), len(paths)))
-    return mark_copies(found)
+    return _mark_copies(found)
 
 
-def mark_copies(photos: Sequence[Photo]) -> list[Photo]:
+def known_photographs(record: Path) -> Sequence[Photo]:
+    """What an earlier call found and was kept in a file; none where there is none that can be read."""
+    try:
+        return read_json(record, tuple[Photo, ...])
+    except BadInput:
+        return ()
+
+
+def _mark_copies(photos: Sequence[Photo]) -> list[Photo]:
     """The photographs, of which copies of one before them are marked as such."""
     first: dict[str, str] = {}
     marked = []
@@ -97,11 +113,6 @@ def mark_copies(photos: Sequence[Photo]) -> list[Photo]:
         same = first.setdefault(photo.pixels, photo.name) if photo.usable else photo.name
         marked.append(photo if same == photo.name else replace(photo, problem=f"a copy of {same}"))
     return marked
-
-
-def is_copy(photo: Photo) -> bool:
-    """Whether a photograph is left out as a copy of another of its folder."""
-    return (photo.problem or "").startswith("a copy of")
 
 
 def is_blurred(photo: Photo, photos: Sequence[Photo]) -> bool:
@@ -127,7 +138,8 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     stamp = (stat.st_size, stat.st_mtime_ns)
     before = known.get(name)
     if before is not None and before.stamp == stamp:
-        return replace(before, problem=None) if is_copy(before) else before
+        copy = (before.problem or "").startswith("a copy of")
+        return replace(before, problem=None) if copy else before
     try:
         return _look(path, Photo(name, stamp))
     except BadInput as error:

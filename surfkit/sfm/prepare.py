@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput, few
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.stages import Stages, key_of
 from surfkit.readers.georeference import Similarity
@@ -24,13 +24,11 @@ from surfkit.sfm.ground_control import Control, Ground, place_by_points, read_gr
 from surfkit.sfm.level import turn_upright, up_direction
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import matched
-from surfkit.sfm.photographs import Photo, look
+from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look
 from surfkit.sfm.report import draw, model_facts, reasons
-from surfkit.sfm.settings import Settings
+from surfkit.sfm.settings import REPORT, WORK, Settings
 
-WORK = "prepare"
-"""Folder of the scene for what the stages keep."""
-REPORT, PICTURE = "report.json", "cameras.png"
+PICTURE = "cameras.png"
 
 
 @dataclass(frozen=True)
@@ -78,12 +76,8 @@ class Preparation:
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
     def _look(self) -> list[Photo]:
-        path = self.work / "photographs.json"
-        try:
-            known = read_json(path, tuple[Photo, ...])
-        except BadInput:
-            known = ()
-        photos = look(self.root, known)
+        path = self.work / PHOTOGRAPHS
+        photos = look(self.root, known_photographs(path))
         write_json(path, photos)
         return photos
 

@@ -1,4 +1,4 @@
-"""How cameras are found."""
+"""How cameras and points are found, and where in the data set what led to them is kept."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from surfkit.core.check import BadInput, require_within
+
+WORK, REPORT = "prepare", "report.json"
+"""Folder of the data set for what the stages keep, and what is told of it at the end."""
 
 
 @dataclass(frozen=True)

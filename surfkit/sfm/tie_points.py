@@ -6,8 +6,8 @@ What comes out is a COLMAP model of the same cameras, in the same coordinates, w
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -15,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from surfkit.core.check import BadInput, few
-from surfkit.core.codec import read_json, write_json
+from surfkit.core.codec import write_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing_folder
 from surfkit.core.stages import Stages, key_of
@@ -30,13 +30,11 @@ from surfkit.scene.scene import Frame
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine, run
+from surfkit.sfm.features import FEWEST
 from surfkit.sfm.mapping import SMALLEST, read_model
-from surfkit.sfm.photographs import Photo, is_copy, look, mark_copies
+from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look_at
 from surfkit.sfm.report import model_facts
-from surfkit.sfm.settings import Settings
-
-WORK, REPORT = "prepare", "report.json"
-"""Folder of the scene for what the stages keep, and what is told of it."""
+from surfkit.sfm.settings import REPORT, WORK, Settings
 
 
 @dataclass(frozen=True)
@@ -66,16 +64,16 @@ class TiePoints:
         """
         load_engine()
         capture = read_capture(self.data, reader_of(self.data))
-        paths = [Path(os.path.abspath(shot.path)) for shot in capture.shots]
-        root = Path(os.path.commonpath([path.parent for path in paths]))
-        shots = {path.relative_to(root).as_posix(): shot for path, shot in zip(paths, capture.shots, strict=True)}
-        self._warn(capture, root)
+        root, shots = _by_path(capture)
+        self._tell_what_is_lost(capture)
         stages = Stages(self.work)
         photos = stages.run("photographs", "", lambda: self._look(root, shots))
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
         found = compare(stages, photos, root, self.work, self.settings, cameras, poses)
+        if poor := [name for name, count in found.counts.items() if count < FEWEST]:
+            emit(Warned(f"{len(poor)} of {len(photos)} photographs have hardly any features: {few(poor)} are left out"))
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])
         models = self.work / "points"
         model = stages.run(
@@ -101,7 +99,7 @@ class TiePoints:
         write_json(self.scene / REPORT, report)
         return report
 
-    def _warn(self, capture: Capture, root: Path) -> None:
+    def _tell_what_is_lost(self, capture: Capture) -> None:
         """Say what of the data set the new one has not."""
         if masks := find_masks(self.data.path, self.data.masks, capture.shots):
             emit(Warned(f"{len(masks)} masks are not taken over: photographs of {self.scene} have other pixels"))
@@ -111,22 +109,17 @@ class TiePoints:
         if capture.metres and capture.crs is None and capture.metres != 1:
             emit(Warned(f"the unit is not taken over: give --metres-per-unit {capture.metres:g} when you train"))
 
-    def _look(self, root: Path, shots: Mapping[str, Shot]) -> list[Photo]:
+    def _look(self, root: Path, names: Iterable[str]) -> list[Photo]:
         """The photographs of the data set that can be used."""
-        path = self.work / "photographs.json"
-        try:
-            known = read_json(path, tuple[Photo, ...])
-        except BadInput:
-            known = ()
-        found = [photo for photo in look(root, known) if photo.name in shots]
-        photos = mark_copies([replace(photo, problem=None) if is_copy(photo) else photo for photo in found])
+        path = self.work / PHOTOGRAPHS
+        photos = look_at(root, [root / name for name in sorted(names)], known_photographs(path))
         write_json(path, photos)
         if wrong := [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]:
             emit(Warned(f"{len(wrong)} of {len(photos)} photographs cannot be used, and are left out: {few(wrong)}"))
         usable = [photo for photo in photos if photo.usable]
         if len(usable) < SMALLEST:
             raise BadInput(
-                f"{root}: {len(usable)} of {len(shots)} photographs can be used; {SMALLEST} or more are needed"
+                f"{root}: {len(usable)} of {len(photos)} photographs can be used; {SMALLEST} or more are needed"
             )
         return usable
 
@@ -150,6 +143,13 @@ class TiePoints:
                 image.name = unquote(image.name)
             made.write_binary(folder / "0")
         return read_model(self.work / "points" / "0")
+
+
+def _by_path(capture: Capture) -> tuple[Path, dict[str, Shot]]:
+    """The folder that all photographs of a data set are in, and what is known of each by its path below that."""
+    paths = [Path(os.path.abspath(shot.path)) for shot in capture.shots]
+    root = Path(os.path.commonpath([path.parent for path in paths]))
+    return root, {path.relative_to(root).as_posix(): shot for path, shot in zip(paths, capture.shots, strict=True)}
 
 
 def _without_points(engine: Any, database: Path, poses: Mapping[str, np.ndarray]) -> Any:

@@ -21,7 +21,7 @@ PAD = 2
 PATCH = 4
 """Side of the square of texels of a triangle without a photograph."""
 PATCHES = 64
-"""Such squares along the side of a chart of them."""
+"""Such squares along the side of a chart of them, at most."""
 FULL = 0.6
 """Share of a page that is estimated to be taken, at most."""
 SMALLEST = 64
@@ -75,12 +75,13 @@ def make_atlas(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: n
 
     Args:
         view: (F,) photograph of each triangle; NONE for none.
-        places: (F, 3, 2) corners in the photograph; changed where there is none.
+        places: (F, 3, 2) corners in the photograph, of triangles no wider or higher than half a `side`: a chart has
+            the middles of its triangles within a quarter, so it fits. Changed where there is no photograph.
         tile: (F,) tile of each triangle.
         beyond: (F, 3) triangles beyond the edges.
         side: A power of two.
     """
-    chart = _charts(view, places, tile, beyond, min(CELL, side // 4))
+    chart = _charts(view, places, tile, beyond, side)
     order = np.argsort(chart, kind="stable")
     first = np.flatnonzero(np.diff(chart[order], prepend=-1))
     low = np.floor(np.minimum.reduceat(places.min(1)[order], first)).astype(np.int64) - PAD
@@ -99,10 +100,10 @@ def make_atlas(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: n
     return Atlas(view, chart, places, tile, page, corner - low, pages)
 
 
-def _charts(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: np.ndarray, cell: int) -> np.ndarray:
+def _charts(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: np.ndarray, side: int) -> np.ndarray:
     """(F,) int32 number of the chart of each triangle; places of those without a photograph are set."""
-    seen = view != NONE
-    grid = np.floor(places.mean(1) / cell).astype(np.int64)
+    seen, patches = view != NONE, min(PATCHES, side // PATCH)
+    grid = np.floor(places.mean(1) / min(CELL, side // 4)).astype(np.int64)
     same = (beyond != NO_FACE) & seen[:, None] & (view[:, None] == view[beyond]) & (tile[:, None] == tile[beyond])
     same &= (grid[:, None] == grid[beyond]).all(2)
     row, edge = np.nonzero(same)
@@ -112,8 +113,8 @@ def _charts(view: np.ndarray, places: np.ndarray, tile: np.ndarray, beyond: np.n
     alone = alone[np.argsort(tile[alone], kind="stable")]
     begins = np.searchsorted(tile[alone], tile[alone])
     within = np.arange(len(alone)) - begins
-    part[alone] = len(view) + (begins + within // PATCHES**2)  # blocks of a tile begin at different numbers
-    row, column = np.divmod(within % PATCHES**2, PATCHES)
+    part[alone] = len(view) + (begins + within // patches**2)  # blocks of a tile begin at different numbers
+    row, column = np.divmod(within % patches**2, patches)
     corner = np.array([[1.5, 1.5], [2.5, 1.5], [1.5, 2.5]])
     places[alone] = PATCH * np.stack([column, row], axis=1)[:, None] + corner
     return np.unique(part, return_inverse=True)[1].astype(np.int32)

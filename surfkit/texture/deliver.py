@@ -94,6 +94,8 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
             write_textured_glb(folder / name, what.mesh, parts, pages, how.pictures, frame.to_file, turn, notes)
             files.append(name)
         except BadInput as error:  # larger than such a file can be: the rest is not to be lost
+            if how.kinds == {"glb"}:
+                raise
             emit(Warned(f"{NAME}.glb is left out: {error}".replace(f"{folder / name}: ", "")))
     if "tiles3d" in how.kinds:
         tiles = Tiles(folder / TILES, frame, level, how.pictures)
@@ -107,7 +109,10 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
 
 
 def painted(what: Paint, kind: Pictures, folder: Path) -> tuple[list[Part], list[Path]]:
-    """The triangles and the file of each page; pages that are in the folder already are not painted again."""
+    """The triangles and the file of each page; pages that are in the folder already are not painted again.
+
+    The photographs are not kept any longer.
+    """
     atlas = what.atlas
     page = atlas.page[atlas.chart]
     order = np.argsort(page, kind="stable")
@@ -120,4 +125,5 @@ def painted(what: Paint, kind: Pictures, folder: Path) -> tuple[list[Part], list
         with replacing(paths[number]) as file:
             file.write(encoded(paint(what, atlas.pages[number], rows[number]), kind))
         emit(Progress("painting pages", done, len(rows)))
+    what.photos.close()
     return [part_of(what.mesh, atlas, number, some) for number, some in enumerate(rows)], paths

@@ -126,22 +126,12 @@ def write_textured_glb(
     Raises:
         BadInput: More than 4 GiB.
     """
-    blocks, primitives, corners = Blocks(), [], []
-    images = []
+    blocks, primitives, images, corners = Blocks(), [], [], []
     for at, (part, page) in enumerate(zip(parts, pages, strict=True)):
         xyz = place(mesh.vertices[part.vertices]).astype("<f4")
-        low, high = xyz.min(0), xyz.max(0)
-        corners += [low, high]
-        count = len(xyz)
-        view = blocks.add(12 * count, xyz.tobytes, target=VERTICES)
-        position = blocks.accessor(view, count, "VEC3", min=low.tolist(), max=high.tolist())
-        view = blocks.add(8 * count, part.uv.astype("<f4").tobytes, target=VERTICES)
-        texcoord = blocks.accessor(view, count, "VEC2")
-        view = blocks.add(4 * part.faces.size, part.faces.astype("<u4").tobytes, target=ELEMENTS)
-        indices = blocks.accessor(view, part.faces.size, "SCALAR", 5125)
+        corners += [xyz.min(0), xyz.max(0)]
+        primitives.append({**_add_part(blocks, xyz, part), "material": at})
         images.append({"bufferView": blocks.add(page.stat().st_size, page.read_bytes), "mimeType": f"image/{kind}"})
-        attributes = {"POSITION": position, "TEXCOORD_0": texcoord}
-        primitives.append({"attributes": attributes, "indices": indices, "material": at})
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     node = {"mesh": 0} | ({} if np.array_equal(turn, np.eye(3)) else {"matrix": matrix.T.ravel().tolist()})
@@ -153,17 +143,31 @@ def write_textured_glb(
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
         "meshes": [{"primitives": primitives}],
-        "materials": [
-            {
-                "pbrMetallicRoughness": {"baseColorTexture": {"index": at}, "metallicFactor": 0, "roughnessFactor": 1},
-                "extensions": {UNLIT: {}},
-                "doubleSided": True,
-            }
-            for at in range(len(parts))
-        ],
+        "materials": [_material(at) for at in range(len(parts))],
         "textures": [{"sampler": 0, "source": at} for at in range(len(parts))],
         "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP}],
         "images": images,
     }
     write_glb(path, document, blocks)
     return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)]).astype(np.float64)
+
+
+def _add_part(blocks: Blocks, xyz: np.ndarray, part: Part) -> dict[str, Any]:
+    """The primitive of a page, with (V, 3) float32 coordinates of its vertices, whose bytes are added to a file."""
+    count = len(xyz)
+    view = blocks.add(xyz.nbytes, xyz.tobytes, target=VERTICES)
+    position = blocks.accessor(view, count, "VEC3", min=xyz.min(0).tolist(), max=xyz.max(0).tolist())
+    view = blocks.add(8 * count, part.uv.astype("<f4").tobytes, target=VERTICES)
+    texcoord = blocks.accessor(view, count, "VEC2")
+    view = blocks.add(4 * part.faces.size, part.faces.astype("<u4").tobytes, target=ELEMENTS)
+    indices = blocks.accessor(view, part.faces.size, "SCALAR", 5125)
+    return {"attributes": {"POSITION": position, "TEXCOORD_0": texcoord}, "indices": indices}
+
+
+def _material(texture: int) -> dict[str, Any]:
+    """Shows a texture as it is, from both sides."""
+    return {
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": texture}, "metallicFactor": 0, "roughnessFactor": 1},
+        "extensions": {UNLIT: {}},
+        "doubleSided": True,
+    }

@@ -15,7 +15,7 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.texture.candidates import NONE
 from surfkit.texture.charts import PATCH, Atlas, Page
 from surfkit.texture.level import Levels
-from surfkit.texture.photographs import Photographs
+from surfkit.texture.photographs import Photographs, by_photograph
 
 Pictures = Literal["jpeg", "png"]
 QUALITY = 92
@@ -64,13 +64,10 @@ def paint(what: Paint, page: Page, faces: np.ndarray) -> np.ndarray:
     owner[(owner >= 0) & ~np.append(seen, False)[owner]] = -1
     views = what.atlas.view[faces]
     texel = np.flatnonzero(owner >= 0)
-    texel = texel[np.argsort(views[owner.reshape(-1)[texel]], kind="stable")]
-    ends = np.searchsorted(views[owner.reshape(-1)[texel]], np.unique(views[seen]), "right")
-    for part in np.split(texel, ends[:-1]) if len(texel) else []:
-        number = int(views[owner.reshape(-1)[part[0]]])
+    for number, rows in by_photograph(views[owner.reshape(-1)[texel]]):
         picture = what.photos(number)
-        for at in range(0, len(part), AT_ONCE):
-            some = part[at : at + AT_ONCE]
+        for at in range(0, len(rows), AT_ONCE):
+            some = texel[rows[at : at + AT_ONCE]]
             image.reshape(-1, 3)[some] = _colors(what, number, picture, faces, corners, owner, some)
     _patch(what, image, owner, faces[~seen], corners[~seen])
     if (owner < 0).any() and (owner >= 0).any():

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import cg
 
 from surfkit.core.events import Progress, emit
 from surfkit.texture.candidates import NONE
-from surfkit.texture.photographs import Photographs
+from surfkit.texture.photographs import Photographs, by_photograph
 from surfkit.texture.topology import NONE as NO_FACE
 
 SAMPLES = 5
@@ -88,11 +88,10 @@ def _seam_colors(
     """(n, 3) float64 mean colours of photographs at the vertices of seams, along the seams; elsewhere 0."""
     sums, weights = np.zeros((count, 3)), np.zeros(count)
     face, edge = seam
-    order = np.argsort(view[face], kind="stable")
-    numbers, starts = np.unique(view[face[order]], return_index=True)
-    photos.expect(numbers)
-    for done, (number, rows) in enumerate(zip(numbers, np.split(order, starts[1:]), strict=True), 1):
-        picture, f, e = photos(int(number)), face[rows], edge[rows]
+    parts = by_photograph(view[face])
+    photos.expect([number for number, _ in parts])
+    for done, (number, rows) in enumerate(parts, 1):
+        picture, f, e = photos(number), face[rows], edge[rows]
         begin, end = places[f, e], places[f, (e + 1) % 3]
         for share in (np.arange(SAMPLES) + 0.5) / SAMPLES:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)
@@ -101,7 +100,7 @@ def _seam_colors(
             for at, weight in ((corner[f, e], 1 - share), (corner[f, (e + 1) % 3], share)):
                 np.add.at(sums, at, weight * shown)
                 np.add.at(weights, at, weight)
-        emit(Progress("comparing colours at seams", done, len(numbers)))
+        emit(Progress("comparing colours at seams", done, len(parts)))
     return sums / np.maximum(weights, 1e-12)[:, None]
 
 

@@ -39,10 +39,10 @@ class Sight:
     color: np.ndarray
 
 
-def project(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """(V, 3) float32 x and y in pixels, and depth, of the vertices; x and y of those behind the camera mean nothing."""
+def project(vertices: np.ndarray, camera: Camera) -> np.ndarray:
+    """(V, 3) float32 x and y in pixels, and depth, of (V, 3) places; x and y mean nothing behind the camera."""
     pose = camera.world_to_camera.numpy()
-    local = mesh.vertices @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
+    local = vertices @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
     z = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.stack([local[:, 0] / z * camera.fx + camera.cx, local[:, 1] / z * camera.fy + camera.cy, z], 1)
@@ -61,7 +61,7 @@ def sight(
         keep: (H, W) bool, false where the photograph is to be ignored; None for all of it.
         longest: Triangles that are wider or higher than this, in pixels, are left out.
     """
-    places = project(mesh, camera)
+    places = project(mesh.vertices, camera)
     depth, _ = draw_faces(places, mesh.faces, camera.width, camera.height)
     if keep is not None:
         depth[~keep] = 0

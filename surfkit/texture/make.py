@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
 from surfkit.core.files import replacing_folder
@@ -27,12 +27,13 @@ from surfkit.scene.scene import Frame, View
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
 from surfkit.texture.choose import choose_views
-from surfkit.texture.deliver import Delivery, Textured, deliver
+from surfkit.texture.deliver import NAME, TILES, Delivery, Textured, deliver
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.keep import Arrays, Kept, identity, seen
 from surfkit.texture.level import Levels, level
 from surfkit.texture.look import project, sight
-from surfkit.texture.photographs import Photographs
+from surfkit.texture.photographs import Photographs, by_photograph
+from surfkit.texture.pieces import Pieces
 from surfkit.texture.regions import Region, divide, middles
 from surfkit.texture.resolution import pixel_sizes
 from surfkit.texture.topology import neighbours, with_short_edges
@@ -47,11 +48,11 @@ LOOKED, PAUSE_S, SHARE = "looked", 20.0, 30.0
 TEXELS = 6.0
 """Texels of a triangle by default, were each photograph to look straight at the surface."""
 LONGEST_PX, LONGEST = 32.0, 4.0
-"""Longer edges are halved: in texels, and in edges of a triangle of mean size."""
+"""Longer edges are halved: in texels, and in edges of a triangle of mean size; and those of a quarter of a page."""
+FINEST = 0.5
+"""Of the median pixel on the surface: smaller texels would show nothing more."""
 LEAST = 100
 """Triangles of a level of detail."""
-ROOM = 16
-"""Texels that a triangle on a page must leave free along each side."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class TextureSettings:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is textured.
+    """What is textured, or drawn on maps.
 
     Attributes:
         surface: The mesh, in the frame of the input.
@@ -103,7 +104,7 @@ class Subject:
 
     surface: Surface
     frame: Frame
-    views: Sequence[View]
+    views: Sequence[View] = ()
 
 
 def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_bytes: int) -> dict[str, Any]:
@@ -118,11 +119,10 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
 
     Raises:
         BadInput: A package is missing, or no photograph shows the mesh.
-        OSError: The folder holds other files.
+        OSError: There is a file, or a folder that holds other files.
     """
     began = time.perf_counter()
-    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).is_file():
-        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
+    refuse_foreign(out)
     work, frame = out.with_name(f"{out.name}{WORK}"), subject.frame
     key = key_of(
         settings, own_version(), identity(subject.surface), seen(subject.views), frame.crs, frame.metres, frame.scale,
@@ -184,8 +184,11 @@ def textured(
         raise BadInput(f"{surface.path}: no photograph shows any of it, so it has no texture")
     texel, views = float(np.nanmedian(sizes)), subject.views
     if settings.texel != "auto":
-        texel = settings.texel / (frame.metres or 1.0)
-        views = reduced(views, sizes, texel)
+        wanted = settings.texel / (frame.metres or 1.0)
+        if wanted < FINEST * texel:
+            emit(Warned(f"texels of {wanted:.3g} are finer than pixels, {texel:.3g} on the surface: these are taken"))
+        else:
+            texel, views = wanted, reduced(views, sizes, wanted)
 
     def simplified() -> Mesh:
         given = local_mesh(surface, frame) if finer is None else finer
@@ -196,7 +199,8 @@ def textured(
     beyond, edge = neighbours(mesh.faces)
 
     def choose() -> Arrays:
-        found, gains, outliers = look_at_all(mesh, photos, settings.size - ROOM, kept)
+        longest = settings.size // 2  # so that each chart fits on a page
+        found, gains, outliers = look_at_all(mesh, photos, longest, kept)
         return {"view": choose_views(found, beyond, edge), "gains": gains, "outliers": np.array([outliers])}
 
     chosen = kept.once("chosen", choose)
@@ -225,11 +229,24 @@ def coarser(
     while depth > 0:
         depth, level = max(0, depth - 2), level + 1
         texel = fine.texel * 2**level * (subject.frame.metres or 1.0)
-        few = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
-        less = replace(settings, texel=texel, triangles=few)
+        fewer = max(LEAST, len(fine.paint.mesh.faces) // 4**level)
+        less = replace(settings, texel=texel, triangles=fewer)
         made = textured(subject, less, budget_bytes, kept.of(level), mesh, fine.region.cut(depth))
         mesh = made.paint.mesh
         yield made
+
+
+def refuse_foreign(out: Path) -> None:
+    """OSError unless a folder is to be made, is empty, or has a textured mesh and nothing else: it will be replaced."""
+    if out.exists() and not out.is_dir():
+        raise OSError(errno.ENOTDIR, "a file; name a folder", str(out))
+    names = {path.name for path in out.iterdir()} if out.exists() else set()
+    if names and RECORD not in names:
+        raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))
+    if other := sorted(name for name in names - {RECORD, TILES} if not name.startswith(NAME)):
+        raise OSError(
+            errno.ENOTEMPTY, f"has files that are not of a textured mesh: {few(other)}; name another", str(out)
+        )
 
 
 def local_mesh(surface: Surface, frame: Frame) -> Mesh:
@@ -238,13 +255,17 @@ def local_mesh(surface: Surface, frame: Frame) -> Mesh:
     for at in range(0, len(surface), 1 << 20):
         part = slice(at, at + (1 << 20))
         vertices[part] = frame.to_local(surface.vertices(part))
+    faces, colors = np.asarray(surface.faces, np.int32), None
     names = ("red", "green", "blue")
-    colors = None
     if set(names) <= set(surface.rows.dtype.names or ()):
         colors = np.stack([surface.rows[name] for name in names], axis=1).astype(np.uint8)
     else:
         emit(Warned(f"{surface.path}: its vertices have no colours; what no photograph shows becomes grey"))
-    return Mesh(vertices, np.asarray(surface.faces, np.int32), colors)
+    good = np.isfinite(vertices).all(1)
+    if not good.all():  # no face has such a vertex, see `read_surface`
+        vertices, colors = vertices[good], None if colors is None else colors[good]
+        faces = (np.cumsum(good) - 1).astype(np.int32)[faces]
+    return Mesh(vertices, faces, colors)
 
 
 def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View]:
@@ -267,7 +288,7 @@ def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
         mesh = simplify_to(mesh, wanted)
         emit(Progress("simplifying", 1, 1))
     edge = (area / max(wanted, 1) * 4 / 3**0.5) ** 0.5
-    return with_short_edges(mesh, max(LONGEST_PX * texel, LONGEST * edge))
+    return with_short_edges(mesh, min(max(LONGEST_PX * texel, LONGEST * edge), settings.size / 4 * texel))
 
 
 def look_at_all(
@@ -275,7 +296,7 @@ def look_at_all(
 ) -> tuple[Candidates, np.ndarray, int]:
     """What can be chosen from, the gains of the photographs, and how many photographs of a triangle were refused."""
     found, count = Candidates(len(mesh.faces)), len(photos.views)
-    start = 0
+    pieces, start = Pieces(mesh), 0
     if (before := kept.read(LOOKED)) is not None:
         start = int(before.pop("count"))
         vars(found).update(before)
@@ -288,7 +309,10 @@ def look_at_all(
         except BadInput as error:
             emit(PhotoSkipped(view.name, str(error)))
             continue
-        found.offer(number, sight(mesh, view.camera, picture, keep, longest))
+        part, rows = pieces.in_view(view.camera)
+        if len(rows):
+            shown = sight(part, view.camera, picture, keep, longest)
+            found.offer(number, replace(shown, faces=rows[shown.faces]))
         now = time.perf_counter()
         if now - saved > max(PAUSE_S, SHARE * spent):
             kept.write(LOOKED, {**vars(found), "count": np.array(number + 1)})
@@ -313,9 +337,9 @@ def lay_out(
         region: Of the tiles, where it is known.
     """
     places = np.zeros((len(mesh.faces), 3, 2), np.float32)
-    for number in np.unique(chosen[chosen != NONE]).tolist():
-        mine = chosen == number
-        places[mine] = project(mesh, views[number].camera)[mesh.faces[mine], :2]
+    for number, rows in by_photograph(chosen):
+        corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3)
+        places[rows] = project(corners, views[number].camera)[:, :2].reshape(-1, 3, 2)
     where = middles(mesh)
     region = region or divide(where, texels_of(chosen, places), FULL * size**2)
     return make_atlas(chosen, places, region.of(where), beyond, size), region

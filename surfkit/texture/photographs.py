@@ -9,6 +9,16 @@ import numpy as np
 from surfkit.readers.masks import mask_cache
 from surfkit.scene.photos import photo_cache
 from surfkit.scene.scene import View
+from surfkit.texture.candidates import NONE
+
+
+def by_photograph(view: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """Each photograph of (n,) numbers, and the rows that have it, rising; those of NONE are left out."""
+    order = np.argsort(view, kind="stable")
+    order = order[view[order] != NONE]
+    numbers, starts = np.unique(view[order], return_index=True)
+    parts = np.split(order, starts[1:])  # one, and not none, of no rows
+    return list(zip(numbers.tolist(), parts[: len(numbers)], strict=True))
 
 
 class Photographs:
@@ -26,6 +36,13 @@ class Photographs:
     def __call__(self, number: int) -> np.ndarray:
         """(3, H, W) uint8."""
         return self.cache[number].numpy()
+
+    def close(self) -> None:
+        """Forget all of them; none can be asked for afterwards."""
+        for cache in (self.cache, self.masks):
+            if cache is not None:
+                cache.close()
+                cache.resize(0)
 
     def keep(self, number: int) -> np.ndarray | None:
         """(H, W) bool, or None for all of it."""

@@ -97,6 +97,15 @@ class Display:
             self.bar.update(self.task, completed=done.index, line=line)
             self.bar.refresh()
 
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Within, time does not count for the speed."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.last += time.perf_counter() - began
+
     def line(self, done: Done) -> str:
         """The numbers of a step, in words."""
         parts = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -41,6 +40,7 @@ from surfkit.train.sparing import sparing
 from surfkit.train.state import StageState
 from surfkit.train.uploads import Pictures, Shown, Uploads
 from surfkit.train.views import Order, ViewContributions
+from surfkit.train.watch import Stopwatch
 
 MOST_STEPS = 100_000_000
 """Of a stage: days and days of the fastest machine."""
@@ -166,19 +166,17 @@ class Trainer:
         state.move(self.rasterizer.where())
         return state
 
-    def run(self, state: StageState) -> Iterator[Done]:
+    def run(self, state: StageState, clock: Stopwatch | None = None) -> Iterator[Done]:
         """Take the steps that are left; after each one, `state` can be saved, and the caller may stop.
 
-        The points of `state` are moved to where the rasterizer draws.
+        The points of `state` are moved to where the rasterizer draws. The caller may stop the `clock` of the state.
         """
-        wall, cpu = time.perf_counter(), time.process_time()
+        clock = clock or Stopwatch(state)
         state.move(self.rasterizer.where())
         self.foretell(state.order)
         while state.index < self.stage.steps:
             done = self.step(state)
-            state.seconds += time.perf_counter() - wall
-            state.cpu_seconds += time.process_time() - cpu
-            wall, cpu = time.perf_counter(), time.process_time()
+            clock.lap()
             held = peak_memory_bytes(), peak_gpu_bytes()
             emit(StepDone(done.index, self.stage.steps, done.losses, done.points, *held))
             yield done

@@ -31,7 +31,8 @@ class Layers:
         """Build the switches, and draw."""
         self.shelf, self.client, self.subject = shelf, client, shelf.subject
         self.shows_mesh = self.subject.splats is None
-        self.typical_size = self._typical_size()
+        centres = [view.camera.centre.numpy() for view in self.subject.views]
+        self.typical_size = typical_size(np.stack(centres)) if centres else 0.0
         self.camera_size = self.typical_size if self.subject.views else 0.0
         gui = client.gui
         with gui.add_folder("Layers"):
@@ -148,13 +149,11 @@ class Layers:
             text = f"block {block.index}: {len(block.views)} views"
             scene.add_label(f"/blocks/{block.index}", text, position=place * WORLD, anchor="bottom-center")
 
-    def _typical_size(self) -> float:
-        """Of the pictures of cameras, local units: they do not hide one another."""
-        if not self.subject.views:
-            return 0.0
-        centres = np.stack([view.camera.centre.numpy() for view in self.subject.views])
-        reach = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-        return 0.8 * reach / max(np.sqrt(len(centres)), 3.0) if reach > 0 else 0.1
+
+def typical_size(centres: np.ndarray) -> float:
+    """Of the pictures of cameras with (V, 3) centres, local units: they do not hide one another."""
+    reach = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    return 0.8 * reach / max(np.sqrt(len(centres)), 3.0) if reach > 0 else 0.1
 
 
 def frustum_lines(centres: np.ndarray, corners: np.ndarray) -> np.ndarray:

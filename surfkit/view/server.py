@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 100
 """Where a free port is looked for, if none is asked for."""
+PORT_NUMBERS = range(1, 65536)
 CLOSE_S = 1.0
 """For a browser to say that it has heard the end."""
 SILENT = logging.getLogger("surfkit.view.requests")
@@ -49,10 +50,12 @@ class Address:
     Attributes:
         host: Name or address of a network interface of this machine.
         port: That must be free; None for the next free one.
+        flags: How the options begin with which a user gives them.
     """
 
     host: str = LOCAL
     port: int | None = None
+    flags: str = "--"
 
     @property
     def is_local(self) -> bool:
@@ -80,18 +83,25 @@ class Served:
         return bool(display) and webbrowser.open(self.url)
 
 
+def refuse_wrong_port(port: int | None, flag: str) -> None:
+    """BadInput if there is no such port; `flag` is the option that it was given with."""
+    if port is not None and port not in PORT_NUMBERS:
+        raise BadInput(f"{flag} {port}: give {PORT_NUMBERS[0]} to {PORT_NUMBERS[-1]}")
+
+
 @contextmanager
-def served(address: Address, title: str) -> Iterator[Served]:
+def served(address: Address, title: str, what: str = "surfkit view") -> Iterator[Served]:
     """Within, a server with an empty scene.
 
     Args:
         address: Where.
         title: Of the panel on the page.
+        what: The command, for the message if viser is not installed.
 
     Raises:
         BadInput: viser is not installed, the port is taken, or the host is none of this machine.
     """
-    package = require_viser()
+    package = require_viser(what)
     listener = listen(address)
     gate = Gate(secrets.token_urlsafe(24), listener.getsockname()[1])
     try:
@@ -111,9 +121,9 @@ def served(address: Address, title: str) -> Iterator[Served]:
         listener.close()
 
 
-def require_viser() -> ModuleType:
+def require_viser(what: str = "surfkit view") -> ModuleType:
     """viser; BadInput where it does not load."""
-    with needed("viser", "surfkit view"):
+    with needed("viser", what):
         import viser
 
     warnings.filterwarnings("ignore", "Queued a .*never be delivered", UserWarning)  # a browser was closed: all is well
@@ -135,9 +145,11 @@ def listen(address: Address) -> socket.socket:
                 continue
             reason = os.strerror(error.errno) if (error.errno or 0) > 0 else error.strerror or str(error)
             if error.errno in (errno.EADDRINUSE, errno.EACCES):
-                raise BadInput(f"--port {port}: {reason}; give another, or leave it out for a free one") from error
-            raise BadInput(f"--host {address.host}: {reason}; give an address of this machine") from error
-    raise BadInput(f"ports {FIRST_PORT} to {wanted[-1]} are all taken; give a free one with --port")
+                raise BadInput(
+                    f"{address.flags}port {port}: {reason}; give another, or leave it out for a free one"
+                ) from error
+            raise BadInput(f"{address.flags}host {address.host}: {reason}; give an address of this machine") from error
+    raise BadInput(f"ports {FIRST_PORT} to {wanted[-1]} are all taken; give a free one with {address.flags}port")
 
 
 def _family(host: str) -> socket.AddressFamily:

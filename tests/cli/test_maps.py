@@ -84,6 +84,7 @@ def test_maps_go_on_after_the_process_was_killed(run, tmp_path):
         (["--gsd", "1e-9"], "too many for one map"),
         (["--against", "nowhere.ply"], "nowhere.ply: no such file"),
         (["--metres-per-unit", "-1"], "--metres-per-unit"),
+        (["--colors", "photographs"], "--colors photographs: --products leaves the orthophoto out"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(run, tmp_path, capsys, words, line):
@@ -97,7 +98,14 @@ def test_no_run_and_no_mesh(tmp_path, run, capsys):
     assert main(["maps", str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
     assert main(["maps", str(run), "--against", str(run / "point_cloud.ply"), "--gsd", "1"]) == 2
-    assert "a cloud of points; maps are drawn of a mesh" in capsys.readouterr().err
+    assert "a cloud of points; name a mesh" in capsys.readouterr().err
+
+
+def test_without_the_package_of_textures_nothing_is_read(run, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "fast_simplification", None)
+    monkeypatch.setattr("surfkit.cli.maps.read", lambda data: pytest.fail("the data set is read"))
+    assert main(["maps", str(run), "--colors", "photographs"]) == 2
+    assert "needs the package fast_simplification" in capsys.readouterr().err
 
 
 def test_without_rasterio_one_line_says_what_to_install(run, monkeypatch, capsys):

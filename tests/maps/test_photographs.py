@@ -7,8 +7,9 @@ import pytest
 from needs import needs
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
-from surfkit.maps.make import MapSettings, Subject, make_maps
+from surfkit.maps.make import MapSettings, make_maps
 from surfkit.maps.photographs import between
+from surfkit.texture.make import Subject
 
 rasterio = needs("rasterio")
 needs("fast_simplification")
@@ -64,6 +65,8 @@ def test_the_mesh_has_the_rest(tmp_path):
     scene = town(tmp_path)
     record, colors, _, _ = orthophoto(replace(scene, views=scene.views[:1]), tmp_path / "maps")
     assert 0.1 < record["orthophoto"]["from_photographs"] < 0.9
+    small = orthophoto(replace(scene, views=scene.views[:1]), tmp_path / "small", replace(SETTINGS, tile=16))[1]
+    assert np.array_equal(small, colors), "some tiles have no cell that a photograph shows"
     from_mesh = np.abs(colors - HIDDEN).max(-1) <= 1
     assert from_mesh.mean() == pytest.approx(1 - record["orthophoto"]["from_photographs"], abs=0.03)
 

@@ -15,9 +15,10 @@ from surfkit.maps.contours import contour_lines, even_interval
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Window, map_crs
 from surfkit.maps.hillshade import hillshade
-from surfkit.maps.make import MapSettings, Subject, make_maps
+from surfkit.maps.make import MapSettings, make_maps
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
+from surfkit.texture.make import Subject
 from surfkit.texture.resolution import ground_sampling_distance
 
 from .shapes import UTM, centres, grid_of, heightfield

@@ -40,6 +40,48 @@ def test_small_clusters_go_and_few_clusters_are_no_error():
     assert sizes.tolist() == [320, 80, 20] and (np.bincount(labels) == sizes).all()
 
 
+def strip(start, count, height=0.0):
+    """`count` squares of two triangles with sides of 1, along x from `start` on."""
+    along = np.arange(count + 1)
+    vertices = np.stack(
+        [np.tile(along + start, 2), np.repeat([0.0, 1.0], count + 1), np.full(2 * count + 2, height)], 1
+    )
+    a = along[:-1]
+    b = a + count + 1
+    return vertices.astype(np.float32), np.concatenate([np.stack([a, a + 1, b], 1), np.stack([b, a + 1, b + 1], 1)])
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.37, 5000.2])
+def test_pieces_with_a_small_gap_are_one_cluster(shift):
+    """In cells of 3: what is nearer than 3 touches always, what is farther than 6 never."""
+    parts = strip(shift, 60), strip(shift + 62.5, 2), strip(shift + 71.5, 2), strip(shift, 2, height=2.9)
+    mesh = together(*parts)
+    labels, sizes = clusters(mesh, gap=3.0)
+    assert sorted(sizes) == [4, 128] and (labels == labels[0]).sum() == 128 and labels[125] != labels[0]
+    assert sorted(clusters(mesh)[1]) == [4, 4, 4, 120]
+    kept, report = clean(mesh, 50, 50, gap=3.0)
+    assert len(kept.faces) == 128 and (report.clusters, report.clusters_kept, report.clustered) == (2, 1, 4)
+    far = together(strip(0, 60), strip(1e9, 60), strip(3e9, 2))
+    assert sorted(clusters(far, gap=3.0)[1]) == [4, 120, 120], "so far that cells of 3 could not be numbered"
+
+
+def test_clusters_with_a_gap_are_those_of_all_pairs_of_cells(rng=np.random.default_rng(4)):
+    """Against labels that scipy's image functions give for a dense grid of the same cells."""
+    from scipy import ndimage
+
+    middles = rng.uniform(0, 40, (300, 3)).astype(np.float32)
+    vertices = (middles[:, None] + np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])).reshape(-1, 3)
+    mesh = Mesh(vertices, np.arange(900, dtype=np.int32).reshape(-1, 3), None)
+    labels, sizes = clusters(mesh, gap=2.0)
+    cells = ((vertices.astype(np.float64) - vertices.min(0)) / 2.0).astype(int)
+    grid = np.zeros(cells.max(0) + 1, bool)
+    grid[tuple(cells.T)] = True
+    wanted = ndimage.label(grid, np.ones((3, 3, 3)))[0][tuple(cells[mesh.faces[:, 0]].T)]
+    assert 3 < len(sizes) < 200
+    pairs = {(a, b) for a, b in zip(labels.tolist(), wanted.tolist(), strict=True)}
+    assert len(pairs) == len(sizes) == len(set(wanted.tolist())), "a one-to-one map of the labels"
+
+
 def test_broken_triangles_and_duplicate_vertices_go():
     vertices, faces = ball()
     doubled = np.concatenate([vertices[faces].reshape(-1, 3), [[np.nan, 0, 0]]]).astype(

@@ -161,6 +161,17 @@ def test_opendronemap_with_tracks(tmp_path, truth):
         reader_of(Data(folder)).tracks(Data(folder))
 
 
+def test_points_of_opendronemap_that_are_nowhere_are_left_out(tmp_path, truth):
+    path = odm(tmp_path, truth) / "opensfm/reconstruction.json"
+    contents = json.loads(path.read_text())
+    points, good = max(contents, key=lambda model: len(model["shots"]))["points"], read(Data(tmp_path)).cloud
+    for number, value in zip(list(points), (1e300, float("inf"), float("nan")), strict=False):
+        points[number]["coordinates"][1] = value
+    path.write_text(json.dumps(contents))
+    left = read(Data(tmp_path)).cloud
+    assert len(left.xyz) == len(good.xyz) - 3 and left.xyz.isfinite().all()
+
+
 def damage(key, value):
     def change(contents):
         for place in (contents, contents["frames"][2]):

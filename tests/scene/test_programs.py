@@ -8,11 +8,15 @@ import pytest
 from needs import needs
 from PIL import Image
 
+from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.export.ply import write_points
 from surfkit.readers.data import Data
+from surfkit.readers.geocentric import place_of
 from surfkit.readers.read import observations, read, read_capture, reader_of
+from surfkit.readers.wkt import parse_wkt
 from surfkit.run.notes import collect_notes
+from surfkit.scene.earth import geocentric
 
 from . import programs
 from .programs import (
@@ -120,17 +124,35 @@ def test_points_in_a_file_beside_the_cameras(tmp_path):
     np.testing.assert_allclose(read_capture(Data(tmp_path), reader_of(Data(tmp_path))).xyz, DOTS, atol=1e-5)
 
 
+def test_positions_of_realitycapture_in_degrees_are_suspected(tmp_path):
+    def degrees(text):
+        head, *lines = text.splitlines()
+        split = [line.split(",") for line in lines]
+        for words in split:
+            words[1:3] = [str(8.9 + float(words[1]) / 75_000), str(47.5 + float(words[2]) / 111_000)]
+        return "\n".join([head, *map(",".join, split)])
+
+    for change, wanted in ((degrees, ["x and y differ by 0.00012 and heights by 4: if these are degrees"]), (str, [])):
+        realitycapture(tmp_path, change=change)
+        with collect_notes() as kept:
+            read(Data(tmp_path))
+        assert [
+            text.partition("csv: ")[2].partition(", export")[0] for text in kept.texts if "degrees" in text
+        ] == wanted
+
+
 def test_pix4d_on_the_map(tmp_path):
-    pix4d(tmp_path)
+    origin = ORIGIN + 0.25  # is nearly always a whole number, but need not be
+    pix4d(tmp_path, offset=origin)
     params = tmp_path / "1_initial/params"
     (params / "survey_wkt.prj").write_text(UTM32)
     scene = read(Data(tmp_path, test_every=0))
-    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:32632", 1.0, tuple(ORIGIN))
-    np.testing.assert_allclose(centres(scene), [ORIGIN + centre for _, centre in POSES.values()], atol=1e-6)
+    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:32632", 1.0, tuple(origin))
+    np.testing.assert_allclose(centres(scene), [origin + centre for _, centre in POSES.values()], atol=1e-6)
     (params / "survey_offset.xyz").unlink()
     lines = ["imageName X Y Z Omega Phi Kappa"]
     for name, (_, centre) in POSES.items():
-        lines.append(" ".join([name, *(f"{value:.6f}" for value in ORIGIN + centre), "0", "0", "0"]))
+        lines.append(" ".join([name, *(f"{value:.6f}" for value in origin + centre), "0", "0", "0"]))
     (params / "survey_calibrated_external_camera_parameters.txt").write_text("\n".join(lines))
     np.testing.assert_allclose(centres(read(Data(tmp_path, test_every=0))), centres(scene), atol=1e-5)
     (params / "survey_calibrated_external_camera_parameters.txt").unlink()
@@ -214,6 +236,38 @@ def test_metashape_on_the_map(tmp_path, text, crs, ellipsoid):
         )
 
 
+def test_a_long_text_of_coordinates_is_read_in_time_that_grows_with_it():
+    class Text(str):
+        copied = 0
+
+        def __getitem__(self, key):
+            found = super().__getitem__(key)
+            Text.copied += len(found)
+            return found
+
+    text = Text(f"PROJCS[{'1,' * 3000}{UTM32}]\n ")
+    assert parse_wkt("x", text).child("PROJCS").code == "EPSG:32632" and Text.copied < 10 * len(text)
+
+
+def test_cameras_far_apart_on_the_map_are_told_how_far_the_earth_bends():
+    centres = geocentric(np.full(3, 47.0), 9.0 + np.array([-0.02, 0.0, 0.02]), np.full(3, 500.0))
+    with collect_notes() as kept:
+        place = place_of("x", UTM32, centres)
+    off = 0.5 * np.array([1521**2, 0, 1521**2]) / 6.388e6  # a parallel of a radius of 4,357 km; the Earth's is 6,388 km
+    heights = place.move.points(centres)[:, 2]
+    np.testing.assert_allclose(heights.max() - heights, off, atol=2e-3)
+    (said,) = (text for text in kept.texts if "the Earth is round" in text)
+    assert "outermost camera, coordinates are 0.18 m off" in said, said
+    with collect_notes() as kept:
+        place_of("x", UTM32, centres[1:])
+    assert not kept.texts
+    pole = np.array([[0, 0, 6.4e6]])  # a camera that is wrong
+    with collect_notes() as kept:
+        place_of("x", UTM32, np.concatenate([np.tile(centres, (3000, 1)), pole]))
+    (said,) = kept.texts
+    assert re.search(r"coordinates are \d\.\d\d m off", said), said
+
+
 def test_metashape_in_local_coordinates(tmp_path):
     onto, move, scale = axes(10, 0, 90), np.array([5.0, 6.0, 7.0]), 2.5
     numbers = " ".join(repr(float(value)) for value in onto.ravel())
@@ -281,20 +335,26 @@ def entry(*path, value):
         (partial(metashape, change=words("<f>190.0</f>", "<fx>190</fx>")), "sensor 0: no f in its calibration"),
         (
             partial(metashape, change=words("<f>190.0</f>", "<f>wide</f>")),
-            "sensor 0: f: 'wide', where 1 numbers belong",
+            "sensor 0: f: 'wide', where a finite number belongs",
         ),
         (partial(metashape, change=words("<f>190.0</f>", "<f>-1</f>")), "sensor 0: no lens has size 220 x 160"),
         (partial(metashape, change=words('<sensor id="0"', '<sensor id="1"')), "sensor 0: no calibration of it"),
-        (partial(metashape, change=words("<transform>", "<transform>1 ")), "camera 'IMG 1': '1 .*, where 16 .*numbers"),
+        (
+            partial(metashape, change=words("<transform>", "<transform>1 ")),
+            "camera 'IMG 1': '1 .*, where 16 finite numbers",
+        ),
         (partial(metashape, change=words("<transform>", "<transform>9")), "camera 'IMG 1': the pose is not a rotation"),
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "'IMG 1' stand for two photographs each"),
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 photographs are missing: 'IMG 5'"),
         (partial(metashape, change=lambda t: t.replace("transform", "nothing")), "all 5 photographs have no pose"),
         (partial(metashape, tail="<transform><scale>0</scale></transform>"), "transform of the chunk: its scale is 0"),
-        (partial(metashape, tail="<transform/><reference>PROJCS[</reference>"), "reference: the text .* is cut off"),
+        (
+            partial(metashape, tail="<transform/><reference>PROJCS[</reference>"),
+            "reference: no coordinate reference system: its text is cut off; export",
+        ),
         (
             partial(metashape, tail="<transform/><reference>x</reference>"),
-            "no coordinate reference system as well-known",
+            "no coordinate reference system: no well-known text; export it again",
         ),
         (partial(pix4d, change=words("0 0 1\n", "0 1 1\n")), "IMG 1.png: the camera matrix has entries below"),
         (partial(pix4d, change=words("radial distortion [3x1]", "fisheye poly [4x1]")), "only perspective cameras are"),
@@ -303,7 +363,7 @@ def entry(*path, value):
         (partial(pix4d, change=words("IMG 1.png 220", "IMG 1.png wide")), "is no photograph with its width and height"),
         (partial(pix4d, offset=(np.nan, 0, 0)), "survey_offset.xyz: 'nan 0 0.*', where 3 finite numbers belong"),
         (partial(realitycapture, change=words(",t1,t2", ",t1")), "it lacks t2; export it as"),
-        (partial(realitycapture, change=words(",12.0,", ",north,")), "IMG 1.png: .*, where 15 numbers belong"),
+        (partial(realitycapture, change=words(",12.0,", ",north,")), "IMG 1.png: .*, where 15 finite numbers belong"),
         (partial(realitycapture, change=words("IMG 2.png,", "IMG 2.png,1,")), "line 3 has 17 values, not 16"),
         (partial(realitycapture, f=0), "IMG 1.png: no lens has size 220 x 160"),
         (partial(bundler, change=words("v0.3", "v0.4")), "begins with '# Bundle file v0.4', not with"),
@@ -344,8 +404,15 @@ def test_two_exports_in_a_folder_need_a_choice(tmp_path):
     metashape(tmp_path)
     (tmp_path / "cameras.xml").rename(tmp_path / "b.xml")
     metashape(tmp_path)
-    with pytest.raises(BadInput, match="several files of cameras: b.xml, cameras.xml; leave one"):
+    with pytest.raises(BadInput, match="several files of cameras: 'b.xml', 'cameras.xml'; leave one"):
         read(Data(tmp_path, layout="metashape"))
+
+
+@pytest.mark.parametrize("layout", ["metashape", "pix4d", "realitycapture", "bundler"])
+def test_a_folder_without_cameras_of_the_chosen_layout(tmp_path, layout):
+    (tmp_path / "images").mkdir()
+    with pytest.raises(BadInput, match=r"no .*(file|bundle\.out).*; (export|copy) "):
+        read(Data(tmp_path, layout=layout))
 
 
 def test_photographs_beside_the_cameras_or_elsewhere(tmp_path):
@@ -372,3 +439,15 @@ def test_where_a_bundle_file_and_its_list_may_lie(tmp_path):
         read(Data(tmp_path))
     (tmp_path / "flight.list.txt").rename(tmp_path / "list.txt")
     assert len(read(Data(tmp_path, test_every=0)).train) == 4
+
+
+def test_doctor_says_once_what_a_lens_lacks_and_what_to_do_without_points(tmp_path, capsys):
+    metashape(tmp_path)
+    assert main(["doctor", str(tmp_path), "--quick", "--probe", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 5 photographs are left out" in said and "spelt otherwise" not in said
+    assert "no sparse points" in said and "`surfkit prepare points` triangulates some" in said
+    metashape(tmp_path, change=words("<f>190.0</f>", "<f>wide</f>"))
+    assert main(["doctor", str(tmp_path), "--quick", "--probe", "0"]) == 2
+    said = capsys.readouterr().out
+    assert said.count("where a finite number belongs") == 1 and "more like it" not in said

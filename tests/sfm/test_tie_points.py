@@ -9,7 +9,7 @@ from needs import needs_native
 from surfkit.cli import main
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
-from surfkit.sfm import features, matching, tie_points
+from surfkit.sfm import features, matching, photographs, tie_points
 from surfkit.testing.synthetic import SURFACES
 
 from .pictures import FOCAL, HEIGHT, WIDTH, arc, picture, save
@@ -112,7 +112,16 @@ def test_cameras_of_other_photographs_are_noticed(tmp_path, capsys):
     assert "are these the cameras of these photographs?" in capsys.readouterr().err
 
 
-def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, capsys):
+def test_a_photograph_without_features_is_named(tmp_path, capsys):
+    folder = pix4d(tmp_path / "data")
+    plain = np.broadcast_to(np.linspace(50, 200, WIDTH).astype(np.uint8)[:, None], (HEIGHT, WIDTH, 3))
+    save(folder / "images/view 4.jpg", plain)
+    assert main(["prepare", "points", str(folder), *QUICK]) == 0
+    assert "1 of 5 photographs have hardly any features: 'view 4.jpg' are left out" in capsys.readouterr().err
+    assert [view.name for view in read(Data(tmp_path / "data-scene", test_every=0)).train] == list(POSES)[:4]
+
+
+def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, monkeypatch, capsys):
     """Cameras of Bundler without points, of photographs through a lens, with masks."""
     from scipy.ndimage import map_coordinates
 
@@ -136,7 +145,10 @@ def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, capsys):
     save(folder / "masks/view 0.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
     (folder / "bundle.out").write_text("\n".join(lines) + "\n")
     (folder / "list.txt").write_text("".join(f"{name}\n" for name in POSES))
+    looked, plain = [], photographs._look
+    monkeypatch.setattr(photographs, "_look", lambda path, photo: looked.append(path.name) or plain(path, photo))
     assert main(["prepare", "points", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    assert sorted(looked) == list(POSES), "what is not of the data set is not read"
     assert "1 masks are not taken over" in capsys.readouterr().err
     scene = read(Data(tmp_path / "s", test_every=0))
     assert (scene.frame.crs, scene.frame.metres) == (None, None)

@@ -12,20 +12,23 @@ from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
+from surfkit.evaluate.geometry.surface import Surface
 from surfkit.export.glb import read_glb
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
+from surfkit.texture import candidates, make, pieces
 from surfkit.texture import level as leveling
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
-from surfkit.texture.charts import packed, texels_of
+from surfkit.texture.charts import make_atlas, packed, texels_of
 from surfkit.texture.choose import choose_views
 from surfkit.texture.fill import paint
 from surfkit.texture.look import look, look_in_numpy, project, sight
 from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture, textured
 from surfkit.texture.photographs import Photographs
+from surfkit.texture.pieces import Pieces
 from surfkit.texture.regions import divide, middles
 from surfkit.texture.topology import neighbours, with_short_edges
 
@@ -154,7 +157,7 @@ def test_sight_is_what_rays_see(tmp_path):
         share = is_seen(places.reshape(-1, 3), [number])[number].reshape(-1, 60).mean(1)
         told = np.zeros(len(share), bool)
         told[found.faces] = True
-        corners = project(mesh, view.camera)[mesh.faces].astype(float)
+        corners = project(mesh.vertices, view.camera)[mesh.faces].astype(float)
         pixels = texels_of(np.zeros(len(corners)), corners[:, :, :2]) / 1.5
         assert ((1 - share) * pixels)[told].max() < 2.5, "of what is told to be whole, hardly a pixel is hidden"
         assert told[share == 1].mean() > 0.95
@@ -214,7 +217,7 @@ def test_corrections_are_linear_between_vertices(tmp_path):
 def test_the_kernel_counts_as_numpy_does(tmp_path):
     scene = town(tmp_path, cell=0.13)
     mesh, view = local_mesh(scene.surface, scene.frame), scene.views[6]
-    places, photo = project(mesh, view.camera), Photographs(scene.views, 10**8)(6)
+    places, photo = project(mesh.vertices, view.camera), Photographs(scene.views, 10**8)(6)
     depth, _ = draw_faces(places, mesh.faces, view.camera.width, view.camera.height)
     depth[:40] = 0  # a mask
     ours = look(places, mesh.faces, photo, depth, 0.01)
@@ -343,6 +346,27 @@ def test_rectangles_do_not_overlap():
         assert sum(each.sum() for each in taken) == size.prod(1).sum()
 
 
+def test_the_largest_triangles_that_are_taken_fit_on_a_page(tmp_path):
+    """A strip in one photograph, whose triangles reach as far to both sides of one cell of charts as they may."""
+    side = 128
+    longest = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            make, "look_at_all", lambda mesh, photos, most, kept: longest.append(most) or look_at_all(mesh, photos, 1)
+        )
+        made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",), size=side))
+    wide = longest[0]
+    x = np.array([30 - 2 * wide / 3, 30 + wide / 3, 30 + wide / 3, 2 - wide / 3, 2 - wide / 3, 2 + 2 * wide / 3])
+    corners = np.stack([x, [0, 0, 4, 4, 8, 8]], axis=1)
+    faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
+    places = corners[faces].astype(np.float32)
+    middle = np.floor(places.mean(1)[[0, 1, 3]] / (side // 4))
+    assert (middle == middle[0]).all(), "of one chart"
+    atlas = make_atlas(np.zeros(4, np.int32), places, np.zeros(4, np.int32), neighbours(faces)[0], side)
+    texels = atlas.texels(np.arange(4))
+    assert (texels >= 0).all() and (texels <= [atlas.pages[0].width, atlas.pages[0].height]).all()
+
+
 def test_neighbours_get_the_same_photograph():
     """A strip of triangles that two photographs show about as well, in turns: one of the two is chosen for all."""
     places, faces = sheet((0, 0, 0), np.array([40.0, 0, 0]), np.array([0, 1.0, 0]), 1.0)
@@ -358,6 +382,49 @@ def test_neighbours_get_the_same_photograph():
     found.view[3] = NONE
     found.quality[3] = 0
     assert np.flatnonzero(choose_views(found, beyond, edge) == NONE).tolist() == [3]
+
+
+def test_only_pieces_in_view_are_looked_at(tmp_path, monkeypatch):
+    """Small pieces give what one large one does; of a flight over a long strip, each photograph shows few of them."""
+    scene = town(tmp_path, cell=0.25)
+    mesh, photos = local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8)
+    whole = look_at_all(mesh, photos, 1000)
+    monkeypatch.setattr(pieces, "PIECE", 50)
+    parts = look_at_all(mesh, photos, 1000)
+    assert (whole[0].view == parts[0].view).all() and (whole[0].quality == parts[0].quality).all()
+    assert (whole[0].color == parts[0].color).all() and (whole[1] == parts[1]).all()
+    strip, faces = sheet((-100, -1, 0), np.array([200.0, 0, 0]), np.array([0, 2.0, 0]), 0.5)
+    divided = Pieces(Mesh(strip.astype(np.float32), faces.astype(np.int32)))
+    for x in (-150.0, -99.0, 0.0, 60.0):
+        pose = torch.tensor([[1.0, 0, 0, -x], [0, -1, 0, 0], [0, 0, -1, 8], [0, 0, 0, 1]], dtype=torch.float64)
+        part, rows = divided.in_view(Camera(pose, 150.0, 150.0, 100.0, 100.0, 200, 200))
+        assert np.array_equal(part.vertices[part.faces], strip[faces[rows]].astype(np.float32))
+        shown = np.abs(strip[faces][..., 0] - x).min(1) < 8 * 100 / 150
+        assert np.isin(np.flatnonzero(shown), rows).all() and len(rows) < shown.sum() + 200
+        assert len(rows) == 0 if x == -150 else len(rows) > 0
+
+
+def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
+    exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
+    scene = town(tmp_path, exposures=exposures, cell=0.25)
+    found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8), 1000)
+    monkeypatch.setattr(candidates, "ENOUGH", len(found.view) // 3)
+    some = exposure_gains(found, 12)
+    assert not np.array_equal(some, gains) and np.abs(some / gains - 1).max() < 0.02
+
+
+def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch):
+    kept, most = [], []
+
+    class Watched(Photographs):
+        def __init__(self, views, budget):
+            most.append(sum(each.cache.bytes for each in kept))
+            super().__init__(views, budget)
+            kept.append(self)
+
+    monkeypatch.setattr(make, "Photographs", Watched)
+    made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("tiles3d",), size=128))
+    assert len(most) > 2 and most == [0] * len(most)
 
 
 def test_gains_of_photographs_that_share_nothing_stay_one():
@@ -390,6 +457,18 @@ def test_coarser_texels_and_fewer_triangles(tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["texture.json", "textured.glb"]
 
 
+def test_texels_are_no_finer_than_pixels(tmp_path, monkeypatch):
+    scene, told = town(tmp_path), []
+    monkeypatch.setattr("surfkit.texture.make.emit", told.append)
+    records = {}
+    for texel in ("auto", 1e-3, 1e9):
+        settings = TextureSettings(formats=("glb",), texel=texel, pictures="png")
+        records[texel] = {**made(scene, tmp_path / "out", settings), "seconds": 0}
+    assert records[1e-3] == records["auto"] and records[1e9]["texel"] == 1e9
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert said == ["texels of 0.001 are finer than pixels, 0.077 on the surface: these are taken"]
+
+
 def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr("surfkit.export.glb.MOST_BYTES", 20_000)
     told = []
@@ -398,6 +477,9 @@ def test_a_glb_file_that_would_be_too_large_is_left_out(tmp_path, monkeypatch):
     assert "textured.glb" not in record["files"] and "textured.obj" in record["files"]
     said = [event.text for event in told if isinstance(event, Warned)]
     assert len(said) == 1 and said[0].startswith("textured.glb is left out: ") and str(tmp_path) not in said[0]
+    with pytest.raises(BadInput, match="use the format tiles3d"):  # or nothing would be left, not even the one before
+        made(town(tmp_path), tmp_path / "out", replace(PNG, formats=("glb",)))
+    assert (tmp_path / "out" / "textured.obj").is_file()
 
 
 def test_masks_hide(tmp_path):
@@ -419,6 +501,32 @@ def test_masks_hide(tmp_path):
     assert np.abs(colors - HIDDEN).max() <= 1
 
 
+def test_vertices_that_are_not_finite_are_left_out(tmp_path):
+    """As `read_surface` leaves them: no face names them, but they are still there."""
+    scene = town(tmp_path)
+    rows = np.concatenate([scene.surface.rows[:1], scene.surface.rows])
+    rows["x"][0] = np.nan
+    odd = replace(scene, surface=Surface("mesh.ply", rows, scene.surface.faces + 1))
+    settings = replace(PNG, formats=("obj",), triangles=200)
+    for each, out in ((scene, "plain"), (odd, "odd")):
+        made(each, tmp_path / out, settings)
+    plain, ours = ((tmp_path / out / "textured.obj").read_bytes() for out in ("plain", "odd"))
+    assert plain == ours
+
+
+def test_what_no_photograph_shows_fits_on_small_pages(tmp_path):
+    scene = town(tmp_path)
+    few = replace(scene, views=scene.views[:1])
+    record = made(few, tmp_path / "out", replace(PNG, formats=("glb",), size=128))
+    assert record["seen"] < 0.9 and set(map(tuple, record["pages"])) <= {(64, 64), (128, 64), (128, 128)}
+    corners, uv, page, images = read_pieces(tmp_path / "out" / "textured.glb")
+    middle, size = uv.mean(1), np.array([images[at].shape[1::-1] for at in page])
+    x, y = np.floor(middle * size * [1, -1] + size * [0, 1]).astype(int).T
+    shown = np.array([images[at][row, column] for at, row, column in zip(page, y, x, strict=True)])
+    under = (corners[..., 2] < 1e-6).all(1) & (np.abs(corners.mean(1)[:, :2] - [-0.5, 0]).max(1) < 1)
+    assert under.sum() > 10 and (shown[under] == HIDDEN).all(), "the ground under the box"
+
+
 def test_what_is_refused(tmp_path):
     scene = town(tmp_path)
     for wrong in ({"size": 100}, {"size": 1000}, {"triangles": 1}, {"texel": -1.0}, {"formats": ()}):
@@ -428,6 +536,12 @@ def test_what_is_refused(tmp_path):
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     with pytest.raises(OSError, match="name another"):
         made(scene, tmp_path / "mine")
+    (tmp_path / "mine" / "texture.json").write_text("{}")
+    with pytest.raises(OSError, match="has files that are not of a textured mesh: 'notes.txt'; name another"):
+        made(scene, tmp_path / "mine")
+    with pytest.raises(OSError, match="a file; name a folder"):
+        made(scene, tmp_path / "mine" / "notes.txt")
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
     away = replace(scene, surface=surface(0.5, (0, 0, 500.0)))
     with pytest.raises(BadInput, match="no photograph shows any of it"):
         made(away, tmp_path / "away")
