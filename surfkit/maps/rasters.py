@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from surfkit.core.codec import from_json
 from surfkit.core.files import replacing
 from surfkit.maps.grid import Grid, Window
 
@@ -88,7 +89,7 @@ class Raster:
         if not self._file(window).exists():
             return None
         with rasterio.open(self._file(window)) as file:
-            return json.loads(file.tags()[FACTS])
+            return from_json(file.tags()[FACTS])
 
     def whole(self) -> Path:
         """Write the file that joins the tiles that are there, and return its path."""

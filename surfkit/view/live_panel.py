@@ -42,7 +42,8 @@ class LivePanel:
         self.drawn: Path | None = None
         self.charts: dict[str, tuple[Any, tuple[str, ...]]] = {}
         self.picture_path: Path | None = None
-        gui.configure_theme(control_layout="collapsible", show_share_button=False, show_logo=False)
+        gui.configure_theme(show_share_button=False, show_logo=False)
+        gui.main_panel.dock_right()
         self.status = gui.add_markdown("The run begins.", order=0)
         self.button = gui.add_button("pause", visible=False, order=1)
         self.button.on_click(lambda _: self._toggle())
