@@ -253,7 +253,9 @@ def test_psnr_of_steps_that_are_made_again(scene, tmp_path):
 def test_while_nobody_looks_nothing_is_drawn(scene, tmp_path):
     needs("viser")
     with live_view(Address(), 0.5) as page, Training(page.control, scene, tmp_path) as training:
-        time.sleep(0.5)
+        until = time.monotonic() + 60
+        while training.index <= 50 and time.monotonic() < until:
+            time.sleep(0.05)
         assert not training.drawn and training.index > 50
         browser = Browser(page.url)
         browser.wait_for(lambda b: backgrounds(b))
