@@ -78,6 +78,7 @@ def clean(
     if not len(mesh.faces):
         what = "all lie outside the crop: is it in the frame of the input?" if cropped else "none is whole"
         raise BadInput(f"no triangle of the mesh is left: {what}")
+    mesh = _referenced(mesh)  # those of what was dropped are neither finite nor near
     labels, sizes = clusters(mesh, gap)
     large = _large(sizes, most, least)
     mesh, clustered = _keep(mesh, large[labels])

@@ -61,6 +61,12 @@ def test_pieces_with_a_small_gap_are_one_cluster(shift):
     assert sorted(clusters(mesh)[1]) == [4, 4, 4, 120]
     kept, report = clean(mesh, 50, 50, gap=3.0)
     assert len(kept.faces) == 128 and (report.clusters, report.clusters_kept, report.clustered) == (2, 1, 4)
+    mesh = together(strip(0, 60), strip(60, 10), strip(72, 1))
+    mesh.vertices[-1] = np.nan  # with the last piece, a triangle of which is whole
+    kept, report = clean(mesh, 50, 3, box((-1, -1, -1, 59.9, 2, 1)).inside, gap=3.0)
+    assert (report.not_finite, report.clusters) == (1, 1) and len(kept.faces) == 120
+    both = clean(mesh, 50, 1, lambda at: (at[:, 0] < 50) | (at[:, 0] > 70), gap=3.0)[1]
+    assert both.clusters == 2, "what is cropped away between them does not connect them"
     far = together(strip(0, 60), strip(1e9, 60), strip(3e9, 2))
     assert sorted(clusters(far, gap=3.0)[1]) == [4, 120, 120], "so far that cells of 3 could not be numbered"
 
