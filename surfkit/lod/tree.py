@@ -105,11 +105,36 @@ class LodBlocks:
             pixels: Largest error that is allowed.
             near: Leave out blocks that the camera does not see, with that as the nearest depth; None draws all.
         """
-        fine = self.is_leaf | (self.pixels(camera) <= pixels)
-        drawn = fine & ~np.where(self.parent >= 0, fine[self.parent], False)
+        drawn = self._drawn(self.pixels(camera), pixels)
         if near is not None:
             drawn &= ~self.outside(camera, near)
         return drawn.nonzero()[0]
+
+    def front_within(self, errors: np.ndarray, points: np.ndarray, budget: int) -> np.ndarray | None:
+        """Positions of the blocks to draw, with the smallest largest error that a budget allows.
+
+        Args:
+            errors: (B,) of each block, such as `pixels`; never below that of a child.
+            points: (B,) that each counts.
+            budget: Most points in all.
+
+        Returns:
+            None if even the coarsest blocks have more points.
+        """
+        allowed = np.unique(errors)  # a front changes at these alone
+        low, high = 0, len(allowed)
+        while low < high:
+            middle = (low + high) // 2
+            if points[self._drawn(errors, allowed[middle])].sum() <= budget:
+                high = middle
+            else:
+                low = middle + 1
+        return self._drawn(errors, allowed[low]).nonzero()[0] if low < len(allowed) else None
+
+    def _drawn(self, errors: np.ndarray, most: float) -> np.ndarray:
+        """(B,) bool, blocks whose error is at most so much, or that are leaves, where their parent is not drawn."""
+        fine = self.is_leaf | (errors <= most)
+        return fine & ~np.where(self.parent >= 0, fine[self.parent], False)
 
 
 @dataclass(frozen=True)

@@ -47,14 +47,16 @@ class Drawn:
     opacities: np.ndarray
     unit: float
 
+    def placed(self, places: np.ndarray, count: int) -> Drawn:
+        """The same splats at (N,) places in a list of `count`, whose other places hold splats that are not seen."""
 
-def most_visible(table: SplatTable, budget: int) -> Tensor:
-    """(n,) rows of at most `budget` splats, in order: those with the most opacity times area."""
-    if len(table) <= budget:
-        return torch.arange(len(table))
-    largest = table.log_scales.float().topk(2, dim=1).values.sum(1)
-    weight = largest + torch.nn.functional.logsigmoid(table.opacity_logits.float())
-    return weight.topk(budget, sorted=False).indices.sort().values
+        def spread(values: np.ndarray) -> np.ndarray:
+            found = np.zeros((count, *values.shape[1:]), values.dtype)
+            found[places] = values
+            return found
+
+        parts = spread(self.means), spread(self.covariances), spread(self.rgb), spread(self.opacities)
+        return Drawn(*parts, self.unit)
 
 
 def level_within(levels: LodTree, budget: int) -> int | None:
@@ -62,10 +64,21 @@ def level_within(levels: LodTree, budget: int) -> int | None:
     return next((number for number, level in enumerate(levels.levels) if len(level) <= budget), None)
 
 
-def drawn(table: SplatTable, rgb: np.ndarray | None = None) -> Drawn:
-    """What a browser needs of splats of a local frame; colours are those of degree 0 where none are given."""
+def unit_of(table: SplatTable) -> float:
+    """The unit of covariances of a model, local units."""
+    return UNIT * max(table.median_scale(), 1e-12)
+
+
+def drawn(table: SplatTable, rgb: np.ndarray | None = None, unit: float | None = None) -> Drawn:
+    """What a browser needs of splats of a local frame.
+
+    Args:
+        table: The splats.
+        rgb: (N, 3) uint8 colours; those of degree 0 where none are given.
+        unit: Of covariances, if not that of these splats.
+    """
+    unit = unit_of(table) if unit is None else unit
     scales = table.ellipsoid_log_scales().float().exp()
-    unit = UNIT * max(table.median_scale(), 1e-12)
     axes = axes_of(table.quats) * (scales / unit).clamp_max(LARGEST)[:, None, :]
     colors = (0.5 + SH_C0 * table.sh0.float()).clamp(0, 1).mul(255).round().byte().numpy() if rgb is None else rgb
     return Drawn(

@@ -13,7 +13,7 @@ from surfkit.view.outlines import block_outlines
 from surfkit.view.picking import corners_of
 from surfkit.view.screen import WORLD, Latest, telling
 from surfkit.view.shelf import Shelf
-from surfkit.view.splat_layer import STEP, SplatLayer, add_points, end_of
+from surfkit.view.splat_layer import SplatLayer, add_budget, add_points
 
 if TYPE_CHECKING:
     import viser
@@ -34,10 +34,11 @@ class Layers:
         centres = [view.camera.centre.numpy() for view in self.subject.views]
         self.typical_size = typical_size(np.stack(centres)) if centres else 0.0
         self.camera_size = self.typical_size if self.subject.views else 0.0
+        self.splats: SplatLayer | None = None
         gui = client.gui
         with gui.add_folder("Layers"):
             if self.subject.splats is not None:
-                SplatLayer(shelf, client, len(self.subject.splats))
+                self.splats = SplatLayer(shelf, client, len(self.subject.splats))
             if self.subject.mesh is not None:
                 self._mesh_switches(gui, self.subject.mesh)
             if self.subject.points is not None:
@@ -48,10 +49,15 @@ class Layers:
                 shown = gui.add_checkbox("blocks", False)
                 shown.on_update(telling(client, lambda _: self._blocks(shown.value)))
 
+    def stop(self) -> None:
+        """The browser has gone."""
+        if self.splats is not None:
+            self.splats.stop()
+
     def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
-        count, most = len(mesh.faces), end_of(len(mesh.faces))
+        count = len(mesh.faces)
         shown = gui.add_checkbox("mesh", self.shows_mesh)
-        budget = gui.add_slider("most triangles", min(STEP, count), most, STEP, min(self.shelf.most, most))
+        budget = add_budget(gui, "most triangles", count, self.shelf.most)
         plain = gui.add_checkbox("mesh in grey", mesh.colors is None, disabled=mesh.colors is None)
         note = gui.add_markdown("")
 
@@ -90,8 +96,7 @@ class Layers:
         count = len(points.xyz)
         shown = gui.add_checkbox("points" if alone else "sparse points", alone)
         size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
-        most = end_of(count)
-        budget = gui.add_slider("most points", min(STEP, count), most, STEP, min(self.shelf.most, most))
+        budget = add_budget(gui, "most points", count, self.shelf.most)
         note = gui.add_markdown("")
 
         def draw() -> None:

@@ -55,13 +55,16 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
             pages[client.client_id] = Page(shelf, client, folder, served.closing)
+            if client.client_id not in server.get_clients():  # it left meanwhile
+                leave(client)
 
         telling(client, build)(None)
 
     @server.on_client_disconnect
-    def _(client: viser.ClientHandle) -> None:
+    def leave(client: viser.ClientHandle) -> None:
         if (page := pages.pop(client.client_id, None)) is not None:
             page.path.stop()
+            page.layers.stop()
 
 
 class Page:

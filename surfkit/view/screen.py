@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
+from surfkit.view.by_view import Eye
 
 if TYPE_CHECKING:
     import viser
 
 WORLD = 10.0
 """Units of the page per local unit: keys move the camera by two units of the page a second."""
-REST_S = 0.4
+REST_S = 0.3
 """A slider or a camera that has not moved for so long is at rest."""
+TICK_S = 0.1
+"""Between two looks at a camera that moves."""
+FAR, FAR_DEGREES = 0.25, 15.0
+"""A camera has moved far when it has gone this share of the way to what it turns about, or has turned by so much."""
 
 
 class Latest:
@@ -35,6 +43,71 @@ class Latest:
         time.sleep(REST_S)
         if mine == self.asked:
             self.action()
+
+
+class Following:
+    """Looks where a camera is, in a thread of its own: while it moves, and when it has come to rest."""
+
+    def __init__(self, action: Callable[[bool], None]) -> None:
+        """Do `action` with whether the camera still moves; one at a time."""
+        self.action, self.moves, self.ended = action, threading.Event(), False
+        threading.Thread(target=self._run, name="follow a camera", daemon=True).start()
+
+    def moved(self, _camera: Any = None) -> None:
+        """The camera has moved."""
+        self.moves.set()
+
+    def stop(self) -> None:
+        """End the thread, after what it does now."""
+        self.ended = True
+        self.moves.set()
+
+    def _run(self) -> None:
+        while True:
+            self.moves.wait()
+            while self.moves.wait(REST_S):
+                self.moves.clear()
+                if self.ended:
+                    return
+                self.action(True)
+                time.sleep(TICK_S)
+            self.action(False)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where a browser's camera is.
+
+    Attributes:
+        eye: What it sees.
+        distance: Of what it turns about, local units.
+    """
+
+    eye: Eye
+    distance: float
+
+    @classmethod
+    def of(cls, camera: viser.CameraHandle) -> Stand:
+        """That of now."""
+        width, height = max(int(camera.image_width), 1), max(int(camera.image_height), 1)
+        focal = height / 2 / math.tan(camera.fov / 2)
+        pose = torch.from_numpy(pose_of(camera))
+        lens = Camera(pose, focal, focal, width / 2, height / 2, width, height)
+        away = float(np.linalg.norm(np.asarray(camera.look_at) - np.asarray(camera.position)))
+        return cls(Eye(lens, camera.near / WORLD), away / WORLD)
+
+    def same_as(self, other: Stand) -> bool:
+        """Whether both see the same."""
+        one, two = self.eye.camera, other.eye.camera
+        lenses = [(each.fx, each.width, each.height) for each in (one, two)]
+        return lenses[0] == lenses[1] and torch.equal(one.world_to_camera, two.world_to_camera)
+
+    def far_from(self, other: Stand) -> bool:
+        """Whether the camera has moved far since it was there."""
+        one, two = self.eye.camera, other.eye.camera
+        gone = float((one.centre - two.centre).norm())
+        ahead = float(one.world_to_camera[2, :3] @ two.world_to_camera[2, :3])
+        return gone > FAR * other.distance or ahead < math.cos(math.radians(FAR_DEGREES))
 
 
 def telling(client: viser.ClientHandle, action: Callable[..., None]) -> Callable[[Any], None]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
 import numpy as np
@@ -13,6 +14,7 @@ from surfkit.export.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import View
+from surfkit.view.by_view import Chosen, Eye, Levels, Lot
 from surfkit.view.display import (
     Colors,
     Drawn,
@@ -23,8 +25,8 @@ from surfkit.view.display import (
     fewer_faces,
     height_bounds,
     level_within,
-    most_visible,
     normals_of,
+    unit_of,
 )
 from surfkit.view.picking import Triangles, hit_points, hit_splats
 from surfkit.view.subject import Subject
@@ -116,10 +118,14 @@ class Shelf:
 
     def _choose_splats(self, budget: int, colors: Colors) -> tuple[Drawn, str]:
         table, told = self.within(budget)
-        return drawn(table, self.painted(table, colors)), told
+        return self.drawn(table, colors), told
+
+    def drawn(self, table: SplatTable, colors: Colors) -> Drawn:
+        """Splats of the model, or such as stand for them, in the colours that are asked for."""
+        return drawn(table, self.painted(table, colors), self.unit)
 
     def within(self, budget: int) -> tuple[SplatTable, str]:
-        """At most `budget` splats: the finest level of detail that has no more, or the most visible ones."""
+        """At most `budget` splats: the finest level of detail that has no more, or what a lot has chosen."""
         table, levels = self.subject.splats, self.subject.levels
         assert table is not None
         if len(table) <= budget:
@@ -129,8 +135,44 @@ class Shelf:
             level = levels.levels[number]
             coarse = level.primitive.table(level.params).on_cpu()
             return coarse, f"{len(coarse):,} splats of level of detail {number} stand for {len(table):,}"
-        chosen = most_visible(table, budget)
-        return table.take(chosen), f"{len(chosen):,} of {len(table):,} splats are shown: the largest and most opaque"
+        chosen = self.lot.choose(budget).table
+        return chosen, f"{len(chosen):,} splats, drawn by lot and enlarged, stand for {len(table):,}{self._remedy()}"
+
+    def for_eye(self, budget: int, eye: Eye) -> tuple[Chosen, str]:
+        """At most `budget` splats for one camera, of a model that has more; and a line that says which."""
+        table = self.subject.splats
+        assert table is not None
+        with self.making:
+            found = self.levels.choose(budget, eye) if self.levels is not None else None
+            if found is not None:
+                told = f"{len(found):,} splats of all levels of detail stand for {len(table):,}"
+            else:
+                found = self.lot.choose(budget, eye)
+                told = f"{len(found):,} splats, drawn by lot and enlarged, stand for {len(table):,}"
+        return found, f"{told}: fine where you are, coarse far away, few beside the picture{self._remedy()}"
+
+    def _remedy(self) -> str:
+        """How to get levels of detail, for a run that has none."""
+        if self.subject.levels is not None or self.subject.scene is None:
+            return ""
+        return f". `surfkit lod {shlex.quote(str(self.subject.path))}` makes levels of detail, which look better"
+
+    @cached_property
+    def levels(self) -> Levels | None:
+        """Of the model, where it has some."""
+        return Levels(self.subject.levels) if self.subject.levels is not None else None
+
+    @cached_property
+    def lot(self) -> Lot:
+        """Of the model."""
+        assert self.subject.splats is not None
+        return Lot(self.subject.splats)
+
+    @cached_property
+    def unit(self) -> float:
+        """Of covariances: the same for all choices, so that one can take the place of another."""
+        assert self.subject.splats is not None
+        return unit_of(self.subject.splats)
 
     def painted(self, table: SplatTable, colors: Colors) -> np.ndarray | None:
         """(N, 3) uint8; None for the colours of training."""

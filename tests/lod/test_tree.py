@@ -56,6 +56,22 @@ def test_the_front_is_that_of_a_search_from_the_root(built):
     assert {1, int(tree.blocks.is_leaf.sum())} < sizes, "the whole, the finest, and some between"
 
 
+def test_the_finest_front_within_a_budget(built):
+    _, tree = built
+    blocks, draw = tree.blocks, torch.Generator().manual_seed(2)
+    points = blocks.last - blocks.first
+    for _ in range(10):
+        camera = random_camera(draw)
+        errors = blocks.pixels(camera)
+        fronts = [blocks.front(camera, pixels) for pixels in sorted({*errors[np.isfinite(errors)], 0.0})]
+        for budget in (50, 120, 333, 799, 800):
+            within = [front for front in fronts if points[front].sum() <= budget]
+            found = blocks.front_within(errors, points, budget)
+            assert points[found].sum() <= budget
+            assert found.tolist() == (within[0].tolist() if within else [0]), "the root is all that is left"
+        assert blocks.front_within(errors, points, int(points[0]) - 1) is None
+
+
 def test_every_point_is_drawn_once_or_stood_for(built):
     _, tree = built
     above = {at: {at} for at in range(len(tree.blocks))}

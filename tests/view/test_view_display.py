@@ -28,7 +28,6 @@ from surfkit.view.display import (
     drawn,
     fewer_faces,
     height_bounds,
-    most_visible,
     normals_of,
     some,
 )
@@ -76,16 +75,7 @@ def test_a_huge_splat_stays_finite():
     assert np.isfinite(found.covariances.astype(np.float16)).all()
 
 
-def test_a_budget_keeps_what_is_seen_most():
-    splats = table(1000)
-    weight = torch.sigmoid(splats.opacity_logits) * splats.log_scales.exp().topk(2, 1).values.prod(1)
-    for budget in (1, 10, 999):
-        rows = most_visible(splats, budget)
-        assert len(rows) == budget and (rows[1:] > rows[:-1]).all()
-        left = torch.ones(1000, dtype=torch.bool)
-        left[rows] = False
-        assert weight[rows].min() >= weight[left].max() * (1 - 1e-5)
-    assert len(most_visible(splats, 1000)) == len(most_visible(splats, 10**9)) == 1000
+def test_a_budget_of_points():
     assert some(10, 3).tolist() == [0, 4, 9] and len(some(0, 5)) == 0 and some(3, 9).tolist() == [0, 1, 2]
 
 
@@ -100,9 +90,26 @@ def test_a_budget_takes_a_level_of_detail_where_there_is_one():
         found, told = Shelf(subject).within(budget)
         assert len(found) == count and said in told
     found, told = Shelf(subject).within(5)
-    assert len(found) == 5 and told.startswith("5 of 100")
+    assert len(found) == 5 and told.startswith("5 splats, drawn by lot")
     found, told = Shelf(replace(subject, levels=None)).within(40)
-    assert len(found) == 40 and told.startswith("40 of 100")
+    assert len(found) == 40 and told.startswith("40 splats, drawn by lot") and "surfkit lod" not in told
+
+
+def test_splats_in_their_places():
+    found = drawn(table(20))
+    places = np.random.default_rng(0).permutation(50)[:20]
+    spread = found.placed(places, 50)
+    free = np.setdiff1d(np.arange(50), places)
+    for name in ("means", "covariances", "rgb", "opacities"):
+        assert np.array_equal(getattr(spread, name)[places], getattr(found, name))
+    assert len(spread.means) == 50 and not spread.opacities[free].any() and spread.unit == found.unit
+
+
+def test_covariances_of_a_choice_are_in_the_unit_of_the_model():
+    splats = table(300)
+    shelf = Shelf(Subject(Path("s"), Frame(np.zeros(3), 1.0), np.array([0.0, 0, 1]), splats))
+    whole, some_of_it = shelf.drawn(splats, "as trained"), shelf.drawn(splats.take(slice(0, 7)), "as trained")
+    assert some_of_it.unit == whole.unit and np.allclose(some_of_it.covariances, whole.covariances[:7])
 
 
 def grid(n, bend=0.0):
