@@ -15,7 +15,9 @@ from surfkit.raster.api import CUTOFF
 from surfkit.scene.camera import Camera
 
 BESIDE = 1 / 16
-"""What lengths count beside the image, as a share: a camera that turns meets something there, but coarser."""
+"""What lengths count beside the image in a lot, as a share: a camera that turns meets something there."""
+SPARE = 0.1
+"""Of the budget for levels of detail that lie beside the image, in the coarsest blocks."""
 WIDER = 1.1
 """By which the image is widened: what lies at its border is there when the camera turns a little."""
 SAMPLES = 32
@@ -135,23 +137,28 @@ class Levels:
         self.samples = self._take(np.minimum(rows, self.starts[-1] - 1).reshape(-1))
 
     def choose(self, budget: int, eye: Eye) -> Chosen | None:
-        """At most `budget` splats for a camera; None if the coarsest level has more."""
+        """At most `budget` splats for a camera; None if the coarsest ones that it sees are more."""
         eye = eye.widened()
         outside = self.blocks.outside(eye.camera, eye.near)
-        errors = self.blocks.pixels(eye.camera) * np.where(outside, BESIDE, 1.0)
+        errors = np.where(outside, 0.0, self.blocks.pixels(eye.camera))
         inside, _ = eye.sees(self.samples.means.float(), reach_of(self.samples))
         share = inside.view(-1, SAMPLES).float().mean(1).numpy()
-        points = self.sizes * np.where(outside, 1.0, share)
-        allowed = float(budget)
+        points = np.where(outside, 0.0, self.sizes * share)
+        most = allowed = (1 - SPARE) * budget
         while (front := self.blocks.front_within(errors, points, int(allowed))) is not None:
-            ids = self._ids(front)
+            ids = self._ids(front[~outside[front]])
             found = self._take(ids)
-            kept = eye.sees(found.means.float(), reach_of(found))[0]
-            kept |= torch.from_numpy(np.repeat(outside[front], self.sizes[front]))
-            if (count := int(kept.sum())) <= budget:
-                return Chosen(ids[kept.numpy()], found.take(kept))
-            allowed *= SAFE * budget / count
+            kept = eye.sees(found.means.float(), reach_of(found))[0].numpy()
+            if (count := int(kept.sum())) <= most:
+                return self._with_beside(ids[kept], front[outside[front]], budget - count)
+            allowed *= SAFE * most / count
         return None
+
+    def _with_beside(self, ids: np.ndarray, beside: np.ndarray, room: int) -> Chosen:
+        """Splats that are seen, and for so many more, blocks that are not: the coarsest first."""
+        beside = beside[np.argsort(-self.blocks.level[beside], kind="stable")]
+        ids = np.concatenate([ids, self._ids(beside[np.cumsum(self.sizes[beside]) <= room])])
+        return Chosen(ids, self._take(ids))
 
     def _ids(self, front: np.ndarray) -> np.ndarray:
         """(n,) rows of some blocks, counted through all levels."""
@@ -161,6 +168,8 @@ class Levels:
 
     def _take(self, ids: np.ndarray) -> SplatTable:
         """Splats by `_ids`, in their order."""
+        if not len(ids):
+            return self.tables[0].take(slice(0, 0))
         level = np.searchsorted(self.starts, ids, side="right") - 1
         order = np.argsort(level, kind="stable")
         parts = [
