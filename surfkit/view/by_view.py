@@ -17,7 +17,7 @@ from surfkit.scene.camera import Camera
 BESIDE = 1 / 16
 """What lengths count beside the image in a lot, as a share: a camera that turns meets something there."""
 SPARE = 0.1
-"""Of the budget for levels of detail that lie beside the image, in the coarsest blocks."""
+"""Of the budget, for the coarsest levels of detail beside the image."""
 WIDER = 1.1
 """By which the image is widened: what lies at its border is there when the camera turns a little."""
 SAMPLES = 32
@@ -92,7 +92,7 @@ class Lot:
     def __init__(self, table: SplatTable) -> None:
         """Of a table in the local frame."""
         draw = torch.Generator().manual_seed(0)
-        self.table, self.means = table, table.means.float()
+        self.table, self.means = of_degree_0(table), table.means.float()
         self.weights = visibility(table)
         self.luck = -torch.rand(len(table), generator=draw).clamp_min(1e-12).log()
         self.reach = CUTOFF * table.log_scales.float().amax(1).exp()
@@ -129,7 +129,7 @@ class Levels:
     def __init__(self, tree: LodTree) -> None:
         """Of a tree whose primitive files of splats have a place for."""
         self.blocks = blocks = tree.blocks
-        self.tables = [level.primitive.table(level.params).on_cpu() for level in tree.levels]
+        self.tables = [of_degree_0(level.primitive.table(level.params)).on_cpu() for level in tree.levels]
         self.starts = np.concatenate([[0], np.cumsum([len(table) for table in self.tables])])
         self.sizes = blocks.last - blocks.first
         steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
@@ -144,7 +144,7 @@ class Levels:
         inside, _ = eye.sees(self.samples.means.float(), reach_of(self.samples))
         share = inside.view(-1, SAMPLES).float().mean(1).numpy()
         points = np.where(outside, 0.0, self.sizes * share)
-        most = allowed = (1 - SPARE) * budget
+        most = allowed = budget - min(SPARE * budget, self.sizes[outside & self.blocks.is_leaf].sum())
         while (front := self.blocks.front_within(errors, points, int(allowed))) is not None:
             ids = self._ids(front[~outside[front]])
             found = self._take(ids)
@@ -178,6 +178,11 @@ class Levels:
         ]
         back = torch.from_numpy(np.argsort(order, kind="stable"))
         return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts])[back] for name in COLUMNS})
+
+
+def of_degree_0(table: SplatTable) -> SplatTable:
+    """Without what browsers do not draw."""
+    return replace(table, sh_rest=table.sh_rest[:, :0])
 
 
 def visibility(table: SplatTable) -> Tensor:

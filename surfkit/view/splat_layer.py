@@ -35,7 +35,7 @@ class SplatLayer:
         self.shelf, self.client, self.count = shelf, client, count
         self.drawing, self.moving, self.node = threading.Lock(), False, None
         self.stand: Stand | None = None
-        self.sent, self.places = 0.0, np.zeros(0, np.int64)
+        self.chosen, self.places = 0.0, np.zeros(0, np.int64)
         gui = client.gui
         self.shown = gui.add_checkbox("splats", True)
         self.form = gui.add_dropdown("draw as", FORMS, initial_value=shelf.form, hint="Points are less work.")
@@ -49,6 +49,7 @@ class SplatLayer:
         self.budget.on_update(telling(client, Latest(self.draw)))
         self.following = Following(self._follow)
         client.camera.on_update(self.following.moved)
+        self.following.moved()  # it may have, while the first splats were chosen
 
     @property
     def by_view(self) -> bool:
@@ -76,11 +77,12 @@ class SplatLayer:
         budget = min(self.budget.value, MOVING) if self.moving else self.budget.value
         as_points = self.moving or self.form.value == "points"
         if self.by_view:
-            self.stand = stand = Stand.of(self.client.camera)
+            self.chosen, self.stand = time.monotonic(), None
+            stand = Stand.of(self.client.camera)
             chosen, told = self.shelf.for_eye(budget, stand.eye)
             if Stand.of(self.client.camera).far_from(stand):
-                self.stand = None  # these are no longer wanted: the next ones are
-                return
+                return  # these are no longer wanted: the next ones are
+            self.stand = stand
             found = self.shelf.drawn(chosen.table, colors)
             if not as_points:
                 found = found.placed(self._places_of(chosen, budget), budget)
@@ -97,7 +99,6 @@ class SplatLayer:
                 found.opacities[:, None],
                 scale=WORLD * found.unit,
             )
-        self.sent = time.monotonic()
         legend = {"height": f"; {self.shelf.height_words()}", "normal": "; red east, green north, blue up"}
         self.note.content = told + legend.get(colors, "")
 
@@ -121,12 +122,10 @@ class SplatLayer:
             self.note.content = f"not updated: {' '.join(f'{type(error).__name__}: {error}'.split())}"
 
     def _is_due(self, moves: bool) -> bool:
-        if self.stand is None:
-            return True
+        if moves and time.monotonic() - self.chosen < BETWEEN_S:
+            return False
         here = Stand.of(self.client.camera)
-        if not moves:
-            return not here.same_as(self.stand)
-        return time.monotonic() - self.sent >= BETWEEN_S and here.far_from(self.stand)
+        return self.stand is None or (here.far_from(self.stand) if moves else not here.same_as(self.stand))
 
 
 def add_points(client: viser.ClientHandle, name: str, xyz: np.ndarray, rgb: np.ndarray, size: float) -> Any:
