@@ -142,10 +142,10 @@ class Levels:
         outside = self.blocks.outside(eye.camera, eye.near)
         errors = np.where(outside, 0.0, self.blocks.pixels(eye.camera))
         inside, _ = eye.sees(self.samples.means.float(), reach_of(self.samples))
-        share = inside.view(-1, SAMPLES).float().mean(1).numpy()
+        share = inside.view(-1, SAMPLES).float().mean(1).clamp_min(0.5 / SAMPLES).numpy()
         points = np.where(outside, 0.0, self.sizes * share)
         most = allowed = budget - min(SPARE * budget, self.sizes[outside & self.blocks.is_leaf].sum())
-        while (front := self.blocks.front_within(errors, points, int(allowed))) is not None:
+        while allowed >= 1 and (front := self.blocks.front_within(errors, points, int(allowed))) is not None:
             ids = self._ids(front[~outside[front]])
             found = self._take(ids)
             kept = eye.sees(found.means.float(), reach_of(found))[0].numpy()
