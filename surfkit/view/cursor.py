@@ -1,7 +1,8 @@
 """Coordinates under a pointer that moves: viser tells of clicks only, so a script on its page asks for them.
 
-The script (cursor.js) finds in the page which client it is, and sends where the pointer is; the server casts the ray of
-that pixel as it does for a click. When the camera moves under a pointer at rest, the server tells the script to ask again.
+The script (cursor.js) finds in the page which client it is, and sends where the pointer is. The server casts the ray of
+that pixel as it does for a click. When the camera moves under a pointer at rest, the server tells the script to ask
+again.
 """
 
 from __future__ import annotations

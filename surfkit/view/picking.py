@@ -14,6 +14,8 @@ from surfkit.scene.scene import View
 
 PER_CELL = 256
 """Triangles or points that are looked at together, about."""
+MOST_WITHIN, SAMPLE = (1, 99), 100_000
+"""Percentiles of about so many places between which the cells lie."""
 FOCAL = 1000.0
 """Pixels: of the picture of a single ray, about that of a window."""
 SEEN = 0.5
@@ -72,9 +74,10 @@ class Places:
 
 def into_cells(middles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The order of (N, 3) places by the cells of a grid, and where each cell that has some begins and ends in it."""
-    low, size = middles.min(0), np.ptp(middles, axis=0)
+    low, high = np.percentile(middles[:: max(1, len(middles) // SAMPLE)], MOST_WITHIN, axis=0)
     parts = max(1, round(np.sqrt(len(middles) / PER_CELL)))  # a surface fills as many cells as a square has
-    cells = np.minimum((middles - low) / max(float(size.max()), 1e-30) * parts, parts - 1).astype(np.int64)
+    cells = (middles - low) / max(float((high - low).max()), 1e-30) * parts
+    cells = cells.clip(0, parts - 1).astype(np.int64)  # what lies far away is in the cells at the rim
     keys = (cells[:, 0] * parts + cells[:, 1]) * parts + cells[:, 2]
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
