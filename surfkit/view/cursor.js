@@ -81,6 +81,9 @@
   for (const kind of ["pointermove", "pointerdown", "pointerup", "pointercancel"]) {
     window.addEventListener(kind, follow, { capture: true, passive: true });
   }
+  for (const kind of ["wheel", "keydown"]) { // also while the panel is folded, or when the server has ended
+    window.addEventListener(kind, () => { due = at !== null; }, { capture: true, passive: true });
+  }
   document.documentElement.addEventListener("pointerleave", leave);
   setInterval(look, EVERY_MS / 4);
 })();

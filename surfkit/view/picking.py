@@ -74,7 +74,7 @@ class Places:
 
 def into_cells(middles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The order of (N, 3) places by the cells of a grid, and where each cell that has some begins and ends in it."""
-    low, high = np.percentile(middles[:: max(1, len(middles) // SAMPLE)], MOST_WITHIN, axis=0)
+    low, high = np.percentile(middles[:: max(1, len(middles) // SAMPLE)].astype(np.float64), MOST_WITHIN, axis=0)
     parts = max(1, round(np.sqrt(len(middles) / PER_CELL)))  # a surface fills as many cells as a square has
     cells = (middles - low) / max(float((high - low).max()), 1e-30) * parts
     cells = cells.clip(0, parts - 1).astype(np.int64)  # what lies far away is in the cells at the rim

@@ -274,4 +274,7 @@ def test_points_are_met_by_cells_as_one_by_one():
     assert all((a is None) == (b is None) and (a is None or abs(a - b) < 1e-9) for a, b in answers)
     assert 15 < sum(a is not None for a, _ in answers) < 60
     assert Places(xyz[:1]).hit(xyz[0] - np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.0]), 0.01) == pytest.approx(2)
+    far = np.zeros((500, 3), np.float32)
+    far[-1] = 1e12
+    assert Places(far).hit(np.array([0.0, 0.0, -2.0]), np.array([0.0, 0.0, 1.0]), 0.01) == pytest.approx(2)
     assert Places(np.zeros((5, 3), np.float32)).hit(np.ones(3), np.array([1.0, 0.0, 0.0]), 0.01) is None
