@@ -55,7 +55,9 @@ def page(tmp_path_factory):
 @contextmanager
 def connected(page):
     found = Browser(page.url)
-    found.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    found.wait_for(lambda b: any(row["type"] == "ScenePointerEnableMessage" for row in b.told))
+    if not page.script.missing:  # the page is there as soon as its client is known
+        found.wait_for(lambda b: ask(page, client=tag(b)[0])[0] != 404)
     yield found
     found.close()
 
