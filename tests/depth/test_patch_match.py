@@ -11,6 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.patch_match import PatchMatch
+from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
@@ -122,6 +123,24 @@ def test_the_kernel_is_the_weighted_correlation_of_windows(samples):
             wanted, abs=5e-3
         )  # positions are rounded to a 64th of a pixel, in noise
     assert np.ptp(planes.cost[4:20, 4:28]) > 0.3
+
+
+def test_a_window_of_which_nothing_counts_matches_nothing():
+    """With a narrow spread, as settings allow it, a bright pixel is compared with none of the dark ones around it."""
+    here, there = two_pictures(0)
+    dark = np.zeros_like(here.value)
+    dark[4::9, 4::9] = 255
+    here, terms = Grey(here.camera, dark), replace(STILL, spread=255 * 1e-4, samples=16, window=7)
+    assert not (pattern(7)[:2, :16] == 0).all(0).any()
+    for kernels in module().kernels():
+        module().use_kernels(kernels)
+        try:
+            planes = Planes.at(np.full(dark.shape, 0.5, np.float32), 1)
+            improve(here, [there], planes, terms, seed=0)
+        finally:
+            module().use_kernels(module().kernels()[0])
+        assert (planes.each[4::9, 4::9] == 255).all(), kernels
+        assert planes.cost.max() <= 2, kernels
 
 
 def test_the_reprojection_error_counts_up_to_its_limit():
