@@ -29,7 +29,10 @@ from surfkit.scene.scene import View
 from surfkit.scene.vectors import unit
 
 KEPT = 48
-"""Pictures and maps kept in memory."""
+"""Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
+case."""
+KEPT_BYTES, PIXEL_BYTES = 2 << 30, 15
+"""Of a pixel: twice as many photographs, pictures as they are compared, and depth maps of either stage."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
@@ -219,29 +222,34 @@ class Work:
     photometric consistency alone, and by geometric consistency too.
     """
 
-    def __init__(
-        self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]], wanted: Sequence[int]
-    ) -> None:
+    def __init__(self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]], wanted: Sequence[int]) -> None:
         self.settings, self.given, self.pairs, self.wanted = settings, given, pairs, set(wanted)
         self.users: list[list[int]] = [[at] for at in range(len(pairs))]  # each photograph, and those compared with it
         for at, others in enumerate(pairs):
             for other in others:
                 self.users[other].append(at)
         self.sweep = InitialPoints(longest=settings.coarsest)
+        kept = self.room()
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
-        self.value = lru_cache(2 * KEPT)(self.read)
-        self.grey = lru_cache(KEPT)(self.halved)
+        self.value = lru_cache(2 * kept)(self.read)
+        self.grey = lru_cache(kept)(self.halved)
         # Of maps of other photographs, the depth alone is kept: a seventh of the whole.
         self.photometric = lru_cache(1)(lambda at: self.kept(MATCHED, at, self.match))
-        self.depth = lru_cache(KEPT)(lambda at: inverse_of(self.photometric(at)))
+        self.depth = lru_cache(kept)(lambda at: inverse_of(self.photometric(at)))
         reconciled = lru_cache(1)(lambda at: self.kept(COMPARED, at, self.reconcile))
         self.consistent = reconciled if settings.consistency else self.photometric
-        self.consistent_depth = lru_cache(KEPT)(lambda at: inverse_of(self.consistent(at)))
+        self.consistent_depth = lru_cache(kept)(lambda at: inverse_of(self.consistent(at)))
         self.stages = (COMPARED, MATCHED) if settings.consistency else (MATCHED,)
         self.made: dict[str, set[int]] = {}  # or not needed
         for what in self.stages:
             every = range(len(pairs))
             self.made[what] = {at for at in every if self.path(what, at).exists() or not self.is_needed(what, at)}
+
+    def room(self) -> int:
+        """How many pictures and maps are kept in memory."""
+        pixels = max((c.width * c.height for c in (self.camera(at, 0) for at in range(len(self.pairs)))), default=1)
+        most = min(KEPT, KEPT_BYTES // (PIXEL_BYTES * pixels))
+        return max(most, 2 + max(map(len, self.pairs), default=0))
 
     def camera(self, at: int, level: int) -> Camera:
         """Of a photograph whose sides are halved `level` times."""

@@ -122,6 +122,18 @@ def test_no_color_of_what_is_in_front_or_has_moved(plain):
     assert (colors[shown & (places[:, 2] < 1e-3)][:, 1] > 150).all(), "the ground below the car is green"
 
 
+@pytest.mark.parametrize("behind", [1e-9, 0.0, -2.0])
+def test_what_passes_the_camera_hides_what_lies_behind_it(behind):
+    """A wall beside a street: one corner of a triangle is beside the camera, or further back."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 48.0, 36.0, 96, 72)
+    wall = np.array([[-3, -8, 2], [-3, 8, 2], [6, 0, behind]], np.float32)
+    far = np.array([[-0.5, -0.5, 9], [0.5, -0.5, 9], [0, 0.5, 9]], np.float32)
+    photo = np.zeros((3, 72, 96), np.uint8)
+    alone = sight(Mesh(far, np.array([[0, 1, 2]], np.int32)), camera, photo)
+    both = sight(Mesh(np.concatenate([wall, far]), np.arange(6, dtype=np.int32).reshape(2, 3)), camera, photo)
+    assert alone.faces.tolist() == [0] and not len(both.faces)
+
+
 def test_a_car_in_every_photograph_would_be_there(tmp_path):
     """The tests above can fail: without the refusal of outliers, the photograph with the car is chosen somewhere."""
     scene = town(tmp_path, car=3)
