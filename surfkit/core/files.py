@@ -44,6 +44,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
+    refuse_own(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
     former = path.with_name(f".{path.name}.{os.getpid()}.old.part")
@@ -59,6 +60,12 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             os.replace(former, path)
         for folder in (unfinished, former):
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def refuse_own(folder: Path) -> None:
+    """OSError if a folder is the one that this process works in, or around it: another one cannot take its place."""
+    if folder.is_dir() and Path.cwd().is_relative_to(folder.resolve()):
+        raise OSError(errno.EBUSY, "the folder that you are in, which cannot be replaced; name another", str(folder))
 
 
 def refuse_special(path: Path) -> None:

@@ -103,3 +103,15 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
             refuse_special(Path("/dev") / name)
     refuse_special(Path("/dev/shm/new.png"))
     refuse_special(tmp_path / "new.png")
+
+
+def test_the_folder_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+    (tmp_path / "out" / "here").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "out" / "here")
+    for path in (Path("."), Path(".."), tmp_path / "out"):
+        with pytest.raises(OSError, match="the folder that you are in"), replacing_folder(path):
+            pass
+    assert Path.cwd() == tmp_path / "out" / "here"
+    with replacing_folder(Path("new")) as folder:
+        (folder / "a").write_text("a")
+    assert Path("new/a").exists()

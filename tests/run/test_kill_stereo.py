@@ -69,9 +69,9 @@ def test_maps_that_are_there_are_not_made_again(farm, tmp_path, own_cache):
     matched = arrays(cache)
     assert len(matched) == 4 and all("matching-photographs" in name for name in matched)
     assert list(cache.rglob(".*.part")), "it died while it wrote"
-    killed(farm, here, at=10 + 1)  # ten more before the first map, each of which is three files
-    assert arrays(cache).items() >= matched.items() and len(arrays(cache)) == 14
-    killed(farm, here, at=3 * 3 + 2)
+    killed(farm, here, at=8 + 1)  # eight more before the first map, each of which is three files
+    assert arrays(cache).items() >= matched.items() and len(arrays(cache)) == 12
+    killed(farm, here, at=2 + 3 * 3 + 2)
     there, before = arrays(cache), read_made(cache)
     assert before.maps == 3 and not (out / "recipe.json").exists()
     work = [name for name in there if ".work" in name]

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -561,3 +562,21 @@ def test_what_is_refused(tmp_path):
     scene.views[2].path.write_bytes(b"damaged")
     record = made(scene, tmp_path / "out")
     assert record["photographs"] <= 11, "the damaged one is passed over"
+
+
+def test_the_folder_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+    scene = town(tmp_path)
+    (tmp_path / "out" / "here").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "out" / "here")
+    for out in (".", "..", tmp_path / "out"):
+        with pytest.raises(OSError, match="the folder that you are in"):
+            made(scene, Path(out))
+
+
+def test_photographs_that_are_all_damaged_make_no_texture(tmp_path):
+    scene = town(tmp_path)
+    for view in scene.views:
+        view.path.write_bytes(b"damaged")
+    with pytest.raises(BadInput, match="of 12 photographs, none shows a triangle of it whole"):
+        made(scene, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
