@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.core.files import refuse_special, replacing, replacing_folder, sweep
+from surfkit.core.files import refuse_own, refuse_special, replacing, replacing_folder, sweep
 
 
 def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
@@ -105,13 +105,13 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     refuse_special(tmp_path / "new.png")
 
 
-def test_the_folder_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+def test_the_folder_one_is_in_is_refused(tmp_path, monkeypatch):
     (tmp_path / "out" / "here").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "out" / "here")
     for path in (Path("."), Path(".."), tmp_path / "out"):
-        with pytest.raises(OSError, match="the folder that you are in"), replacing_folder(path):
-            pass
-    assert Path.cwd() == tmp_path / "out" / "here"
-    with replacing_folder(Path("new")) as folder:
-        (folder / "a").write_text("a")
-    assert Path("new/a").exists()
+        with pytest.raises(OSError, match="the folder that you are in"):
+            refuse_own(path)
+    for path in (Path("new"), Path("../there"), tmp_path / "out" / "here" / "in"):
+        path.mkdir()
+        refuse_own(path)
+    refuse_own(Path("none"))
