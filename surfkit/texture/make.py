@@ -206,10 +206,8 @@ def textured(
     chosen = kept.once("chosen", choose)
     kept.forget(LOOKED)
     if finer is None and (chosen["view"] == NONE).all():
-        raise BadInput(
-            f"{surface.path}: of {len(views)} photographs, none shows a triangle of it whole, outside of masks and "
-            "with nothing in front, so it has no texture"
-        )
+        told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
+        emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
     gains = chosen["gains"]
     levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))

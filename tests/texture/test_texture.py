@@ -12,7 +12,7 @@ from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
+from surfkit.core.events import PhotoSkipped, Warned
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.export.glb import read_glb
 from surfkit.mesh.base import Mesh
@@ -573,10 +573,12 @@ def test_the_folder_one_is_in_is_not_replaced(tmp_path, monkeypatch):
             made(scene, Path(out))
 
 
-def test_photographs_that_are_all_damaged_make_no_texture(tmp_path):
-    scene = town(tmp_path)
+def test_photographs_that_are_all_damaged_make_a_note(tmp_path, monkeypatch):
+    scene, told = town(tmp_path), []
     for view in scene.views:
         view.path.write_bytes(b"damaged")
-    with pytest.raises(BadInput, match="of 12 photographs, none shows a triangle of it whole"):
-        made(scene, tmp_path / "none")
-    assert not (tmp_path / "none").exists()
+    monkeypatch.setattr(make, "emit", told.append)
+    record = made(scene, tmp_path / "out", replace(PNG, formats=("obj",)))
+    assert record["seen"] == 0 and sum(isinstance(event, PhotoSkipped) for event in told) == 12
+    (warned,) = [event.text for event in told if isinstance(event, Warned)]
+    assert "of 12 photographs, none shows a triangle whole" in warned
