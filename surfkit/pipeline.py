@@ -11,7 +11,7 @@ from typing import Any
 from surfkit.blocks.block import plan_file
 from surfkit.blocks.schedule import Compute, tune_blocks
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, load, read_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
@@ -205,11 +205,20 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
     refuse_file(run.out)
     refuse_unused(run.recipe)
+    refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
     if run.recipe.partition is not None:
         compute.workers.ready()
     for mesher in run.recipe.meshers:
         mesher.ready()
+
+
+def refuse_unsaved(recipe: Recipe) -> None:
+    """BadInput if recipe.json could not be read again: JSON has no place for a setting, as of a part of a plugin."""
+    try:
+        load(Recipe, dump(recipe))
+    except TypeError as error:
+        raise BadInput(f"the recipe cannot be saved: {error}; the author of the part has to change that") from error
 
 
 def refuse_unplannable(run: Run, scene: Scene) -> None:

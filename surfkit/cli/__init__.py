@@ -138,6 +138,8 @@ def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:
         text = f"{' '.join(words[:1])}: {out_of_memory(error)}"
         _release(error)
         return f"{text}; {MEMORY_ADVICE.get(words[0], 'more memory is needed')}", 1
+    if isinstance(error, (FileExistsError, NotADirectoryError)) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: a file is in the place of a folder; name another", 2
     if isinstance(error, OSError) and error.filename is not None:  # no permission, a folder in the place of a file
         return f"{os.fsdecode(error.filename)}: {error.strerror}", 2
     return None

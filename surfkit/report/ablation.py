@@ -40,6 +40,9 @@ class Row:
     group: str = ""
 
     def __post_init__(self) -> None:
+        for text in (self.label, self.group):
+            if len(text.splitlines()) > 1:
+                raise BadInput(f"row {self.label!r}: label and group are one line each")
         for name in self.paper:
             if name not in COLUMNS:
                 raise BadInput(f"row {self.label!r}, paper: {unknown('column', name, COLUMNS)}")
