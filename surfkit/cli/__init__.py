@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from surfkit.cli.streams import READER_LEFT, reopen_closed, silence_lost_streams
+from surfkit.cli.streams import READER_LEFT, reopen_closed, replace_unknown_letters, silence_lost_streams
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
@@ -74,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Idle threads of torch would otherwise spin, and use as much CPU time as the work itself.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     reopen_closed()
+    replace_unknown_letters()
     try:
         status = _guarded(words)
         sys.stdout.flush()

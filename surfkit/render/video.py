@@ -63,12 +63,14 @@ def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
 
 def refuse_cut_off(cv2: ModuleType, video: Path, path: Path, frames: Sequence[Path]) -> None:
     """Fault if a video, to be called `path`, lacks frames: OpenCV does not say when a file could not be written."""
-    reader = cv2.VideoCapture(str(video))
+    reader, count = cv2.VideoCapture(str(video)), 0  # what its head says of its length is right even then
     try:
-        count = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+        while reader.grab():
+            count += 1
+            emit(Progress("checking the video", count, len(frames)))
     finally:
         reader.release()
-    if count < len(frames) - 1:  # WebM files tell their length in milliseconds
+    if count < len(frames):
         raise Fault(
             f"{path}: the video could not be written to its end; free some space on the disk, then give the same "
             f"command again: the pictures in {frames[0].parent} are kept"

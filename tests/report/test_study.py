@@ -18,6 +18,7 @@ from surfkit.readers.read import read
 from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
 from surfkit.report import rows
 from surfkit.report.ablation import Row, Table
+from surfkit.report.rows import Outcome
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
 from surfkit.report.table import lines, markdown
@@ -172,6 +173,14 @@ def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_p
     with pytest.raises(BadInput, match=rf"--out {plan.out} has rows .* photograph {photo.name} has changed"):
         ablate(replace(plan, seeds=2), Silent())
     assert runs.calls == [] and rows_in(ablate(plan, Silent()))[0]["runs"] == rows_in(first)[0]["runs"]
+
+
+def test_a_row_that_draws_nothing_is_done_without_lpips(data, tmp_path):
+    plan = Plan(TABLE, (data,), tmp_path, columns=("lpips",))
+    trial, spent = trials(plan)[0], {"seconds": 1.0, "cpu_seconds": 1.0}
+    assert plan.is_done(trial, Outcome(spent)) and not plan.is_done(trial, Outcome())
+    assert not plan.is_done(trial, Outcome(spent | {"psnr": 20.0}))
+    assert plan.is_done(trial, Outcome(spent | {"psnr": 20.0, "lpips": 0.3}))
 
 
 def test_some_rows_now_and_the_others_later(data, runs, tmp_path):
