@@ -109,10 +109,13 @@ def test_a_broken_plugin_is_reported_and_breaks_nothing(world, install, capsys, 
         ("    @abc.abstractmethod\n    def weigh(self): pass\n", "Acme lacks weigh, which every Loss must have"),
     ],
 )
-def test_a_part_that_cannot_be_used_is_not_offered(world, install, more, reason):
+def test_a_part_that_cannot_be_used_is_not_offered(world, install, capsys, more, reason):
     install("acme", "import abc\n" + GOOD.replace("NAME", "'far'").replace("away.'''\n", f"away.'''\n\n{more}"))
     assert set(components(world.Loss)) == {"l1", "depth"}
     assert reason in failures()[0].error
+    for words in (["components", "loss"], ["recipes"], ["tables"]):
+        assert main(words) == 0
+        assert capsys.readouterr().err.startswith("surfkit: plugin acme (acme-dist 1.0) is not in use: surfkit_compo")
     assert main(["train", "recipe:discs", "--data", "d"]) == 0
 
 
