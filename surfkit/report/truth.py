@@ -65,8 +65,8 @@ class Truth:
         What `surfkit evaluate` has measured with other settings, or in another volume, is not that.
         """
         geometry = (metrics.get("compressed") or {} if compressed else metrics).get("geometry") or {}
-        made = geometry.get("table") or {}
-        is_same = bool(made) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
+        made = geometry.get("table")
+        is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
         return geometry.get("truth") == str(self.path) and is_same
 
     def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
