@@ -69,6 +69,11 @@ class Trim(Prune):
             return None
         return Edit(drop=lowest(self._scores(step.views), self.ratio))
 
+    def edits(self, steps: int, views: int) -> range:
+        """See `Prune.edits`; beside them, the first step drops what no view sees."""
+        due = self.trims(views)
+        return range(due.start, min(due.stop, steps + 1), due.step)
+
     def trims(self, views: int) -> range:
         """The steps that trim where so many views are an epoch, unless opacities have just been reset."""
         unit = views if self.whole_epochs else 1

@@ -90,6 +90,23 @@ def test_trims_at_given_steps_whatever_an_epoch_is(crowd):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "policy",
+    [
+        Trim(start=1_000, until=2_000, every=300),
+        Importance(at=(0, 7, 1_200, 9_000)),
+        Faint(start=500, until=1_100, every=100),
+        Importance(at=(9_000,)),
+        Trim(until=900),
+    ],
+)
+@pytest.mark.parametrize("steps", [900, 1_500])
+def test_steps_that_remove_points_are_foretold(crowd, policy, steps):
+    unseen = isinstance(policy, Trim)  # which drops, at the first step, what no view sees
+    found = [i for i in range(1 + unseen, steps + 1) if dropped(policy, crowd, i) is not None]
+    assert list(policy.edits(steps, 7)) == found
+
+
 def schedule(recipe_steps, epoch):
     """Steps that add points and steps that trim, of a run of so many steps with so many views."""
     adc, trim = (rescale(policy, recipe_steps / 30_000) for policy in (ADC(), Trim()))
