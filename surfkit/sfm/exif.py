@@ -16,6 +16,8 @@ warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
 TAKEN, SUBSECOND, FOCAL_MM, FOCAL35_MM = 0x9003, 0x9291, 0x920A, 0xA405
+BODY, LENS = 0xA431, 0xA435
+"""Serial numbers."""
 PIXELS_X, PER_UNIT_X, UNIT = 0xA002, 0xA20E, 0xA210
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, ERROR_M = 1, 2, 3, 4, 5, 6, 31
 UNIT_MM = {2: 25.4, 3: 10.0}
@@ -34,6 +36,7 @@ class Exif:
 
     Attributes:
         camera: Make and model.
+        serial: Serial numbers of body and lens, and the number in a rig: which one of several equal cameras it is.
         taken: Time, "2024:05:01 12:00:00.25", which sorts by time.
         orientation: 1 to 8, as EXIF numbers them; 1 is upright.
         focal_px: Focal length in pixels of the longer side's direction, at the size of the file.
@@ -43,10 +46,16 @@ class Exif:
 
     camera: str | None = None
     taken: str | None = None
+    serial: str | None = None
     orientation: int = 1
     focal_px: float | None = None
     position: tuple[float, float, float] | None = None
     accuracy_m: tuple[float, float, float] | None = None
+
+    @property
+    def which(self) -> str | None:
+        """Make and model, and which of several equal cameras it is."""
+        return self.camera if self.serial is None else f"{self.camera} {self.serial}"
 
 
 def read_exif(image: Image.Image, size: tuple[int, int]) -> Exif:
@@ -78,12 +87,18 @@ def facts(
     turned = basic.get(ORIENTATION, 1)
     return Exif(
         camera=" ".join(filter(None, names)) or None,
+        serial=_serial(camera, xmp),
         taken=f"{taken}.{part}" if taken and part else taken,
-        orientation=turned if turned in range(1, 9) else 1,
+        orientation=int(turned) if turned in range(1, 9) else 1,
         focal_px=_focal_px(camera, size),
         position=_position(gps),
         accuracy_m=_accuracy(gps, xmp),
     )
+
+
+def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
+    found = [*(_text(tags.get(tag)) for tag in (BODY, LENS)), xmp.get("RigCameraIndex")]
+    return " ".join(str(part) for part in found if part is not None) or None
 
 
 def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
@@ -104,7 +119,7 @@ def _position(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
     altitude = _number(tags.get(ALTITUDE), negative=True)
     if latitude is None or longitude is None or altitude is None or (latitude, longitude) == (0, 0):
         return None
-    below = tags.get(ALTITUDE_REF) in (1, b"\x01")
+    below = tags.get(ALTITUDE_REF) in (1, b"\x01", 3, b"\x03")  # sea level; the ellipsoid, from EXIF 3.0 on
     return latitude, longitude, -altitude if below else altitude
 
 
@@ -116,7 +131,7 @@ def _degrees(value: Any, half: Any, negative: str, most: float) -> float | None:
     found = degrees + minutes / 60 + seconds / 3600
     if not (math.isfinite(found) and abs(found) <= most):
         return None
-    return -found if _text(half) == negative else found
+    return -found if (_text(half) or "").upper().startswith(negative) else found
 
 
 def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, float, float] | None:

@@ -71,6 +71,22 @@ def test_accuracies(xmp, found):
     assert facts({}, {}, {exif.ERROR_M: 4.0}, {}, (40, 30)).accuracy_m == (4, 4, 8)
 
 
+@pytest.mark.parametrize("south, below, height", [("S", b"\x03", -12.5), ("South", b"\x02", 12.5), ("s", 1, -12.5)])
+def test_halves_of_the_earth_and_heights_below_either_zero(south, below, height):
+    gps = {exif.LATITUDE_REF: south, exif.LATITUDE: (33, 30, 0), exif.LONGITUDE_REF: "W", exif.LONGITUDE: (70, 0, 0)}
+    found = facts({}, {}, gps | {exif.ALTITUDE_REF: below, exif.ALTITUDE: 12.5}, {}, (40, 30)).position
+    assert found == (-33.5, -70, height)
+
+
+def test_which_of_several_equal_cameras_it_is():
+    basic = {exif.MAKE: "MicaSense", exif.MODEL: "RedEdge", exif.ORIENTATION: IFDRational(6)}
+    rig = exif._xmp("<Camera:RigCameraIndex>2</Camera:RigCameraIndex>")
+    found = facts(basic, {exif.BODY: "RX01-17"}, {}, rig, (40, 30))
+    assert found.which == "MicaSense RedEdge RX01-17 2.0" and found.camera == "MicaSense RedEdge"
+    assert facts(basic, {}, {}, {}, (40, 30)).which == "MicaSense RedEdge"
+    assert type(found.orientation) is int and found.orientation == 6, "it is kept as a whole number"
+
+
 @pytest.mark.parametrize(
     "gps",
     [
