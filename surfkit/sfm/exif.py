@@ -24,7 +24,9 @@ UNIT_MM = {2: 25.4, 3: 10.0}
 """Of the focal plane's resolution: inch, centimetre."""
 DIAGONAL35_MM = math.hypot(36, 24)
 """Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
-XMP = re.compile(r"(?:drone-dji|Camera):(\w+)(?:=[\"']|>)\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)")
+LIKELY = (0.1, 10.0)
+"""Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
+XMP = re.compile(r"(?:drone-dji|Camera):(\w+)(?:=[\"']|>)\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?=\s*[\"'<])")
 """Numbers that DJI, and cameras by Pix4D's convention, write into XMP, as attributes or elements."""
 MOST_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
@@ -103,14 +105,19 @@ def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
 
 def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     focal, equivalent = _number(tags.get(FOCAL_MM)), _number(tags.get(FOCAL35_MM))
-    if equivalent:
-        return equivalent / DIAGONAL35_MM * math.hypot(*size)
+    if equivalent and _is_likely(found := equivalent / DIAGONAL35_MM * math.hypot(*size), size):
+        return found
     density, unit = _number(tags.get(PER_UNIT_X)), UNIT_MM.get(tags.get(UNIT, 2))
     width = _number(tags.get(PIXELS_X))
     if not (focal and density and unit and width):
         return None
     sensor_mm = width / density * unit  # of the direction that was the width when the photograph was taken
-    return focal / sensor_mm * max(size) if sensor_mm > 0.5 else None
+    found = focal / sensor_mm * max(size)
+    return found if _is_likely(found, size) else None
+
+
+def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:
+    return LIKELY[0] < focal_px / max(size) < LIKELY[1]
 
 
 def _position(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:

@@ -54,6 +54,9 @@ def test_focal_lengths():
     half = facts({}, plane | {exif.PER_UNIT_X: 5472 / 1.32}, {}, {}, (2736, 1824)).focal_px
     assert half == pytest.approx(8.8 / 13.2 * 2736)  # reduced by a program that kept EXIF
     assert facts({}, {exif.FOCAL_MM: 8.8}, {}, {}, size).focal_px is None
+    dpi = {exif.FOCAL_MM: 8.8, exif.PIXELS_X: 5472, exif.PER_UNIT_X: 72, exif.UNIT: 2}
+    for wrong in ({exif.FOCAL35_MM: 65535}, {exif.FOCAL35_MM: 1}, dpi):
+        assert facts({}, wrong, {}, {}, size).focal_px is None, "a wrong one would be held to"
 
 
 @pytest.mark.parametrize(
@@ -63,6 +66,7 @@ def test_focal_lengths():
         (PIX4D, (1.5, 1.5, 3.0)),
         ('drone-dji:RtkStdLon="0"', None),
         ("<", None),
+        (PIX4D.replace("1.5", "150/100"), None),  # a fraction is no 150 m
         (None, None),
     ],
 )
