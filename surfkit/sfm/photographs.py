@@ -131,16 +131,18 @@ def lens_groups(photos: Sequence[Photo]) -> list[int]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """All files below a folder, in folders that links lead to as well, but for those that programs keep for themselves,
-    as thumbnails."""
-    found, seen = [], set()
-    for here, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN))
-        if (place := os.path.realpath(here)) in seen:  # a link to a folder that was there, or that it is in
-            folders.clear()
-            continue
-        seen.add(place)
-        found += [Path(here, name) for name in names if not name.startswith(HIDDEN)]
+    """All files below a folder, but for those that programs keep for themselves, as thumbnails. Folders that links lead
+    to come after all others, so that each folder is looked into once, by its own name if it is inside."""
+    found, seen, starts = [], set(), [folder]
+    for start in starts:
+        for here, folders, names in os.walk(start):
+            if (place := os.path.realpath(here)) in seen:
+                folders.clear()
+                continue
+            seen.add(place)
+            folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN))
+            starts += [path for name in folders if (path := Path(here, name)).is_symlink()]
+            found += [Path(here, name) for name in names if not name.startswith(HIDDEN)]
     return sorted(path for path in found if path.is_file() or path.is_symlink())
 
 
@@ -151,12 +153,12 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     except OSError as error:
         return Photo(name, (0, 0), problem=f"a link that leads nowhere ({error.strerror})")
     stamp = (stat.st_size, stat.st_mtime_ns)
+    if not _is_text(name):
+        return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
     if before is not None and before.stamp == stamp:
         copy = (before.problem or "").startswith("a copy of")
         return replace(before, problem=None) if copy else before
-    if not _is_text(name):
-        return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     try:
         return _look(path, Photo(name, stamp))
     except BadInput as error:

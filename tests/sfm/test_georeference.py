@@ -154,6 +154,14 @@ def test_systems_that_will_not_do(crs, said):
         chart_of(np.array([[52.0, 16.0, 100.0]]), crs)
 
 
+def test_a_group_without_positions_is_refused_on_every_map():
+    needs("pyproj")
+    shots, _ = survey(grid(5))
+    for crs in ("EPSG:32633", "EPSG:2180"):
+        found = place(shots, [Photo(name, (0, 0)) for name in shots], Chart(crs, (0.0, 0.0, 0.0)))
+        assert isinstance(found, Refused) and "0 of 5 placed photographs have a position" in found.reason
+
+
 def test_at_the_pole_a_system_must_be_named():
     with pytest.raises(BadInput, match="--crs"):
         chart_of(np.array([[88.0, 16.0, 100.0]]), "auto")

@@ -75,10 +75,11 @@ def test_folders_behind_links_are_looked_into_once(folder, tmp_path_factory):
     save(flight / "x.jpg", picture(arc(4)[3]))
     save(folder / "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", picture(arc(5)[4]))
     (folder / "second").symlink_to(flight)
+    (folder / "deep again").symlink_to(folder / "deep er")  # before the folder itself, by name
     (flight / "back").symlink_to(folder)
     (folder / "gone.jpg").symlink_to(flight / "no.jpg")
     found = {photo.name: photo for photo in look(folder)}
-    assert len(found) == 9 and found["second/x.jpg"].usable
+    assert len(found) == 9 and found["second/x.jpg"].usable and "deep er/b.JPG" in found
     assert "leads nowhere" in found["gone.jpg"].problem
 
 
