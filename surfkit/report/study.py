@@ -57,7 +57,7 @@ class Plan:
         seeds: Runs of each row.
         rows: Numbers or labels of those to run; all if empty.
         device: Where to compute.
-        max_points: No row grows beyond this number of points.
+        max_points: No row grows beyond this number of points, and none of its blocks while it is tuned.
         truth: For each data set, what the meshes of all rows are compared with, for their F1; rows without a mesh get
             one then. Empty to compare none.
         columns: Those of the written tables; what was measured if empty. LPIPS is measured only if it is named.

@@ -109,6 +109,9 @@ def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
     recipes = [trial.recipe for trial in trials(plan)]
     assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * len(MODEL.rows)
     assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
+    stages = [(path, stage) for recipe in recipes for path, stage, _ in recipe.stages() if stage.densify is not None]
+    assert {path for path, _ in stages} == {"pretrain", "partition_pretrain", "tune"}, "in blocks, too"
+    assert all(stage.densify.most_points == 500 for _, stage in stages)
     free = trials(replace(plan, max_points=None))
     assert not {trial.folder for trial in trials(plan)} & {trial.folder for trial in free}
     assert "at most 500 points" in markdown(report_of(plan, [], {}))
