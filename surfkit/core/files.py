@@ -75,6 +75,15 @@ def refuse_special(path: Path) -> None:
         raise OSError(errno.EINVAL, "a device or a pipe, not a file; name another", str(path))
 
 
+def refuse_unwritable(folder: Path) -> None:
+    """OSError if a folder cannot be made, or takes no files: asked before what is to lie in it is computed."""
+    found = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not found.is_dir():
+        raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
+    if not os.access(found, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(found))
+
+
 def sync_folder(folder: Path) -> None:
     """Let the disk know the names in a folder, where the file system has a way to be asked."""
     with suppress(OSError):
