@@ -11,7 +11,7 @@ from typing import Any
 from surfkit.blocks.block import plan_file
 from surfkit.blocks.schedule import Compute, tune_blocks
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, load, read_json
 from surfkit.core.events import FileWritten, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
@@ -126,7 +126,7 @@ def run(
             mesher.refuse_unfit(scene.frame)
         refuse_unplannable(run, scene)
         warn_of_gaps(scene, state)
-        warn_of_no_edits(run)
+        warn_of_no_edits(run, scene)
         warn_of_idle(run, compute)
         begun = state is not None or is_begun(run)
         run = use.enter_context(with_maps(run, scene, prints, caches, compute.device, begun))
@@ -205,11 +205,20 @@ def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
     refuse_file(run.out)
     refuse_unused(run.recipe)
+    refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
     if run.recipe.partition is not None:
         compute.workers.ready()
     for mesher in run.recipe.meshers:
         mesher.ready()
+
+
+def refuse_unsaved(recipe: Recipe) -> None:
+    """BadInput if recipe.json could not be read again: JSON has no place for a setting, as of a part of a plugin."""
+    try:
+        load(Recipe, dump(recipe))
+    except TypeError as error:
+        raise BadInput(f"the recipe cannot be saved: {error}; the author of the part has to change that") from error
 
 
 def refuse_unplannable(run: Run, scene: Scene) -> None:
@@ -364,10 +373,10 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     return run, state, scene
 
 
-def warn_of_no_edits(run: Run) -> None:
-    """Say which stages cannot add a point, though they are to."""
+def warn_of_no_edits(run: Run, scene: Scene) -> None:
+    """Say which stages cannot add a point, or never remove one by its worth, though they are to."""
     for at in run.stages:
-        stage = at.stage
+        stage, views = at.stage, 1 if at.name == "tune" else len(scene.train)  # a block may have few of them
         edits = stage.densify.edits(stage.steps) if stage.densify is not None else None
         if edits is not None and len(edits) == 0:
             emit(
@@ -376,6 +385,11 @@ def warn_of_no_edits(run: Run) -> None:
                     f"steps; more steps, or a lower {at.setting}.densify.start and every, change that"
                 )
             )
+        for number, prune in enumerate(stage.prune):
+            if (edits := prune.edits(stage.steps, views)) is not None and len(edits) == 0:
+                epochs = f" of {views:,} photographs to an epoch" * (views > 1)
+                due = f"is never due within its {stage.steps:,} steps{epochs}; more steps, or another schedule of it,"
+                emit(Warned(f"{at.setting}.prune.{number}: {name_of(prune)} {due} change that"))
 
 
 def warn_of_idle(run: Run, compute: Compute) -> None:

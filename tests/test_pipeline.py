@@ -240,8 +240,28 @@ def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data,
     texts, whole = [], recipes()["2dgs"].pretrain
     monkeypatch.setattr(pipeline, "emit", lambda event: texts.append(event.text))
     tune = replace(whole, steps=600, densify=replace(whole.densify, start=600))
-    pipeline.warn_of_no_edits(Run(tmp_path, replace(recipe, partition=cut, tune=tune), data))
+    pipeline.warn_of_no_edits(Run(tmp_path, replace(recipe, partition=cut, tune=tune), data), read(data))
     assert [text.partition(":")[0] for text in texts] == told
+
+
+def test_a_prune_that_is_never_due_is_told_before_the_run(recipe, data, tmp_path, monkeypatch):
+    """In 1,000 steps, trims end before the first; in 9,999 with epochs of 8,000, the second epoch ends too late."""
+    texts, scene = [], read(data)
+    monkeypatch.setattr(pipeline, "emit", lambda event: texts.append(event.text))
+
+    def told(recipe, views=scene.train):
+        texts.clear()
+        pipeline.warn_of_no_edits(Run(tmp_path, recipe, data), replace(scene, train=views))
+        return texts
+
+    city = recipes()["citygs2"]
+    assert len(told(with_steps(city, 1_000))) == 1 and texts[0].startswith("tune.prune.0: trim is never due within its")
+    assert told(with_steps(city, 4_000)) == [] and told(city) == []
+    trimmed = evolve(with_steps(recipes()["trim2dgs"], 10_000), "pretrain.prune.0.start", 8_001)
+    assert told(trimmed) == [] and told(trimmed, [None] * 8_000) == [
+        "pretrain.prune.0: trim is never due within its 10,000 steps of 8,000 photographs to an epoch; more steps, or "
+        "another schedule of it, change that"
+    ]
 
 
 @pytest.mark.parametrize(("name", "primitive"), [("2dgs", Surfel2D()), ("citygs2-coarse", Flat3D())])

@@ -76,6 +76,7 @@ def test_a_plugin_is_found(world, install):
     [
         ("import no_such_thing", "ModuleNotFoundError: No module named 'no_such_thing'"),
         ("raise RuntimeError('no\\n licence')", "RuntimeError: no licence"),
+        ("import sys\n\nsys.exit(3)", "SystemExit: 3"),
         (OFFER, "unknown hook 'surfkit_component'; did you mean 'surfkit_components'?"),
         (OFFER.replace("component():", "event(evnt):"), "PluginValidationError: "),
         (
@@ -98,6 +99,40 @@ def test_a_broken_plugin_is_reported_and_breaks_nothing(world, install, capsys, 
     assert main(["plugins"]) == 0
     assert f"broken-dist  1.0      not in use: {reason}" in capsys.readouterr().out
     assert main(["train", "recipe:discs", "--data", "d"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "reason"),
+    [
+        ("    every: int\n", "Acme: setting 'every' has no default; 'far' alone must choose a usable part"),
+        ("    every: 'Nope' = 3\n", "Acme: a type of its settings cannot be found: NameError: name 'Nope' is not"),
+        ("    @abc.abstractmethod\n    def weigh(self): pass\n", "Acme lacks weigh, which every Loss must have"),
+    ],
+)
+def test_a_part_that_cannot_be_used_is_not_offered(world, install, capsys, more, reason):
+    install("acme", "import abc\n" + GOOD.replace("NAME", "'far'").replace("away.'''\n", f"away.'''\n\n{more}"))
+    assert set(components(world.Loss)) == {"l1", "depth"}
+    assert reason in failures()[0].error
+    for words in (["components", "loss"], ["recipes"], ["tables"]):
+        assert main(words) == 0
+        assert capsys.readouterr().err.startswith("surfkit: plugin acme (acme-dist 1.0) is not in use: surfkit_compo")
+    assert main(["train", "recipe:discs", "--data", "d"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("hook", "value", "reason"),
+    [
+        ("recipes", "{'about': 'fast'}", "'mine' is {'about': 'fast'}, and not a surfkit.Recipe"),
+        ("tables", "[1, 2]", "'mine' is [1, 2], and not a surfkit.Table"),
+        ("rows", "Acme()", "'mine' is Acme(), and not a tuple of surfkit.Row"),
+        ("rows", "(1, Acme())", "'mine' is (1, Acme()), and not a tuple of surfkit.Row"),
+    ],
+)
+def test_offers_of_another_kind_take_only_their_plugin(world, install, capsys, hook, value, reason):
+    more = f"\n@hookimpl\ndef surfkit_{hook}():\n    return {{'mine': {value}}}\n"
+    install("acme", GOOD.replace("NAME", "'far'") + more)
+    assert main(["plugins"]) == 0 and main(["recipes"]) == 0 and main(["tables"]) == 0
+    assert f"not in use: surfkit_{hook}: {reason}" in capsys.readouterr().out
 
 
 def test_a_taken_name_names_both_owners(world, install):

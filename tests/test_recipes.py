@@ -1,18 +1,22 @@
 """The recipes say what was published."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import pytest
 
 from surfkit.cli.recipes import recipes
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
+from surfkit.core.registry import hookimpl, plugins
 from surfkit.densify import ADC, Importance, Trim
+from surfkit.densify.base import Prune
 from surfkit.losses import L1, SSIM, DepthRegression, Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import ContractedGrid, QuantileGrid
-from surfkit.pipeline import with_steps
+from surfkit.pipeline import run, with_steps
 from surfkit.primitives import Gaussian3D, Surfel2D
+from surfkit.readers.data import Data
 from surfkit.train.stage import rates_of
 
 
@@ -150,3 +154,41 @@ def test_citygs2_for_streets():
     for stage in (street.pretrain, street.tune):
         assert stage.losses["depth"].scale_band == (0.01, 50.0)
     assert street.assign.threshold == 0.01 and street.partition.blocks == (5, 4) and street.tune.prune == ()
+
+
+@dataclass(frozen=True)
+class Listed(Prune):
+    """With a setting that recipe.json could hold, and nobody could read."""
+
+    steps: list = field(default_factory=list)
+    """Of any kind."""
+
+    def edit(self, points, step):
+        return None
+
+
+@dataclass(frozen=True)
+class Held(Listed):
+    """With a setting that recipe.json cannot hold."""
+
+    steps: Any = field(default_factory=object)
+    """Of any kind."""
+
+
+@pytest.mark.parametrize("part", [Listed, Held])
+def test_a_recipe_that_could_not_be_read_again_is_refused_before_it_runs(part, tmp_path):
+    class Offers:
+        @hookimpl
+        def surfkit_components(self):
+            return {"own": part}
+
+    offers = Offers()
+    plugins().register(offers, "offers")
+    try:
+        plain = recipes()["2dgs"]
+        recipe = replace(plain, pretrain=replace(plain.pretrain, prune=(part(),)))
+        with pytest.raises(BadInput, match="the recipe cannot be saved: .*the author of the part"):
+            run(recipe, Data(tmp_path), tmp_path / "out")
+    finally:
+        plugins().unregister(offers)
+    assert not (tmp_path / "out").exists()

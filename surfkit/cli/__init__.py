@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from surfkit.cli.streams import READER_LEFT, reopen_closed, silence_lost_streams
+from surfkit.cli.streams import READER_LEFT, reopen_closed, replace_unknown_letters, silence_lost_streams
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
@@ -74,6 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Idle threads of torch would otherwise spin, and use as much CPU time as the work itself.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     reopen_closed()
+    replace_unknown_letters()
     try:
         status = _guarded(words)
         sys.stdout.flush()
@@ -138,6 +139,8 @@ def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:
         text = f"{' '.join(words[:1])}: {out_of_memory(error)}"
         _release(error)
         return f"{text}; {MEMORY_ADVICE.get(words[0], 'more memory is needed')}", 1
+    if isinstance(error, (FileExistsError, NotADirectoryError)) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: a file is in the place of a folder; name another", 2
     if isinstance(error, OSError) and error.filename is not None:  # no permission, a folder in the place of a file
         return f"{os.fsdecode(error.filename)}: {error.strerror}", 2
     return None

@@ -54,7 +54,8 @@ class Ablate:
     hardly densified, and rows differ little."""
 
     max_points: int | None = None
-    """Largest number of points of every row, so that rows are compared at equal size and fit into memory."""
+    """Largest number of points of every row, so that rows are compared at equal size and fit into memory. Where a row
+    cuts the scene, each block has the same limit: merged, they may come to more."""
 
     seeds: int = 1
     """Number of runs of each row, with seeds 0, 1, 2 and so on; with several, differences have a standard error."""

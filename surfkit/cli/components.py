@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_failures, print_table
 from surfkit.core.check import BadInput
 from surfkit.core.describe import settings, summary
 from surfkit.core.registry import Component, components, kebab, kind_of, offered, records, unknown
@@ -37,6 +37,7 @@ class Components:
         owners = owner_of()
         rows = [(kind, name, summary(cls), owners[cls]) for kind, parts in shown.items() for name, cls in parts.items()]
         print_table(("kind", "name", "what it does", "from"), rows)
+        print_failures()
 
 
 COMMAND = Components

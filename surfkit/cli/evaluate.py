@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.cli.result import show, show_geometry, show_levels
 from surfkit.core.check import BadInput
+from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
 from surfkit.evaluate.geometry.measure import measure_geometry
@@ -141,6 +142,7 @@ class Evaluate:
             if zones != Zones():
                 refuse_not_drawn(run)
         out = self.out or (self.target.with_name(f"{self.target.stem}-geometry") if run is None else shown.out)
+        refuse_unwritable(out / "geometry")
         scene = self._scene(run)
         if scene is not None:
             zones.refuse_too_many(scene)

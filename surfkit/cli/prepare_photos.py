@@ -110,7 +110,7 @@ def show(report: dict[str, Any], scene: Path) -> None:
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
     for name, why in list(lost.items())[:SHOWN]:
-        print(f"no camera for {name}: {why}")
+        print(f"no camera for {name!r}: {why}")
     if len(lost) > SHOWN:
         print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
     print(f"data set in {scene}; look at {scene / PICTURE}")

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from surfkit.cli.parts import with_parts
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_failures, print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.core.registry import offered_once
@@ -79,6 +79,7 @@ class Recipes:
     def run(self) -> None:
         """Print one line per recipe."""
         print_table(("recipe", "what it is"), [(name, about(recipe)) for name, recipe in recipes().items()])
+        print_failures()
 
 
 COMMAND = Recipes

@@ -245,7 +245,7 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         return f"{found[name]:.4f}" + ("" if error is None else f" +- {error:.4f}")
 
     crop = found["crop"]
-    where = "all" if crop is None else f"area {crop['area']:.0f}, heights {crop['low']:.4g} to {crop['high']:.4g}"
+    where = "all" if crop is None else f"area {crop['area']:.4g}, heights {crop['low']:.4g} to {crop['high']:.4g}"
     rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
     rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
     for label, name in (("chamfer", "chamfer"), ("chamfer, as DTU", "chamfer_dtu")):

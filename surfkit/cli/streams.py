@@ -28,6 +28,13 @@ def reopen_closed() -> None:
         setattr(sys, name, open(os.devnull, mode))
 
 
+def replace_unknown_letters() -> None:
+    """Let output have a question mark for what its encoding lacks: a name of other bytes, or ± where there is ASCII."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
 def silence_lost_streams() -> list[str]:
     """Give the output streams that take nothing any more to /dev/null, so that Python ends without a word of its own.
 

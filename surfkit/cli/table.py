@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from surfkit.core.registry import failures
+
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], errors: Sequence[int] = ()) -> None:
     """Print rows under a head: coloured and fitted to a terminal, else aligned text with one line per row.
@@ -27,3 +29,9 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], errors: Sequ
     widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
     for row in [head, *rows]:
         print("  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip())
+
+
+def print_failures() -> None:
+    """Say on stderr which installed plugins are not in use, and so not in a list that was printed."""
+    for plugin in failures():
+        print(f"surfkit: plugin {plugin} is not in use: {plugin.error}", file=sys.stderr)

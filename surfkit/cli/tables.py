@@ -10,7 +10,7 @@ from typing import Annotated, Any, Union
 import tyro
 
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_failures, print_table
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
 from surfkit.core.registry import unknown
@@ -58,6 +58,7 @@ class Tables:
         if self.table is None:
             known = tables()
             print_table(("table", "rows", "what it shows"), [(n, str(len(t.rows)), t.about) for n, t in known.items()])
+            print_failures()
             return
         name = self.table.removeprefix(MARK)
         known = tables([MARK + name])

@@ -61,12 +61,27 @@ def replacing_folder(path: Path) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def refuse_own(folder: Path) -> None:
+    """OSError if a folder is the one that this process works in, or around it: another one cannot take its place."""
+    if folder.is_dir() and Path.cwd().is_relative_to(folder.resolve()):
+        raise OSError(errno.EBUSY, "the folder that you are in, which cannot be replaced; name another", str(folder))
+
+
 def refuse_special(path: Path) -> None:
     """OSError if something else than a file has the name, such as a device: root would replace it for the machine."""
     if path.is_dir():
         raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if (path.exists() and not path.is_file()) or path.parent == Path("/dev"):
         raise OSError(errno.EINVAL, "a device or a pipe, not a file; name another", str(path))
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """OSError if a folder cannot be made, or takes no files: asked before what is to lie in it is computed."""
+    found = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not found.is_dir():
+        raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(found))
+    if not os.access(found, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(found))
 
 
 def sync_folder(folder: Path) -> None:

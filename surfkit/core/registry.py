@@ -14,7 +14,7 @@ import os
 import re
 from abc import ABC
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from typing import Annotated, Any, TypeVar, Union
 
@@ -22,6 +22,7 @@ import pluggy
 import tyro
 
 from surfkit.core.check import BadInput
+from surfkit.core.hints import hints_of
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.version import own_version
 
@@ -65,6 +66,12 @@ class Hooks:
 
 
 HOOKS = tuple(name for name in vars(Hooks) if name.startswith("surfkit_"))
+KINDS = {
+    "surfkit_recipes": "a surfkit.Recipe",
+    "surfkit_tables": "a surfkit.Table",
+    "surfkit_rows": "a tuple of surfkit.Row",
+}
+"""What the values of offering hooks are, beside parts."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +269,7 @@ def _load(manager: pluggy.PluginManager, point: importlib.metadata.EntryPoint) -
     origin = Plugin(point.name, point.dist.name if point.dist else "", point.dist.version if point.dist else "")
     try:
         _register(manager, point.load(), point.name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if is_out_of_memory(error):
             raise
         return Plugin(origin.name, origin.distribution, origin.version, error=_one_line(error))
@@ -298,6 +305,11 @@ def _check_offer(hook: str, name: str, value: Any) -> None:
     """Refuse what could not be named, saved or shared."""
     if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
         raise BadInput(f"{name!r} is not a name in kebab-case (lower-case letters, digits, single hyphens)")
+    if hook in KINDS:
+        items = list(value) if hook == "surfkit_rows" and isinstance(value, (tuple, list)) else [value]
+        wrong = [item for item in items if not is_dataclass(item) or isinstance(item, type)]
+        if wrong or (hook == "surfkit_rows" and items == [value]):
+            raise BadInput(f"{name!r} is {repr(value)[:80]}, and not {KINDS[hook]}")
     if hook != "surfkit_components":
         return
     if not (isinstance(value, type) and issubclass(value, Component)):
@@ -311,6 +323,15 @@ def _check_class(name: str, cls: type[Component]) -> None:
         raise BadInput(f"{_where(cls)} must be a frozen dataclass to be offered as {name!r}")
     if is_dataclass(cls) and any(field.name == "use" for field in fields(cls)):
         raise BadInput(f"{_where(cls)} has a setting named 'use', which saved recipes keep for the component's name")
+    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
+        raise BadInput(f"{_where(cls)} lacks {', '.join(missing)}, which every {kind_of(cls).__name__} must have")
+    unset = [f.name for f in fields(cls) if f.init and f.default is MISSING and f.default_factory is MISSING]
+    if unset:
+        raise BadInput(f"{_where(cls)}: setting {unset[0]!r} has no default; {name!r} alone must choose a usable part")
+    try:
+        hints_of(cls)
+    except Exception as error:  # a name that is not imported, or whatever else stands for a type
+        raise BadInput(f"{_where(cls)}: a type of its settings cannot be found: {_one_line(error)}") from error
 
 
 def _unused(name: str, records: Mapping[str, Plugin]) -> str:

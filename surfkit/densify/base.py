@@ -136,6 +136,14 @@ class Densify(Policy):
 class Prune(Policy):
     """A policy that removes points."""
 
+    def edits(self, steps: int, views: int) -> Sequence[int] | None:
+        """The steps 1 to `steps` of a stage with so many views after which points may be removed by what they are
+        worth, in order; None where that is not known.
+
+        Where there are none, a note says so before the run.
+        """
+        return None
+
 
 class Filter(Component):
     """A condition that a point must meet to be densified."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -50,6 +51,10 @@ class Importance(Prune):
             return None
         measure = significance if self.score == "significance" else importance
         return Edit(drop=lowest(measure(step.views, step.splats, self.power), self.ratio))
+
+    def edits(self, steps: int, views: int) -> Sequence[int]:
+        """See `Prune.edits`."""
+        return sorted({max(1, at) for at in self.at if at <= steps})
 
 
 def importance(views: Views, splats: Splats, power: float) -> Tensor:
@@ -99,3 +104,7 @@ class Faint(Prune):
         if not self.start < step.index <= self.until or step.index % self.every or step.since_reset < self.recovery:
             return None
         return Edit(drop=step.splats.opacities < self.below)
+
+    def edits(self, steps: int, views: int) -> range:
+        """See `Prune.edits`."""
+        return range((self.start // self.every + 1) * self.every, min(self.until, steps) + 1, self.every)

@@ -51,7 +51,8 @@ class Trim(Prune):
     steps, as in the released code."""
 
     recovery: Annotated[int, StepCount(floor=100)] = 500
-    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100."""
+    """Steps after a reset of the opacities without a trim, as ranking means nothing then; at least 100. One that falls
+    there comes at their end, unless the next is fewer than `every` steps away."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.ratio < 1:
@@ -65,9 +66,22 @@ class Trim(Prune):
         """Drop the lowest at the end of some epochs, and the unseen at the beginning."""
         if step.index == 1:
             return Edit(drop=step.views.contributions(self.gamma, 1 - self.gamma).views == 0)
-        if step.index not in self.trims(len(step.views)) or step.since_reset < self.recovery:
+        if not self.is_due(step.index, step.since_reset, len(step.views)):
             return None
         return Edit(drop=lowest(self._scores(step.views), self.ratio))
+
+    def edits(self, steps: int, views: int) -> range:
+        """See `Prune.edits`; beside them, the first step drops what no view sees."""
+        due = self.trims(views)
+        return range(due.start, min(due.stop, steps + 1), due.step)
+
+    def is_due(self, index: int, since_reset: int, views: int) -> bool:
+        """Whether step `index` trims, so many steps after the last reset of the opacities."""
+        due = self.trims(views)
+        if since_reset != self.recovery or index in due or index > self.until:
+            return since_reset >= self.recovery and index in due
+        was_put_off = any(at in due for at in range(index - self.recovery + 1, index))
+        return was_put_off and not any(at in due for at in range(index + 1, index + self.every))
 
     def trims(self, views: int) -> range:
         """The steps that trim where so many views are an epoch, unless opacities have just been reset."""

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -28,13 +29,18 @@ from surfkit.scene.scene import View
 from surfkit.scene.vectors import unit
 
 KEPT = 48
-"""Pictures and maps kept in memory."""
+"""Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
+case."""
+KEPT_BYTES, PIXEL_BYTES = 2 << 30, 15
+"""Of a pixel: twice as many photographs, pictures as they are compared, and depth maps of either stage."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
 FEW, MANY = 16, 32
 """Pixels of a window that are compared in small pictures, and at full size."""
+MATCHED, COMPARED = "matching photographs", "comparing depth maps"
+"""What is done while the maps of either stage are made."""
 RANGES = {
     "longest": (32, 20_000),
     "neighbours": (1, 16),
@@ -129,10 +135,12 @@ class PatchMatch(DepthEstimator):
         refuse_wide_window(self.window, self.longest, views)
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
-        work = Work(self, given, neighbours(given.views, given.observations, self.neighbours, self.angle))
+        pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
+        work = Work(self, given, pairs, wanted)
         for at in wanted:
             found = work.consistent(at)
             yield Estimate(at, None, None) if found is None else self.trusted(work, at, found)
+            work.finish(at)
 
     def trusted(self, work: Work, at: int, found: Map) -> Estimate:
         """What the maps of other photographs agree with, and the mean of what they say."""
@@ -206,24 +214,42 @@ class InitialPoints(PlaneSweep):
 
 
 class Work:
-    """Pictures and maps of a data set, made when they are asked for; maps are kept in the folder for work.
+    """Pictures and maps of a data set, made when they are asked for.
+
+    Maps are kept in the folder for work as long as they are needed: they are ten times as large as what comes of them.
 
     `photometric` and `consistent` give the map of the view at a position, or None where none can be made: by
     photometric consistency alone, and by geometric consistency too.
     """
 
-    def __init__(self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]]) -> None:
-        self.settings, self.given, self.pairs = settings, given, pairs
+    def __init__(self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]], wanted: Sequence[int]) -> None:
+        self.settings, self.given, self.pairs, self.wanted = settings, given, pairs, set(wanted)
+        self.users: list[list[int]] = [[at] for at in range(len(pairs))]  # each photograph, and those compared with it
+        for at, others in enumerate(pairs):
+            for other in others:
+                self.users[other].append(at)
         self.sweep = InitialPoints(longest=settings.coarsest)
+        kept = self.room()
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
-        self.value = lru_cache(2 * KEPT)(self.read)
-        self.grey = lru_cache(KEPT)(self.halved)
+        self.value = lru_cache(2 * kept)(self.read)
+        self.grey = lru_cache(kept)(self.halved)
         # Of maps of other photographs, the depth alone is kept: a seventh of the whole.
-        self.photometric = lru_cache(1)(lambda at: self.kept("matching photographs", at, self.match))
-        self.depth = lru_cache(KEPT)(lambda at: inverse_of(self.photometric(at)))
-        reconciled = lru_cache(1)(lambda at: self.kept("comparing depth maps", at, self.reconcile))
+        self.photometric = lru_cache(1)(lambda at: self.kept(MATCHED, at, self.match))
+        self.depth = lru_cache(kept)(lambda at: inverse_of(self.photometric(at)))
+        reconciled = lru_cache(1)(lambda at: self.kept(COMPARED, at, self.reconcile))
         self.consistent = reconciled if settings.consistency else self.photometric
-        self.consistent_depth = lru_cache(KEPT)(lambda at: inverse_of(self.consistent(at)))
+        self.consistent_depth = lru_cache(kept)(lambda at: inverse_of(self.consistent(at)))
+        self.stages = (COMPARED, MATCHED) if settings.consistency else (MATCHED,)
+        self.made: dict[str, set[int]] = {}  # or not needed
+        for what in self.stages:
+            every = range(len(pairs))
+            self.made[what] = {at for at in every if self.path(what, at).exists() or not self.is_needed(what, at)}
+
+    def room(self) -> int:
+        """How many pictures and maps are kept in memory."""
+        pixels = max((c.width * c.height for c in (self.camera(at, 0) for at in range(len(self.pairs)))), default=1)
+        most = min(KEPT, KEPT_BYTES // (PIXEL_BYTES * pixels))
+        return max(most, 2 + max(map(len, self.pairs), default=0))
 
     def camera(self, at: int, level: int) -> Camera:
         """Of a photograph whose sides are halved `level` times."""
@@ -247,15 +273,37 @@ class Work:
         small = adaptive_avg_pool2d(self.value(at).to(torch.float32)[None], (camera.height, camera.width))[0]
         return Grey(camera, small.round().to(torch.uint8).numpy())
 
+    def path(self, what: str, at: int) -> Path:
+        """Where a map is kept."""
+        return self.given.work / what.replace(" ", "-") / f"{at:06d}.npy"
+
     def kept(self, what: str, at: int, make: Callable[[int], Map | None]) -> Map | None:
         """A map from the folder for work, where it is put if it is not there."""
-        path = self.given.work / what.replace(" ", "-") / f"{at:06d}.npy"
+        path = self.path(what, at)
         if not path.exists():
             made = make(at)
             save_array(path, np.zeros(0, np.uint8) if made is None else made.packed())
-            emit(Progress(what, len(list(path.parent.glob("*.npy"))), len(self.given.views)))
+            self.made[what].add(at)
+            emit(Progress(what, len(self.made[what]), len(self.given.views)))
         numbers = np.load(path)
         return Map.unpacked(numbers) if len(numbers) else None
+
+    def is_needed(self, what: str, at: int) -> bool:
+        """Whether anything is still to be made from a map: an estimate from those of the last stage, and these from
+        those of the one before."""
+        if what == self.stages[0]:
+            return any(user in self.wanted for user in self.users[at])
+        return any(user not in self.made[self.stages[0]] for user in self.users[at])
+
+    def finish(self, at: int) -> None:
+        """Delete the maps that nobody needs any more when the estimate of a photograph is kept."""
+        self.wanted.discard(at)
+        near = {at, *self.pairs[at]}
+        for what in self.stages:
+            for each in near:
+                if not self.is_needed(what, each):
+                    self.path(what, each).unlink(missing_ok=True)
+            near = near.union(*(self.pairs[each] for each in near))
 
     def match(self, at: int) -> Map | None:
         """By photometric consistency, from coarse to fine; None without neighbours, parallax or sparse points."""

@@ -17,7 +17,7 @@ import torch
 
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.codec import write_json
-from surfkit.core.files import replacing_folder
+from surfkit.core.files import refuse_own, replacing_folder
 from surfkit.export.base import Format
 from surfkit.export.gltf import Compress, Up, extensions_of, up_of, write_splats
 from surfkit.export.gltf_reader import UPS, read_splats
@@ -64,6 +64,7 @@ class Tiles3D(Format):
         path = Path(path)
         if path.is_dir() and any(path.iterdir()) and not (path / INDEX).is_file():
             raise OSError(errno.ENOTEMPTY, f"not empty and without {INDEX}; name another", str(path))
+        refuse_own(path)
         table.refuse_unsound(path)
         place = self._place(path, frame)
         root = tree or Tile(table, *_corners(table))

@@ -121,10 +121,11 @@ def contour_lines(heights: np.ndarray, grid: Grid, window: Window, interval: flo
     tracer = contour_generator(columns, rows, np.ma.masked_array(heights, ~known))
     found = []
     for level in range(first, last + 1):
-        for line in tracer.lines(level * interval):
+        height = float(f"{level * interval:.12g}")  # 0.3 and not 0.30000000000000004, as labels show it
+        for line in tracer.lines(height):
             if len(line) > 1:
                 place = np.stack([grid.west + line[:, 0], grid.north - line[:, 1]], axis=1) * grid.gsd
-                found.append((level * interval, place))
+                found.append((height, place))
     return found
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 
-NEAR = 1e-3
+NEAR = 1e-5
 """Depth at which triangles are cut, as a share of the depth of the farthest corner in front of the camera."""
 
 
@@ -21,15 +21,20 @@ def mesh_depth(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
         faces: (F, 3).
         camera: Lens, size and pose.
     """
+    depth = nearest(vertices, faces, camera)
+    return np.where(np.isfinite(depth), depth, np.float32(0))
+
+
+def nearest(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """The same, inf where there is no triangle."""
     pose = camera.world_to_camera.numpy()
-    local = vertices @ pose[:3, :3].T + pose[:3, 3]
+    local = vertices @ pose[:3, :3].T.astype(np.float64) + pose[:3, 3]
     near = NEAR * max(float(local[:, 2].max(initial=0)), 1e-12)
     local, faces = in_front(local, faces, near)
     z = np.where(local[:, 2] > 0, local[:, 2], np.nan)
     places = np.stack([local[:, 0] / z * camera.fx + camera.cx, local[:, 1] / z * camera.fy + camera.cy, z], 1)
     places[np.isnan(z), 2] = 0.0
-    depth, _ = draw_faces(places, faces, camera.width, camera.height)
-    return np.where(np.isfinite(depth), depth, np.float32(0))
+    return draw_faces(places, faces, camera.width, camera.height)[0]
 
 
 def in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
@@ -42,6 +47,8 @@ def in_front(local: np.ndarray, faces: np.ndarray, near: float) -> tuple[np.ndar
     """
     ahead = (local[:, 2] >= near)[faces]
     count = ahead.sum(1)
+    if (count == 3).all():
+        return local, faces
     vertices, kept = [local], [np.asarray(faces[count == 3], np.int64)]
     begun = len(local)
     for corners in (1, 2):

@@ -13,9 +13,11 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
+from surfkit.export.glb import MOST_BYTES
 from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
 
@@ -75,7 +77,11 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 
 
 def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
-    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input."""
+    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input.
+
+    Raises:
+        BadInput: More than 4 GiB.
+    """
     corners = frame.to_input(mesh.vertices.min(0)), frame.to_input(mesh.vertices.max(0))
     offset = np.round((corners[0] + corners[1]) / 2)
     places = (frame.to_input(mesh.vertices) - offset).astype("<f4")
@@ -111,8 +117,11 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + starts[-1]
+    if total > MOST_BYTES:
+        raise BadInput(f"{path}: {len(mesh.faces):,} triangles take {total} bytes; a GLB file has at most {MOST_BYTES}")
     with replacing(path) as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + starts[-1]))
+        file.write(struct.pack("<4sII", b"glTF", 2, total))
         file.write(struct.pack("<I4s", len(text), b"JSON") + text)
         file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
         for part in parts:

@@ -51,12 +51,13 @@ class Stereo(Mesher):
             )
         places = {view.name: at for at, view in enumerate(subject.views)}
 
-        def draw(view: View) -> Maps:
+        def draw(view: View, coloured: bool = True) -> Maps:
             at = places[view.name]
-            photo = None if subject.photo is None else subject.photo(at)
-            return seen(view, subject.priors[at], photo, self.min_confidence)
+            prior = subject.priors[at]  # there is none of a damaged photograph
+            photo = None if prior is None or subject.photo is None or not coloured else subject.photo(at)
+            return seen(view, prior, photo, self.min_confidence)
 
-        splats = points(subject.views, draw)
+        splats = points(subject.views, lambda view: draw(view, coloured=False))
         if not len(splats):
             raise BadInput(
                 f"none of {len(subject.views)} views has a depth prior of confidence {self.min_confidence:g} or more; "

@@ -2,6 +2,7 @@
 
 #include <atomic>
 #include <condition_variable>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <thread>
@@ -19,9 +20,17 @@ struct Job {
     std::atomic<int64_t> next{0};
     std::atomic<int> running{0};
     int wanted = 0;  // helpers still to join, guarded by the pool's lock
+    std::mutex failing;
+    std::exception_ptr failure;  // the first one, such as of memory that gave out; what is left is not begun then
 
     void work() {
-        for (int64_t i; (i = next.fetch_add(1)) < count;) (*body)(i);
+        try {
+            for (int64_t i; (i = next.fetch_add(1)) < count;) (*body)(i);
+        } catch (...) {
+            next = count;
+            std::lock_guard<std::mutex> lock(failing);
+            if (!failure) failure = std::current_exception();
+        }
     }
 };
 
@@ -43,6 +52,7 @@ class Pool {
         std::unique_lock<std::mutex> lock(mutex_);
         job_ = nullptr;  // whoever has not joined yet need not
         done_.wait(lock, [&] { return job.running.load() == 0; });
+        if (job.failure) std::rethrow_exception(job.failure);
     }
 
   private:

@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -137,17 +138,22 @@ class Cells:
 
     def owner(self, points: Tensor) -> Tensor:
         """(N,) int64, the block that owns each of (N, 3) points; -1 for one that is not finite."""
-        flat = self.flat(points)
-        owner = torch.full((len(points),), -1, dtype=torch.int64)
+        flat, (x, y, blocks) = self.flat(points), self._fields
+        at = (torch.bucketize(flat[:, axis].contiguous(), side, right=True) for axis, side in enumerate((x, y)))
+        return blocks[tuple(at)].masked_fill_(~flat.isfinite().all(1), -1)
+
+    @cached_property
+    def _fields(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(X,) and (Y,) all borders along each axis, and (X + 1, Y + 1) the block that owns each field between them.
+
+        A place is found among the borders of each axis: with as many steps as a cell has there, however many cells.
+        """
+        borders = [sorted({box[side] for box in self.boxes for side in (axis, axis + 2)} - {None}) for axis in (0, 1)]
+        x, y = ({border: at + 1 for at, border in enumerate(some)} for some in borders)
+        blocks = torch.full((len(x) + 1, len(y) + 1), -1)
         for (x0, y0, x1, y1), block in zip(self.boxes, self.blocks, strict=True):
-            here = flat.isfinite().all(1)
-            for axis, low, high in ((0, x0, x1), (1, y0, y1)):
-                if low is not None:
-                    here &= flat[:, axis] >= low
-                if high is not None:
-                    here &= flat[:, axis] < high
-            owner[here] = block
-        return owner
+            blocks[x.get(x0, 0) : x.get(x1), y.get(y0, 0) : y.get(y1)] = block
+        return *(torch.tensor(some, dtype=torch.float64) for some in borders), blocks
 
 
 @dataclass(frozen=True)

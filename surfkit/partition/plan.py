@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -156,39 +155,40 @@ def with_enough(cells: Cells, joins: Tensor, inside: Tensor, fewest: int, poor: 
     Returns:
         Cells, joins and inside of the blocks that are left.
     """
-    groups = [{block} for block in range(cells.count)]
+    groups = {block: {block} for block in range(cells.count)}
+    views, beside = dict(enumerate(joins.T.contiguous())), touching(cells)
     while len(groups) > 1:
-        views = [joins[:, sorted(group)].any(1) for group in groups]
-        least = min(range(len(groups)), key=lambda at: (not poor[sorted(groups[at])].all(), int(views[at].sum()), at))
-        few_points = bool(poor[sorted(groups[least])].all())
-        if int(views[least].sum()) >= fewest and not few_points:
+        least = min(groups, key=lambda at: (not poor[list(groups[at])].all(), int(views[at].sum()), at))
+        count, few_points = int(views[least].sum()), bool(poor[list(groups[least])].all())
+        if count >= fewest and not few_points:
             break
-        touching = [at for at in range(len(groups)) if at != least and touch(cells, groups[least], groups[at])]
-        partner = max(touching, key=lambda at: (int((views[at] & views[least]).sum()), int(views[at].sum()), -at))
-        lack = "hardly any points" if few_points else f"{int(views[least].sum())} views, fewer than {fewest},"
+        partner = max(beside[least], key=lambda at: (int((views[at] & views[least]).sum()), int(views[at].sum()), -at))
+        lack = "hardly any points" if few_points else f"{count} views, fewer than {fewest},"
         emit(Warned(f"partition: a block with {lack} is joined to its neighbour"))
-        groups[partner] |= groups[least]
-        del groups[least]
-    groups.sort(key=min)
-    number = {block: at for at, group in enumerate(groups) for block in group}
-    joined = replace(cells, blocks=tuple(number[block] for block in cells.blocks))
-    return joined, *(torch.stack([table[:, sorted(g)].any(1) for g in groups], 1) for table in (joins, inside))
+        groups[partner] |= groups.pop(least)
+        views[partner] = views[partner] | views.pop(least)
+        for at in beside.pop(least):
+            beside[at].discard(least)
+            if at != partner:
+                beside[at].add(partner)
+                beside[partner].add(at)
+    joined = sorted(groups.values(), key=min)
+    number = {block: at for at, group in enumerate(joined) for block in group}
+    cells = replace(cells, blocks=tuple(number[block] for block in cells.blocks))
+    return cells, *(torch.stack([table[:, sorted(g)].any(1) for g in joined], 1) for table in (joins, inside))
 
 
-def touch(cells: Cells, one: set[int], other: set[int]) -> bool:
-    """Whether cells of two groups of blocks have more than a corner in common."""
+def touching(cells: Cells) -> dict[int, set[int]]:
+    """Of each block, the others whose cells have more than a corner in common with its own."""
     infinity = float("inf")
-
-    def sides(block: set[int]) -> Sequence[tuple[float, ...]]:
-        found = [box for box, of in zip(cells.boxes, cells.blocks, strict=True) if of in block]
-        return [
-            tuple((-infinity if at < 2 else infinity) if side is None else side for at, side in enumerate(box))
-            for box in found
-        ]
-
-    for a in sides(one):
-        for b in sides(other):
-            x, y = (min(a[axis + 2], b[axis + 2]) - max(a[axis], b[axis]) for axis in (0, 1))
-            if (x == 0 and y > 0) or (y == 0 and x > 0):
-                return True
-    return False
+    sides = torch.tensor(
+        [[(-infinity if at < 2 else infinity) if s is None else s for at, s in enumerate(box)] for box in cells.boxes],
+        dtype=torch.float64,
+    )
+    found: dict[int, set[int]] = {block: set() for block in range(cells.count)}
+    for side, block in zip(sides, cells.blocks, strict=True):
+        x, y = (torch.minimum(side[2:], sides[:, 2:]) - torch.maximum(side[:2], sides[:, :2])).unbind(1)
+        for at in (((x == 0) & (y > 0)) | ((y == 0) & (x > 0))).nonzero()[:, 0].tolist():
+            if cells.blocks[at] != block:
+                found[block].add(cells.blocks[at])
+    return found

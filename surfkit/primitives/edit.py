@@ -78,6 +78,16 @@ class Edit:
         return drop, clone + (0 if self.new is None else len(self.new)), split
 
 
+FLOATS = (torch.float32, torch.float64)
+ROWS: dict[str, tuple[tuple[torch.dtype, ...], tuple[int, ...]]] = {
+    **dict.fromkeys(("drop", "split", "forget", "scatter"), ((torch.bool,), ())),
+    "clone": ((torch.bool, torch.int64), ()),
+    "move": (FLOATS, (3,)),
+    **dict.fromkeys(("opacities", "scale_by"), (FLOATS, ())),
+}
+"""Types of what an edit has for each of N points, and their shapes after N."""
+
+
 def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Generator) -> Points:
     """Points after an edit: the kept in their order, then clones, children and new points."""
     points, added, keep = _adjusted(primitive, points, edit), [], None
@@ -100,6 +110,24 @@ def apply(primitive: Primitive, points: Points, edit: Edit, generator: torch.Gen
     if added:
         points = points.append({name: torch.cat([rows[name] for rows in added]) for name in points.params})
     return points if edit.max_opacity is None else _dimmed(primitive, points, edit.max_opacity)
+
+
+def sound(edit: Edit | None, count: int, policy: object) -> Edit | None:
+    """What a policy asks for, or BadInput if it is no edit of so many points: other masks would pass for indices."""
+    if edit is None:
+        return None
+    name = f"{type(policy).__module__}.{type(policy).__qualname__}.edit"
+    if not isinstance(edit, Edit):
+        raise BadInput(f"{name} gives {type(edit).__name__}; it must be a surfkit.Edit, or None")
+    for field, (kinds, shape) in ROWS.items():
+        value, wanted = getattr(edit, field), (count, *shape)
+        if value is None:
+            continue
+        if not isinstance(value, Tensor) or value.dtype not in kinds or value.shape != wanted:
+            came = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            kind = " or ".join(str(each).removeprefix("torch.") for each in kinds)
+            raise BadInput(f"{name}: {field} is {came}; it must be {kind} of shape {wanted}, a value for each point")
+    return edit
 
 
 def withheld(edit: Edit, may: Tensor) -> Edit:

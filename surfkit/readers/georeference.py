@@ -21,7 +21,7 @@ POLAR, BESIDE = 84.0, 30.0
 MOST_M = 1e8
 """No coordinate on Earth is larger, metres."""
 FOLDER = "odm_georeferencing"
-ZONES = (r"WGS ?84 / UTM zone (\d+)([NS])", r"WGS84 UTM (\d+)([NS])", r"\+proj=utm.*\+zone=(\d+)(.*\+south)?")
+ZONES = (r"WGS ?84 / UTM zone (\d+)([NS])", r"WGS84 UTM (\d+)([NS])", r"\+proj=utm.*\+zone=(\d+)()")
 """How OpenDroneMap writes a zone of UTM, in coords.txt and in proj.txt."""
 
 
@@ -142,7 +142,7 @@ def zone_of(text: str) -> tuple[int, bool] | None:
     """Number of a zone of UTM, and whether it is south of the equator."""
     for pattern in ZONES:
         if (found := re.match(pattern, text)) and 1 <= int(found[1]) <= 60:
-            return int(found[1]), (found[2] or "").endswith(("S", "+south"))
+            return int(found[1]), found[2] == "S" or "+south" in text
     if (found := re.fullmatch(r"EPSG:32([67])(\d\d)", text)) and 1 <= int(found[2]) <= 60:
         return int(found[2]), found[1] == "7"
     return None

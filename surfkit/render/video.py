@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import sync_folder
 from surfkit.core.optional import needed
@@ -38,6 +38,7 @@ def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
 
     Raises:
         BadInput: OpenCV is not installed, or has no encoder.
+        Fault: The disk is full.
     """
     cv2 = require_video()
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix.lower()}")  # the ending is the container
@@ -53,10 +54,27 @@ def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
                 "folder as --out and encode its pictures with another program"
             )
         _write(writer, frames)
+        refuse_cut_off(cv2, unfinished, path, frames)
         os.replace(unfinished, path)
         sync_folder(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def refuse_cut_off(cv2: ModuleType, video: Path, path: Path, frames: Sequence[Path]) -> None:
+    """Fault if a video, to be called `path`, lacks frames: OpenCV does not say when a file could not be written."""
+    reader, count = cv2.VideoCapture(str(video)), 0  # what its head says of its length is right even then
+    try:
+        while reader.grab():
+            count += 1
+            emit(Progress("checking the video", count, len(frames)))
+    finally:
+        reader.release()
+    if count < len(frames):
+        raise Fault(
+            f"{path}: the video could not be written to its end; free some space on the disk, then give the same "
+            f"command again: the pictures in {frames[0].parent} are kept"
+        )
 
 
 def _write(writer: Any, frames: Sequence[Path]) -> None:

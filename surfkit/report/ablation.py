@@ -40,6 +40,9 @@ class Row:
     group: str = ""
 
     def __post_init__(self) -> None:
+        for text in (self.label, self.group):
+            if len(text.splitlines()) > 1:
+                raise BadInput(f"row {self.label!r}: label and group are one line each")
         for name in self.paper:
             if name not in COLUMNS:
                 raise BadInput(f"row {self.label!r}, paper: {unknown('column', name, COLUMNS)}")
@@ -145,7 +148,9 @@ def scaled(recipe: Recipe, table: Table, steps: int | None) -> Recipe:
 
 
 def limit_points(recipe: Recipe, points: int | None) -> Recipe:
-    """The recipe with pretraining limited to a number of points; None sets no limit.
+    """The recipe in which no stage adds points beyond a number of them; None sets no limit.
+
+    Each block has the same limit while it is tuned: merged, they may come to more.
 
     Raises:
         BadInput: The number is below 1.
@@ -154,9 +159,11 @@ def limit_points(recipe: Recipe, points: int | None) -> Recipe:
         return recipe
     if points < 1:
         raise BadInput(f"--max-points {points}: give 1 or more")
-    recipe = replace(recipe, start=recipe.start.limited(points))
-    densify = recipe.pretrain.densify
-    return recipe if densify is None else evolve(recipe, "pretrain.densify", densify.limited(points))
+    limited = replace(recipe, start=recipe.start.limited(points))
+    for path, stage, _ in recipe.stages():
+        if stage.densify is not None:
+            limited = evolve(limited, f"{path}.densify", stage.densify.limited(points))
+    return limited
 
 
 def pick(table: Table, names: Sequence[str]) -> list[str]:

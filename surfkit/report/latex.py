@@ -11,6 +11,9 @@ from surfkit.report.table import Cell, caption, columns_of, data_name, data_sets
 from surfkit.report.table import published_cells as published
 
 PACKAGES = r"% In the preamble: \usepackage{adjustbox,booktabs} and \usepackage[table]{xcolor}"
+GREEK = """
+alpha beta gamma delta varepsilon eta theta kappa lambda mu pi rho sigma tau varphi omega Delta Sigma Omega
+"""
 SPECIAL = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -21,9 +24,14 @@ SPECIAL = {
     "±": r"$\pm$",
     "×": r"$\times$",
     "−": r"$-$",
-    "τ": r"$\tau$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "→": r"$\rightarrow$",
+    "[": "{[}",  # after the end of a row, this and the next would belong to its \\
+    "*": "{*}",
 } | {letter: f"\\{letter}" for letter in "&%$#_{}"}
 """What LaTeX does not take as it stands, and what it takes instead."""
+SPECIAL |= {letter: rf"$\{name}$" for letter, name in zip("αβγδεηθκλμπρστφωΔΣΩ", GREEK.split(), strict=True)}
 ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$"}
 
 
@@ -57,7 +65,7 @@ def latex(report: Mapping[str, Any]) -> str:
             r"\begin{table}[t]",
             r"\centering",
             rf"\caption{{{escape(caption(report))}}}",
-            rf"\label{{tab:{report['table']}}}",
+            rf"\label{{tab:{re.sub(r'[^A-Za-z0-9_-]+', '-', report['table'])}}}",
             r"\begin{adjustbox}{max width=\textwidth}",
             rf"\begin{{tabular}}{{l{'r' * (width - 1)}}}",
             r"\toprule",

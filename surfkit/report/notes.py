@@ -38,12 +38,22 @@ def _wants_maps(trial: Trial) -> bool:
 
 
 def notes_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
-    """Plain data of each note in the records of some runs, stated once: its "text", and the "rows" with such a run."""
+    """Plain data of each note in the records of some runs, stated once: its "text", and the "rows" with such a run.
+
+    Where runs were made on several devices, that is a note, too.
+    """
     found: dict[str, list[str]] = {}
+    devices: dict[str, list[str]] = {}
     for trial in trials:
-        for text in read_record(trial.folder).get("notes", []):
-            rows = found.setdefault(text, [])
-            rows += [] if trial.label in rows else [trial.label]
+        record = read_record(trial.folder)
+        where = [f"{record['device']}, threads: {record.get('threads')}"] if "device" in record else []
+        for into, texts in ((found, record.get("notes", [])), (devices, where)):
+            for text in texts:
+                rows = into.setdefault(text, [])
+                rows += [] if trial.label in rows else [trial.label]
+    if len(devices) > 1:  # the table went on elsewhere
+        for where, rows in devices.items():
+            found[f"trained on {where}: minutes and FPS compare with such rows only"] = rows
     return [{"text": text, "rows": rows} for text, rows in found.items()]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,6 @@ def refuse_unmeasurable(views: Sequence[View]) -> None:
         load_perceptual(NET)
     except NoWeights as error:
         raise BadInput(f"--columns lpips: {error}".replace("give --lpips-weights FOLDER", "leave lpips out")) from error
-
-
-def lpips_known(metrics: Mapping[str, Any], compressed: bool = False) -> bool:
-    """Whether the metrics of a run have its LPIPS, or that of its compressed model, or say that it draws nothing."""
-    images = (metrics.get("compressed") or {} if compressed else metrics).get("images") or {}
-    return f"lpips_{NET}" in images or "not_measured" in images
 
 
 def measure_lpips(folder: Path, device: Device) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def measured(work: Work, found: dict[str, int | float]) -> dict[str, int | float
     trial, compressed = work.trial, work.trial.recipe.compress is not None
     if trial.truth is not None and "f1" not in found:
         found = figures(trial.truth.measure(trial.folder, work.out, work.device), compressed)
-    if work.lpips and "lpips" not in found:
+    if work.lpips and "lpips" not in found and "psnr" in found:
         again = figures(measure_lpips(trial.folder, work.device), compressed)
         found |= {name: again[name] for name in ("lpips",) if name in again}
     return found

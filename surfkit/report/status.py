@@ -36,7 +36,7 @@ class Block:
     """Where one block stands.
 
     Attributes:
-        index: ViewCounts from 0.
+        index: Counts from 0.
         views: It is tuned on; 0 for one that stays as it is.
         status: planned, running, done or failed, as last heard of.
         step: Done.

@@ -21,7 +21,7 @@ from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
-from surfkit.recipe import Recipe
+from surfkit.recipe import Recipe, complete
 from surfkit.report.ablation import Table, build, limit_points, pick, scaled
 from surfkit.report.columns import refuse_unknown_columns
 from surfkit.report.compare import compare
@@ -33,6 +33,8 @@ from surfkit.report.runs_csv import comma_separated
 from surfkit.report.sharing import finished_keys, next_wave, shared_stages
 from surfkit.report.table import markdown
 from surfkit.report.truth import Truth
+from surfkit.run.folder import Run, read_record
+from surfkit.run.resume import compared_data
 from surfkit.run.shared import versions
 from surfkit.run.stage import select_rasterizer
 from surfkit.run.store import StageStore
@@ -55,7 +57,7 @@ class Plan:
         seeds: Runs of each row.
         rows: Numbers or labels of those to run; all if empty.
         device: Where to compute.
-        max_points: No row grows beyond this number of points.
+        max_points: No row grows beyond this number of points, and none of its blocks while it is tuned.
         truth: For each data set, what the meshes of all rows are compared with, for their F1; rows without a mesh get
             one then. Empty to compare none.
         columns: Those of the written tables; what was measured if empty. LPIPS is measured only if it is named.
@@ -107,8 +109,11 @@ class Plan:
 
     def is_done(self, trial: Trial, outcome: Outcome) -> bool:
         """Whether all that is wanted of a trial was measured."""
-        wanted = ({"f1"} if trial.truth is not None else set()) | ({"lpips"} if self.lpips else set())
-        return outcome.figures is not None and wanted <= outcome.figures.keys()
+        if outcome.figures is None:
+            return False
+        draws = "psnr" in outcome.figures  # a mesher alone draws no pictures that LPIPS could be measured on
+        wanted = ({"f1"} if trial.truth is not None else set()) | ({"lpips"} if self.lpips and draws else set())
+        return wanted <= outcome.figures.keys()
 
 
 class Watch(Protocol):
@@ -138,6 +143,7 @@ def ablate(plan: Plan, watch: Watch, before: Callable[[Plan, Sequence[Trial]], N
     left = unfinished(plan)
     if left:
         refuse_unusable(plan)
+        refuse_other_data(plan)
     with locked(plan.out):
         if left and before is not None:
             before(plan, left)
@@ -266,6 +272,24 @@ def refuse_unusable(plan: Plan) -> None:
             truth.refuse_unusable()
         if plan.lpips:
             refuse_unmeasurable(held_out)
+
+
+def refuse_other_data(plan: Plan) -> None:
+    """BadInput if finished runs were trained on other photographs, cameras or depth maps than the next ones would be.
+
+    One run that looks at depth maps, and one that does not, stand for all on a data set: they were compared alike.
+    """
+    every = trials(plan)
+    for data, _ in plan.sets:
+        own = replace(data, path=data.path.resolve())
+        runs = [Run(each.folder, complete(each.recipe), own) for each in every if each.data == data]
+        for run in {run.needs_priors: run for run in runs if run.metrics.exists() and run.inputs.exists()}.values():
+            other = compared_data(run, read(own), set(read_record(run.out).get("skipped", ())))[1]
+            if other is not None:
+                raise BadInput(
+                    f"--out {plan.out} has rows that are trained already, as {run.out.name}, but {other}, name another "
+                    "folder, or delete that one"
+                )
 
 
 def save(plan: Plan, every: list[Trial], outcomes: Mapping[Path, Outcome]) -> dict[str, Any]:

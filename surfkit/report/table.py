@@ -172,9 +172,10 @@ def note_lines(report: Mapping[str, Any]) -> list[str]:
 
 def caption(report: Mapping[str, Any]) -> str:
     """What the table shows, and what of."""
-    limit = f"; at most {report['max_points']:,} points" if report["max_points"] else ""
+    limit = f"; at most {report['max_points']:,} points, or as many in each block" if report["max_points"] else ""
     data = ", ".join(data_name(entry) for entry in data_sets(report))
-    return f"{report['about']}. Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}{limit}."
+    about = report["about"].rstrip(".")
+    return f"{about}{about and '. '}Data: {data}; steps: {report['steps']:,}; seeds: {report['seeds']}{limit}."
 
 
 def markdown(report: Mapping[str, Any]) -> str:

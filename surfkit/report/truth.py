@@ -45,16 +45,29 @@ class Truth:
         """BadInput for a file that no mesh could be compared with."""
         truth_side(read_surface(self.path), self.settings)
 
+    @property
+    def stamp(self) -> str | None:
+        """Size and time of the file, by which another one of the same name is noticed; None if it is gone."""
+        try:
+            state = self.path.stat()
+        except OSError:
+            return None
+        return f"{state.st_size} {state.st_mtime_ns}"
+
     def crop(self, out: Path) -> Path:
         """Where the crop volume of all rows is kept in the folder of a table."""
-        digest = hashlib.sha256(f"{self.path} {self.tau}".encode()).hexdigest()[:12]
+        digest = hashlib.sha256(f"{self.path} {self.tau} {self.stamp}".encode()).hexdigest()[:12]
         return out / f"crop-{digest}.json"
 
     def known(self, metrics: Mapping[str, Any], compressed: bool = False) -> bool:
-        """Whether the metrics of a run have the F1 of its mesh, or of that of its compressed model, against this."""
+        """Whether the metrics of a run have the F1 of its mesh, or of that of its compressed model, against this.
+
+        What `surfkit evaluate` has measured with other settings, or in another volume, is not that.
+        """
         geometry = (metrics.get("compressed") or {} if compressed else metrics).get("geometry") or {}
-        given = self.tau is None or geometry.get("tau") == self.tau
-        return geometry.get("truth") == str(self.path) and given
+        made = geometry.get("table")
+        is_same = isinstance(made, dict) and made.get("tau") == self.tau and self.stamp in (None, made.get("truth"))
+        return geometry.get("truth") == str(self.path) and is_same
 
     def measure(self, folder: Path, out: Path, device: Device = "auto") -> dict[str, Any]:
         """Compare the mesh of a run, and return its metrics with what came out.
@@ -78,6 +91,7 @@ class Truth:
         settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
         files = (shown.mesh, self.path)
         found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)
+        found["table"] = {"tau": self.tau, "truth": self.stamp}
         if not crop.exists():
             write_json(crop, read_json(shown.out / "geometry" / "crop.json", Any))
         metrics = note_metrics(shown.metrics, {"geometry": found})

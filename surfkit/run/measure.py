@@ -146,6 +146,6 @@ def note_compressed(run: Run, found: dict[str, Any]) -> dict[str, Any]:
     facts["images"] = {name: value for name, value in found.get("images", {}).items() if isinstance(value, float)}
     facts["fps_before_and_after"] = found.get("fps_before_and_after")
     if "geometry" in found:
-        geometry = found["geometry"]
-        facts["geometry"] = {name: geometry[name] for name in ("precision", "recall", "f1", "truth", "tau")}
+        kept = ("precision", "recall", "f1", "truth", "tau", "table")
+        facts["geometry"] = {name: value for name, value in found["geometry"].items() if name in kept}
     return note_metrics(run.metrics, {"compressed": facts})

@@ -13,7 +13,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, read_keys, write_json
-from surfkit.core.events import FileWritten, Progress, emit
+from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
 from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain
@@ -229,8 +229,16 @@ def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) 
         meshes.append((f"mesh-lod{at}", simplify_to(mesh, max(1, round(share * len(mesh.faces))))))
         emit(Progress("simplifying", at, len(delivery.lods)))
     for name, each in meshes:
-        for kind in dict.fromkeys(delivery.formats):
-            for path in write_mesh(run.out / f"{name}.{kind}", each, subject.frame):
+        kinds = list(dict.fromkeys(delivery.formats))
+        for kind in kinds:
+            try:
+                paths = write_mesh(run.out / f"{name}.{kind}", each, subject.frame)
+            except BadInput as error:  # larger than such a file can be: hours of work are not to be lost
+                alone = kinds == [kind]
+                emit(Warned(f"{error}: {'PLY is written in its place' if alone else 'it is left out'}"))
+                kinds += ["ply"] if alone else []
+                continue
+            for path in paths:
                 emit(FileWritten(path, "mesh"))
                 yield path
 

@@ -116,21 +116,32 @@ def refuse_changed(run: Run, scene: Scene, skipped: set[str]) -> Fingerprint:
         scene: Its data.
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
+    now, other = compared_data(run, scene, skipped)
+    if other is not None:
+        raise BadInput(f"--out {run.out}: {other}, name another folder, or delete that one")
+    return now
+
+
+def compared_data(run: Run, scene: Scene, skipped: set[str]) -> tuple[Fingerprint, str | None]:
+    """The fingerprint of the data, and in words what is not as it was when the run began; None if nothing is.
+
+    Args:
+        run: The run.
+        scene: Its data.
+        skipped: Names of photographs that the run has found damaged; they do not count.
+    """
     before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
     own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
     now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None, run.files)
-    if before is not None and (path := changed_file(before, now)) is not None:
-        raise BadInput(
-            f"--out {run.out}: {path} has changed since the run began; put the old file back, name another folder, or "
-            "delete that one"
-        )
-    if before is not None and (found := [text for text in changed(before, now) if text.name not in skipped]):
+    if before is None:
+        return now, None
+    if (path := changed_file(before, now)) is not None:
+        return now, f"{path} has changed since the run began; put the old file back"
+    if found := [text for text in changed(before, now) if text.name not in skipped]:
         more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-        raise BadInput(
-            f"--out {run.out}: the data in {run.data.path} are not those that the run began with: {found[0].what}"
-            f"{more}; put them back, name another folder, or delete that one"
-        )
-    return now
+        where = f"the data in {run.data.path} are not those that the run began with"
+        return now, f"{where}: {found[0].what}{more}; put them back"
+    return now, None
 
 
 def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:

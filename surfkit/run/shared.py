@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -13,7 +14,7 @@ import torch
 
 from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import MemoryTaken, emit, say
-from surfkit.core.registry import records
+from surfkit.core.registry import BUILTIN, plugins, records
 from surfkit.execute.state import read_state
 from surfkit.readers.data import Data
 from surfkit.readers.fingerprint import Fingerprint, Stamp
@@ -43,6 +44,8 @@ FILES = {
 blocks are not among them, as the merged model holds all that later parts need."""
 
 
+SOURCES = (".py", ".cu", ".cpp", ".h", ".so")
+"""Endings of files with code of a plugin."""
 PLAN, TUNE = ("partition", "assign", "min_views", "partition_pretrain"), ("tune", "context")
 """Fields of the recipe that belong to the plan of the blocks, and to tuning them."""
 OTHERS = ("about", "depth", "refine", "mesh", "lod", "compress")
@@ -117,9 +120,27 @@ def part_keys(recipe: Recipe, inputs: Callable[[bool], Any] = lambda needs_prior
 
 
 def versions() -> dict[str, str]:
-    """Of surfkit and of the installed plugins that offer parts of recipes."""
+    """Of surfkit and of the installed plugins that offer parts of recipes.
+
+    Those of plugins end with a digest of their source files: whoever writes one changes the code more often than the
+    version, and finished runs of the old code must not stand for the new.
+    """
     offering = [plugin for plugin in records() if plugin.distribution and "surfkit_components" in plugin.hooks]
-    return dict(sorted((plugin.distribution, plugin.version) for plugin in offering))
+    return dict(sorted((each.distribution, f"{each.version}{_source_tag(each.name)}") for each in offering))
+
+
+def _source_tag(name: str) -> str:
+    """What tells the code of an installed plugin from other code of the same version; "" for parts of surfkit."""
+    module = inspect.getmodule(plugins().get_plugin(name))
+    if name in BUILTIN or module is None or not getattr(module, "__file__", None):
+        return ""
+    file = Path(module.__file__)
+    is_alone = not getattr(module, "__package__", None)
+    paths = [file] if is_alone else sorted(each for each in file.parent.rglob("*") if each.suffix in SOURCES)
+    found = hashlib.sha256()
+    for path in paths:
+        found.update(f"\0{path.relative_to(file.parent).as_posix()}\0".encode() + path.read_bytes())
+    return f"+{found.hexdigest()[:12]}"
 
 
 def inputs_of(run: Run, backend: str, prints: Fingerprint) -> Callable[[bool], Any]:

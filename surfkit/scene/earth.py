@@ -58,7 +58,8 @@ class Site:
         units = np.linalg.norm(axes, axis=0)
         if not (np.isfinite(units).all() and units.max() * (1 - UNEVEN) <= units.min() and np.linalg.det(axes) > 0):
             shown = " ".join(f"{value:.15g}" for value in origin)
-            raise BadInput(f"{crs} at {shown}: its axes are not east, north and up in one unit of length")
+            feet = "; name heights in feet too, such as EPSG:2263+6360" if 0.3 < units[0] < 0.31 else ""
+            raise BadInput(f"{crs} at {shown}: its axes are not east, north and up in one unit of length{feet}")
         up = axes[:, 2] / units[2]
         east = axes[:, 0] - up * (up @ axes[:, 0])
         east /= np.linalg.norm(east)

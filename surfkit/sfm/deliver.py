@@ -62,7 +62,10 @@ def deliver(
     except BadInput:
         before = {}
     lenses = [(image.name, model.cameras[image.camera_id]) for model, _ in models for image in _images(model)]
-    if any(before.get(file_name(name)) != _key(photos[name], camera) for name, camera in lenses):
+    wanted = {file_name(name): _key(photos[name], camera) for name, camera in lenses}
+    if any(before.get(name) != key for name, key in wanted.items()):
+        before = {name: key if wanted.get(name, key) == key else "" for name, key in before.items()}
+        write_json(work / RECORD, before)  # what a kill leaves half replaced counts as neither
         shutil.rmtree(scene / "sparse", ignore_errors=True)  # a model of other photographs would not be noticed
     total, done = sum(model.num_reg_images() for model, _ in models), 0
     kept: dict[str, str] = {}

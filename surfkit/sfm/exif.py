@@ -16,13 +16,17 @@ warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 MAKE, MODEL, ORIENTATION = 0x010F, 0x0110, 0x0112
 TAKEN, SUBSECOND, FOCAL_MM, FOCAL35_MM = 0x9003, 0x9291, 0x920A, 0xA405
+BODY, LENS = 0xA431, 0xA435
+"""Serial numbers."""
 PIXELS_X, PER_UNIT_X, UNIT = 0xA002, 0xA20E, 0xA210
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE, ERROR_M = 1, 2, 3, 4, 5, 6, 31
 UNIT_MM = {2: 25.4, 3: 10.0}
 """Of the focal plane's resolution: inch, centimetre."""
 DIAGONAL35_MM = math.hypot(36, 24)
 """Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
-XMP = re.compile(r"(?:drone-dji|Camera):(\w+)(?:=[\"']|>)\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)")
+LIKELY = (0.1, 10.0)
+"""Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
+XMP = re.compile(r"(?:drone-dji|Camera):(\w+)(?:=[\"']|>)\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?=\s*[\"'<])")
 """Numbers that DJI, and cameras by Pix4D's convention, write into XMP, as attributes or elements."""
 MOST_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
@@ -34,6 +38,7 @@ class Exif:
 
     Attributes:
         camera: Make and model.
+        serial: Serial numbers of body and lens, and the number in a rig: which one of several equal cameras it is.
         taken: Time, "2024:05:01 12:00:00.25", which sorts by time.
         orientation: 1 to 8, as EXIF numbers them; 1 is upright.
         focal_px: Focal length in pixels of the longer side's direction, at the size of the file.
@@ -43,10 +48,16 @@ class Exif:
 
     camera: str | None = None
     taken: str | None = None
+    serial: str | None = None
     orientation: int = 1
     focal_px: float | None = None
     position: tuple[float, float, float] | None = None
     accuracy_m: tuple[float, float, float] | None = None
+
+    @property
+    def which(self) -> str | None:
+        """Make and model, and which of several equal cameras it is."""
+        return self.camera if self.serial is None else f"{self.camera} {self.serial}"
 
 
 def read_exif(image: Image.Image, size: tuple[int, int]) -> Exif:
@@ -78,24 +89,35 @@ def facts(
     turned = basic.get(ORIENTATION, 1)
     return Exif(
         camera=" ".join(filter(None, names)) or None,
+        serial=_serial(camera, xmp),
         taken=f"{taken}.{part}" if taken and part else taken,
-        orientation=turned if turned in range(1, 9) else 1,
+        orientation=int(turned) if turned in range(1, 9) else 1,
         focal_px=_focal_px(camera, size),
         position=_position(gps),
         accuracy_m=_accuracy(gps, xmp),
     )
 
 
+def _serial(tags: Mapping[int, Any], xmp: Mapping[str, float]) -> str | None:
+    found = [*(_text(tags.get(tag)) for tag in (BODY, LENS)), xmp.get("RigCameraIndex")]
+    return " ".join(str(part) for part in found if part is not None) or None
+
+
 def _focal_px(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     focal, equivalent = _number(tags.get(FOCAL_MM)), _number(tags.get(FOCAL35_MM))
-    if equivalent:
-        return equivalent / DIAGONAL35_MM * math.hypot(*size)
+    if equivalent and _is_likely(found := equivalent / DIAGONAL35_MM * math.hypot(*size), size):
+        return found
     density, unit = _number(tags.get(PER_UNIT_X)), UNIT_MM.get(tags.get(UNIT, 2))
     width = _number(tags.get(PIXELS_X))
     if not (focal and density and unit and width):
         return None
     sensor_mm = width / density * unit  # of the direction that was the width when the photograph was taken
-    return focal / sensor_mm * max(size) if sensor_mm > 0.5 else None
+    found = focal / sensor_mm * max(size)
+    return found if _is_likely(found, size) else None
+
+
+def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:
+    return LIKELY[0] < focal_px / max(size) < LIKELY[1]
 
 
 def _position(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
@@ -104,7 +126,7 @@ def _position(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
     altitude = _number(tags.get(ALTITUDE), negative=True)
     if latitude is None or longitude is None or altitude is None or (latitude, longitude) == (0, 0):
         return None
-    below = tags.get(ALTITUDE_REF) in (1, b"\x01")
+    below = tags.get(ALTITUDE_REF) in (1, b"\x01", 3, b"\x03")  # sea level; the ellipsoid, from EXIF 3.0 on
     return latitude, longitude, -altitude if below else altitude
 
 
@@ -116,7 +138,7 @@ def _degrees(value: Any, half: Any, negative: str, most: float) -> float | None:
     found = degrees + minutes / 60 + seconds / 3600
     if not (math.isfinite(found) and abs(found) <= most):
         return None
-    return -found if _text(half) == negative else found
+    return -found if (_text(half) or "").upper().startswith(negative) else found
 
 
 def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, float, float] | None:

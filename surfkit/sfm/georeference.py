@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
+from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.readers.georeference import POLAR, Similarity
+from surfkit.readers.georeference import BESIDE, POLAR, Similarity, zone_of
 from surfkit.scene.earth import Site, utm
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.similarity import FEWEST, Fit, fit_robustly
@@ -78,28 +79,38 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
     Raises:
         BadInput: The coordinate reference system is not known, or is none of east, north and up, or pyproj is missing.
     """
-    middle = np.median(positions, axis=0)
+    middle = np.median(np.column_stack([positions[:, 0], _unbroken(positions[:, 1]), positions[:, 2]]), axis=0)
     if crs == "auto":
         if abs(middle[0]) > POLAR:
             raise BadInput(f"at latitude {middle[0]:.2f} there is no UTM; name a system with --crs, such as EPSG:3995")
         zone = int((middle[1] + 180) // 6) % 60 + 1
         crs = f"EPSG:{(32700 if middle[0] < 0 else 32600) + zone}"
-    return chart_about(crs, to_chart(Chart(crs, (0.0, 0.0, 0.0)), middle[None])[0])
+    placed = to_chart(Chart(crs, (0.0, 0.0, 0.0)), middle[None])[0]
+    if not np.isfinite(placed).all():
+        raise BadInput(
+            f"--crs {crs}: it does not reach {middle[0]:.4f}, {middle[1]:.4f} (latitude, longitude), the middle of the "
+            "positions; name one of their country"
+        )
+    return chart_about(crs, placed)
 
 
 def chart_about(crs: str, placed: np.ndarray) -> Chart:
     """The map about (3,) a place on it, its offset near it; BadInput for one that is not of east, north and up."""
     unit = Site.at(crs, placed).unit
-    metres = 1.0 if abs(unit - 1) < METRIC else unit
+    metres = 1.0 if abs(unit - 1) < METRIC else _unit_of_heights(crs)
     east, north = (float(np.round(value / GRAIN_M) * GRAIN_M) for value in placed[:2])
     return Chart(crs, (east, north, 0.0), metres)
 
 
 def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
-    """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes."""
-    code = chart.crs.upper().removeprefix("EPSG:")
-    if code.isdigit() and code[:3] in ("326", "327") and 1 <= int(code[3:]) <= 60 and len(code) == 5:
-        flat = np.array([utm(lat, lon, int(code[3:]), code[2] == "7") for lat, lon, _ in positions])
+    """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes; what is not finite
+    in a row says that the map does not reach it."""
+    zone = zone_of(chart.crs.upper())
+    if zone is not None:
+        away = np.abs((positions[:, 1] - (6 * zone[0] - 183) + 180) % 360 - 180)
+        reached = (np.abs(positions[:, 0]) <= POLAR) & (away < BESIDE)
+        flat = np.full((len(positions), 2), np.nan)
+        flat[reached] = np.array([utm(*row, *zone) for row in positions[reached, :2].tolist()]).reshape(-1, 2)
     else:
         flat = _by_pyproj(chart.crs, positions)
     return np.column_stack([flat, positions[:, 2] / chart.metres]) - chart.offset
@@ -116,11 +127,15 @@ def place(
         chart: The map.
         seed: Of the draws.
     """
-    known = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
+    given = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
+    onto = to_chart(chart, np.array([photo.exif.position for photo in given], np.float64).reshape(-1, 3))
+    reached = np.isfinite(onto).all(1)
+    if far := [photo.name for photo, good in zip(given, reached, strict=True) if not good]:
+        emit(Warned(f"{len(far)} positions are where {chart.crs} does not reach, and are left out: {few(far)}"))
+    known, onto = [photo for photo, good in zip(given, reached, strict=True) if good], onto[reached]
     if len(known) < FEWEST:
         return Refused(f"{len(known)} of {len(centres)} placed photographs have a position, {FEWEST} are needed")
     xyz = np.stack([centres[photo.name] for photo in known])
-    onto = to_chart(chart, np.array([photo.exif.position for photo in known], np.float64))
     stated = [photo.exif.accuracy_m for photo in known]
     sigma = None if None in stated else np.linalg.norm(np.array(stated, np.float64), axis=1) / np.sqrt(3)
     fit = fit_robustly(xyz, onto, sigma, seed, NEAR_M / chart.metres)
@@ -129,6 +144,8 @@ def place(
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
     along, across = fit.similarity.scale * spread[:2] / np.sqrt(fit.inside.sum()) * chart.metres
     rms = float(np.linalg.norm(fit.sigma)) * chart.metres
+    if along < NEAR_M:
+        return Refused(f"{int(fit.inside.sum())} of {len(known)} positions are one place")
     if across < LINE * along:
         return Refused(f"positions lie along a line: they spread by {along:.1f} m along it and {across:.2f} m across")
     if rms / np.sqrt(3) > MOST_TURN * across * np.sqrt(fit.inside.sum()):
@@ -155,6 +172,20 @@ def _by_pyproj(crs: str, positions: np.ndarray) -> np.ndarray:
     except ProjError as error:
         said = " ".join(str(error).split())[:200]
         raise BadInput(f"--crs {crs}: pyproj does not know it: {said}; name one such as EPSG:2180") from error
-    if not np.isfinite(flat).all():
-        raise BadInput(f"--crs {crs}: it does not reach the positions of the photographs; name one of their country")
     return flat
+
+
+def _unit_of_heights(crs: str) -> float:
+    """Metres, without the scale that the map has at a place: that of its heights is 1."""
+    with needed("pyproj", f"the coordinate reference system {crs}"):
+        from pyproj import CRS
+    return float(CRS(crs).to_3d().axis_info[-1].unit_conversion_factor)
+
+
+def _unbroken(longitudes: np.ndarray) -> np.ndarray:
+    """(P,) longitudes without the jump from 180 to -180 degrees, where they lie on both sides of it."""
+    if np.ptp(longitudes) <= 180:
+        return longitudes
+    turns = np.exp(1j * np.radians(longitudes))
+    about = np.degrees(np.angle(turns.mean()))
+    return about + (longitudes - about + 180) % 360 - 180

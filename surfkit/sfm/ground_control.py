@@ -5,6 +5,7 @@ The similarity to the map is that of the points, triangulated in the model; poin
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,14 +14,22 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput, few
+from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity, zone_of
-from surfkit.sfm.georeference import LINE, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
-from surfkit.sfm.similarity import FEWEST, fit_robustly, umeyama
+from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
+from surfkit.sfm.photographs import Photo
+from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
 
 FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
 GEOGRAPHIC = ("EPSG:4326", "WGS84", "+PROJ=LONGLAT", "+PROJ=LATLONG")
 """How a list says that its coordinates are longitude, latitude and height."""
+WGS84 = re.compile(
+    r"\+(proj=(utm|longlat|latlong)|zone=\d+|south|(datum|ellps)=WGS84|towgs84=0(,0)*|units=m|no_defs|type=crs)"
+)
+"""Words of PROJ that leave UTM and degrees on WGS 84, in metres; with any other they are left to pyproj."""
+FAR_M = 1000.0
+"""Receivers in cameras are not so wrong."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +39,7 @@ class GroundPoint:
     Attributes:
         name: As the list has it, or its line number.
         xyz: (3,) in the coordinates of the list.
-        marks: By name of the photograph, the pixel: x to the right and y down from the corner.
+        marks: By name of the photograph, the pixel: x to the right and y down from the corner of the file as stored.
     """
 
     name: str
@@ -133,34 +142,88 @@ def read_list(path: Path) -> tuple[str, list[GroundPoint]]:
     return rows[0][1], list(found.values())
 
 
-def read_ground(path: Path, wanted: str, names: Sequence[str]) -> Ground:
+def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], held_back: int = 0) -> Ground:
     """The points of a list on their map.
 
     Args:
         path: The list.
         wanted: `--crs`, which only coordinates in degrees leave open.
-        names: Photographs of the folder.
+        sizes: Width and height of each photograph that can be used, as stored, by its name.
+        held_back: How many points are to be checkpoints.
 
     Raises:
         BadInput: The list cannot be used; says where.
     """
-    crs, points = read_list(path)
-    known = {name.rpartition("/")[2] for name in names} | set(names)
-    listed = {name for point in points for name in point.marks}
-    if not listed & known:
-        shown = f": {few(sorted(listed))}" if listed else ", as it has no points"
-        raise BadInput(f"--gcp {path}: none of its photographs is in the folder{shown}; name those there")
+    crs, listed = read_list(path)
+    points = _marked(path, listed, sizes)
+    enough = sum(len(point.marks) >= FEWEST_VIEWS for point in points)
+    if enough < FEWEST_POINTS + held_back:
+        also = f" besides {held_back} --checkpoints" if held_back else ""
+        raise BadInput(
+            f"--gcp {path}: {enough} of its {len(points)} points are marked in {FEWEST_VIEWS} or more photographs of "
+            f"the folder; {FEWEST_POINTS} are needed{also}"
+        )
     xyz = np.array([point.xyz for point in points], np.float64)
-    if crs.upper().replace(" ", "").startswith(GEOGRAPHIC) and zone_of(crs) is None:
+    plain = not crs.startswith("+") or all(map(WGS84.fullmatch, crs.split()))
+    zone = zone_of(crs) if plain else None
+    if plain and zone is None and crs.upper().replace(" ", "").startswith(GEOGRAPHIC):
         positions = xyz[:, [1, 0, 2]]
+        if wrong := [point.name for point, (x, y, _) in zip(points, xyz, strict=True) if abs(x) > 180 or abs(y) > 90]:
+            raise BadInput(
+                f"--gcp {path}: {few(wrong)} is not in degrees, as line 1, {crs!r}, says; x is the longitude, y the "
+                "latitude, or line 1 names another system, such as EPSG:32633"
+            )
         chart = chart_of(positions, wanted)
-        return Ground(points, chart, to_chart(chart, positions))
-    if (zone := zone_of(crs)) is not None:
+        onto = to_chart(chart, positions)
+        if not np.isfinite(onto).all():
+            raise BadInput(f"--gcp {path}: some points are where {chart.crs} does not reach; x is the longitude")
+        return Ground(points, chart, onto)
+    if zone is not None:
         crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}"
     if wanted not in ("auto", crs):
         raise BadInput(f"--crs {wanted}: the list of --gcp is in {crs}, and the scene will be; leave --crs out")
-    chart = chart_about(crs, np.median(xyz, axis=0))
+    try:
+        chart = chart_about(crs, np.median(xyz, axis=0))
+    except BadInput as error:
+        raise BadInput(f"--gcp {path}: {error} (line 1 names the system; x is east and y north in it)") from error
     return Ground(points, chart, xyz - chart.offset)
+
+
+def _marked(path: Path, points: Sequence[GroundPoint], sizes: Mapping[str, tuple[int, int]]) -> Sequence[GroundPoint]:
+    """The points of a list with the full names of the photographs that show them, and without unknown ones."""
+    folders: dict[str, list[str]] = {}
+    for name in sizes:
+        folders.setdefault(name.rpartition("/")[2], []).append(name)
+    unknown: dict[str, None] = {}
+    found = []
+    for point in points:
+        marks = {}
+        for said, pixel in point.marks.items():
+            names = [said] if said in sizes else folders.get(said, [])
+            if not names:
+                unknown[said] = None
+                continue
+            if len(names) > 1:
+                raise BadInput(f"--gcp {path}: {said!r} may be {few(names)}; write the folder too")
+            if not all(0 <= at <= size for at, size in zip(pixel, sizes[names[0]], strict=True)):
+                width, height = sizes[names[0]]
+                raise BadInput(
+                    f"--gcp {path}: {point.name!r} is marked at {pixel[0]:g} {pixel[1]:g} in {said!r}, outside of its "
+                    f"{width} x {height} pixels; they are counted from the upper left of the file as it is stored"
+                )
+            marks[names[0]] = pixel
+        found.append(replace(point, marks=marks))
+    if not any(point.marks for point in found):
+        shown = f": {few(sorted(unknown))}" if unknown else ", as it has no points"
+        raise BadInput(f"--gcp {path}: none of its photographs is in the folder{shown}; name those there")
+    if unknown:
+        emit(
+            Warned(
+                f"--gcp {path}: {len(unknown)} of its photographs are not in the folder, or cannot be used; their "
+                f"marks are left out: {few(list(unknown))}"
+            )
+        )
+    return found
 
 
 def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Refused:
@@ -190,9 +253,17 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     inside = np.ones(len(control), bool) if fit is None else fit.inside
     given = umeyama(xyz, onto[control], np.ones(len(control))) if fit is None else fit.similarity
     sizes = np.linalg.svd(xyz[inside] - xyz[inside].mean(0), compute_uv=False)
-    if sizes[1] < LINE * sizes[0]:
-        return Refused("ground control points lie along a line")
     left = (onto[seen] - given.points(np.stack([placed[at] for at in seen]))) * chart.metres
+    if not sizes[1] > LINE * sizes[0]:
+        return Refused("ground control points lie along a line")
+    residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
+    rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
+    across = given.scale * sizes[1] * chart.metres
+    if rms / np.sqrt(3) > MOST_TURN * across:
+        return Refused(
+            f"residuals of {rms:.1f} m are too large for {len(residuals)} ground control points that spread by "
+            f"{across / np.sqrt(len(residuals)):.1f} m"
+        )
     return Control(
         chart,
         given,
@@ -204,18 +275,47 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     )
 
 
+def doubts(control: Control, centres: Mapping[str, np.ndarray], up: np.ndarray, photos: Sequence[Photo]) -> list[str]:
+    """What else is known of the photographs and contradicts the control points, a line for each.
+
+    Args:
+        control: Where the points put the model.
+        centres: (3,) of each placed camera in the model, by the name of its photograph.
+        up: (3,) unit vector of the model, by how cameras are held.
+        photos: With or without positions.
+    """
+    crs, found = control.chart.crs, []
+    if (control.similarity.turn @ up)[2] < -0.5:
+        found.append(
+            "the ground control points turn the photographs upside down, as an exchange of x and y does: is x east and "
+            f"y north in the list, in {crs}?"
+        )
+    known = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
+    if known:
+        ours = control.similarity.points(np.stack([centres[photo.name] for photo in known]))
+        theirs = to_chart(control.chart, np.array([photo.exif.position for photo in known], np.float64))
+        away = np.linalg.norm((ours - theirs)[:, :2], axis=1) * control.chart.metres
+        away = float(np.median(np.where(np.isfinite(away), away, np.inf)))
+        if away > FAR_M:
+            far = f"{away / 1000:.0f} km" if np.isfinite(away) else "out of reach"
+            found.append(
+                f"the ground control points put the photographs {far} from their positions in EXIF: is {crs} the "
+                "system of the list, with x east and y north?"
+            )
+    return found
+
+
 def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, float]]) -> np.ndarray | None:
     """(3,) the point nearest to the rays through its marks, each weighted by how near its camera is; None of fewer than
     two.
 
     Args:
         images: pycolmap.Image of each placed photograph, by its name.
-        marks: Pixels, by name of the photograph, of any folder.
+        marks: Pixels, by name of the photograph.
     """
-    by_name = {name.rpartition("/")[2]: image for name, image in images.items()} | dict(images)
     rays = []
     for name, pixel in marks.items():
-        if (image := by_name.get(name)) is None:
+        if (image := images.get(name)) is None:
             continue
         direction = np.append(np.asarray(image.camera.cam_from_img(np.array([pixel], np.float64))).ravel()[:2], 1.0)
         direction = np.array(image.cam_from_world().rotation.matrix()).T @ direction

@@ -21,8 +21,9 @@ from surfkit.sfm.pairs import Pair
 from surfkit.sfm.photographs import Photo, lens_groups
 from surfkit.sfm.settings import Settings
 
-BATCH = 40
-"""Pairs that are compared between two reports of progress."""
+BATCH, MOST_BATCHES = 40, 200
+"""Pairs that are compared at least between two reports of progress; such reports at most, as at each of them pycolmap
+begins by reading what the database says of all photographs."""
 DEFAULT_FOCAL = 1.2
 """Focal length over the longer side, where EXIF says none."""
 EXTRA = {"SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4}
@@ -54,7 +55,7 @@ def contents(
 ) -> Contents:
     """What the database of photographs is to be made from; `cameras` as for `match`."""
     features = {photo.name: feature_file(folder, photo, settings).name for photo in photos}
-    lenses = {photo.name: f"{settings.lens} {photo.exif.camera} {photo.size} {photo.exif.focal_px}" for photo in photos}
+    lenses = {photo.name: f"{settings.lens} {photo.exif.which} {photo.size} {photo.exif.focal_px}" for photo in photos}
     if cameras is not None:
         lenses = {photo.name: str(cameras[photo.name]) for photo in photos}
     return Contents(features, lenses, settings.seed)
@@ -84,8 +85,9 @@ def match(
     except BadInput:
         _begin(photos, pairs, features, database, settings, cameras)
     file = database.with_name("pairs.txt")
-    for start in range(0, len(pairs), BATCH):
-        batch = pairs[start : start + BATCH]
+    size = max(BATCH, -(-len(pairs) // MOST_BATCHES))
+    for start in range(0, len(pairs), size):
+        batch = pairs[start : start + size]
         with replacing(file) as opened:
             lines = [f"{alias(photos[one].name)} {alias(photos[two].name)}\n" for one, two in batch]
             opened.write("".join(lines).encode())
@@ -108,8 +110,8 @@ def matched(database: Path) -> dict[str, int]:
         names = {image.image_id: unquote(image.name) for image in opened.read_all_images()}
         counts = dict.fromkeys(names.values(), 0)
         least = engine.TwoViewGeometryOptions().min_num_inliers
-        for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            if len(geometry.inlier_matches) >= least:
+        for number, inliers in zip(*opened.read_two_view_geometry_num_inliers(), strict=True):
+            if inliers >= least:
                 for image in engine.pair_id_to_image_pair(number):
                     counts[names[image]] += 1
     finally:

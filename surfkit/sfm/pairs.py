@@ -70,8 +70,9 @@ def choose_pairs(
     chosen = sequence(order, STEPS)
     if way == "gps":
         chosen |= near(photos, settings.neighbours)
-    if way == "retrieval" or with_gps < count:
-        chosen |= alike(count, settings.neighbours, descriptors, settings.seed)
+    lost = range(count) if way == "retrieval" else [at for at in order if photos[at].exif.position is None]
+    if lost:
+        chosen |= alike(count, settings.neighbours, descriptors, settings.seed, lost)
     return sorted(chosen)
 
 
@@ -151,8 +152,10 @@ def distance_seen(centres: np.ndarray, views: np.ndarray) -> float:
     return max(least, -float((moved * turned).sum()) / weight if weight > 1e-12 * len(centres) else 0.0)
 
 
-def alike(count: int, most: int, descriptors: Callable[[int], np.ndarray], seed: int) -> set[Pair]:
-    """Each of `count` photographs with the `most` that look most like it."""
+def alike(
+    count: int, most: int, descriptors: Callable[[int], np.ndarray], seed: int, wanted: Sequence[int]
+) -> set[Pair]:
+    """Each of the `wanted` of `count` photographs with the `most` that look most like it."""
     if count < 2:
         return set()
     rng = np.random.default_rng(seed)
@@ -161,7 +164,7 @@ def alike(count: int, most: int, descriptors: Callable[[int], np.ndarray], seed:
     words, _ = kmeans2(sample, min(WORDS, len(sample)), minit="++", seed=rng)
     vectors = np.stack([vlad(descriptors(at).astype(np.float32), words) for at in range(count)])
     pairs = set()
-    for at in range(count):
+    for at in wanted:
         likeness = vectors @ vectors[at]
         likeness[at] = -np.inf
         for other in np.argsort(-likeness, kind="stable")[: min(most, count - 1)].tolist():

@@ -23,6 +23,8 @@ PHOTOGRAPHS = "photographs.json"
 """File of what was found."""
 OTHER = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
 """Photographs that Pillow does not decode."""
+HIDDEN = (".", "@eaDir")
+"""What names begin with that programs, and Synology's disks, keep for themselves."""
 DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MOST_THREADS = 8
@@ -77,7 +79,7 @@ def look(folder: Path, known: Sequence[Photo] = ()) -> list[Photo]:
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: {'a file' if folder.exists() else 'no such folder'}; name a folder of photographs")
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder)))
+    files = _files(folder)
     paths = [path for path in files if path.suffix.lower() in PICTURES]
     if other := [path.name for path in files if path.suffix.lower() in OTHER]:
         emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
@@ -115,27 +117,44 @@ def _mark_copies(photos: Sequence[Photo]) -> list[Photo]:
     return marked
 
 
-def is_blurred(photo: Photo, photos: Sequence[Photo]) -> bool:
-    """Whether a photograph is far less sharp than most of the folder."""
-    others = [other.sharpness for other in photos if other.usable]
-    return bool(others) and photo.sharpness < 0.4 * float(np.median(others))
+def blurred_below(photos: Sequence[Photo]) -> float:
+    """The sharpness below which a photograph is far less sharp than most of the folder."""
+    usable = [photo.sharpness for photo in photos if photo.usable]
+    return 0.4 * float(np.median(usable)) if usable else 0.0
 
 
 def lens_groups(photos: Sequence[Photo]) -> list[int]:
-    """The number of the lens of each photograph, from 0: equal for equal camera, size and focal length."""
-    keys = [(photo.exif.camera, photo.size, photo.exif.focal_px and round(photo.exif.focal_px)) for photo in photos]
+    """The number of the lens of each photograph, from 0: equal for one camera, size and focal length."""
+    keys = [(photo.exif.which, photo.size, photo.exif.focal_px and round(photo.exif.focal_px)) for photo in photos]
     numbers = {key: number for number, key in enumerate(Counter(keys))}
     return [numbers[key] for key in keys]
 
 
-def _is_hidden(path: Path) -> bool:
-    """Whether a file, or a folder that it is in, is one that programs keep for themselves, as thumbnails."""
-    return any(part.startswith(".") for part in path.parts)
+def _files(folder: Path) -> list[Path]:
+    """All files below a folder, but for those that programs keep for themselves, as thumbnails. Folders that links lead
+    to come after all others, so that each folder is looked into once, by its own name if it is inside."""
+    found, seen, starts = [], set(), [folder]
+    for start in starts:
+        for here, folders, names in os.walk(start):
+            if (place := os.path.realpath(here)) in seen:
+                folders.clear()
+                continue
+            seen.add(place)
+            folders[:] = sorted(name for name in folders if not name.startswith(HIDDEN))
+            starts += [path for name in folders if (path := Path(here, name)).is_symlink()]
+            found += [Path(here, name) for name in names if not name.startswith(HIDDEN)]
+    return sorted(path for path in found if path.is_file() or path.is_symlink())
 
 
 def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Photo:
-    name, stat = path.relative_to(folder).as_posix(), path.stat()
+    name = path.relative_to(folder).as_posix()
+    try:
+        stat = path.stat()
+    except OSError as error:
+        return Photo(name, (0, 0), problem=f"a link that leads nowhere ({error.strerror})")
     stamp = (stat.st_size, stat.st_mtime_ns)
+    if not _is_text(name):
+        return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
     if before is not None and before.stamp == stamp:
         copy = (before.problem or "").startswith("a copy of")
@@ -144,6 +163,14 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
         return _look(path, Photo(name, stamp))
     except BadInput as error:
         return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "))
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:  # bytes that Python could not decode
+        return False
+    return True
 
 
 def _look(path: Path, photo: Photo) -> Photo:

@@ -20,7 +20,7 @@ from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
-from surfkit.sfm.ground_control import Control, Ground, place_by_points, read_ground
+from surfkit.sfm.ground_control import Control, Ground, doubts, place_by_points, read_ground
 from surfkit.sfm.level import turn_upright, up_direction
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import matched
@@ -114,7 +114,8 @@ class Preparation:
     def _site(self, photos: Sequence[Photo]) -> Chart | Ground | None:
         """The map that the models come to, with control points if there are some; None without either."""
         if self.settings.gcp is not None:
-            return read_ground(self.settings.gcp, self.settings.crs, [photo.name for photo in photos])
+            sizes = {photo.name: photo.size for photo in photos}
+            return read_ground(self.settings.gcp, self.settings.crs, sizes, self.settings.checkpoints)
         known = np.array([photo.exif.position for photo in photos if photo.exif.position is not None], np.float64)
         if not len(known) and self.settings.crs != "auto":
             raise BadInput(f"--crs {self.settings.crs} needs positions, and no photograph has one; leave it out")
@@ -140,6 +141,9 @@ class Preparation:
         if isinstance(where, Refused):
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
             return _levelled(model, by_name), None
+        if isinstance(where, Control):
+            for doubt in doubts(where, centres_of(model), _up(model, by_name), photos):
+                emit(Warned(f"sparse/{number}: {doubt}"))
         model.transform(_sim3d(where.similarity))
         _name_wrong(where)
         if isinstance(where, Control):
@@ -202,11 +206,18 @@ def _placed(where: Placement | Control) -> Placed:
 def _levelled(model: Any, photos: dict[str, Photo]) -> Any:
     """The model turned so that z is up, its points about 0."""
     engine = load_engine()
-    images = [model.image(number) for number in model.reg_image_ids()]
-    poses = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
-    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    up = up_direction(poses, [photos[image.name].exif.orientation for image in images], points)
-    turn = turn_upright(up)
-    middle = turn @ np.median(points, axis=0)
+    turn = turn_upright(_up(model, photos))
+    middle = turn @ np.median(_points(model), axis=0)
     model.transform(engine.Sim3d(1.0, engine.Rotation3d(turn), -middle))
     return model
+
+
+def _up(model: Any, photos: dict[str, Photo]) -> np.ndarray:
+    """(3,) unit vector of the model, by how cameras are held."""
+    images = [model.image(number) for number in model.reg_image_ids()]
+    poses = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+    return up_direction(poses, [photos[image.name].exif.orientation for image in images], _points(model))
+
+
+def _points(model: Any) -> np.ndarray:
+    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)

@@ -12,7 +12,7 @@ from surfkit.core.files import replacing
 from surfkit.sfm.features import FEWEST
 from surfkit.sfm.georeference import Placement, centres_of
 from surfkit.sfm.ground_control import Control
-from surfkit.sfm.photographs import DARK, Photo, is_blurred
+from surfkit.sfm.photographs import DARK, Photo, blurred_below
 
 MOST_POINTS = 20_000
 """Points in the picture."""
@@ -29,12 +29,12 @@ def reasons(
         matches: With how many others each shares matches.
         models: Names in each model.
     """
-    found = {}
+    found, blurred = {}, blurred_below(photos)
     for photo in photos:
         name = photo.name
         if models and name in models[0]:
             continue
-        sight = " (far less sharp than the others)" if photo.usable and is_blurred(photo, photos) else ""
+        sight = " (far less sharp than the others)" if photo.usable and photo.sharpness < blurred else ""
         sight = " (dark)" if photo.usable and photo.light < DARK else sight
         group = next((number for number, names in enumerate(models) if name in names), None)
         if photo.problem is not None:
@@ -97,6 +97,7 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
 
 def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
     """A picture of cameras and points from above; of positions in EXIF too, with a line to the camera of each."""
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
     points = sorted(model.points3D.items())
@@ -111,9 +112,9 @@ def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
     axes.scatter(*xyz[:, :2].T, c=rgb, s=1.5, linewidths=0, rasterized=True)
     if isinstance(placement, Placement):
         onto = placement.onto
-        for name, to, good in zip(placement.names, onto, placement.fit.inside, strict=True):
-            colour = "tab:orange" if good else "red"
-            axes.plot(*zip(centres[name][:2], to[:2], strict=True), color=colour, linewidth=0.8)
+        lines = [(centres[name][:2], to[:2]) for name, to in zip(placement.names, onto, strict=True)]
+        colours = ["tab:orange" if good else "red" for good in placement.fit.inside]
+        axes.add_collection(LineCollection(lines, colors=colours, linewidths=0.8))
         axes.plot([], [], color="tab:orange", linewidth=0.8, label="to its position in EXIF")
         if not placement.fit.inside.all():
             axes.plot([], [], color="red", linewidth=0.8, label="position left out")

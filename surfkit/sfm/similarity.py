@@ -15,6 +15,8 @@ from surfkit.readers.georeference import Similarity
 
 DRAWS, ROUNDS = 300, 10
 """Fits to three positions; concentrations of each."""
+MOST = 1500
+"""Positions among which the consensus is sought: of more, a random part stands for all, as in FAST-LTS."""
 SIGMAS = 4.0
 """A position is wrong beyond so many standard deviations of the residuals: of Gaussian ones, 1 of 900 is."""
 MEDIAN_OF_CHI3 = 1.5382
@@ -99,6 +101,9 @@ def fit_robustly(
 
 def _consensus(xyz: np.ndarray, onto: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Similarity:
     """The fit with the least sum of squares over its best half."""
+    if len(xyz) > MOST:
+        part = rng.choice(len(xyz), MOST, replace=False)
+        xyz, onto, weights = xyz[part], onto[part], weights[part]
     count = len(xyz)
     half = max(FEWEST, (count + 4) // 2)
     best, least = umeyama(xyz, onto, weights), np.inf

@@ -50,7 +50,9 @@ def choose_views(found: Candidates, beyond: np.ndarray, edge: np.ndarray) -> np.
             part = slice(at, at + PART)
             for side in range(3):
                 after[part, side] = _messages(found.view, total, message, beyond, edge, part, side)
-        message = DAMPING * message + (1 - DAMPING) * after
+        message *= DAMPING  # in place: it is the largest array of all
+        after *= 1 - DAMPING
+        message += after
         emit(Progress("choosing photographs", turn + 1, ROUNDS))
     slot = (cost + message.sum(1)).argmin(1)
     chosen = np.where(found.view.max(1) == NONE, NONE, found.view[np.arange(len(slot)), slot]).astype(np.int32)

@@ -9,7 +9,7 @@ import torch
 from scipy import ndimage
 
 from surfkit.mesh.base import Mesh
-from surfkit.mesh.shade import draw_faces
+from surfkit.mesh.depths import nearest
 from surfkit.native import module
 from surfkit.scene.camera import Camera
 
@@ -62,7 +62,7 @@ def sight(
         longest: Triangles that are wider or higher than this, in pixels, are left out.
     """
     places = project(mesh.vertices, camera)
-    depth, _ = draw_faces(places, mesh.faces, camera.width, camera.height)
+    depth = nearest(mesh.vertices, mesh.faces, camera)
     if keep is not None:
         depth[~keep] = 0
     focal = min(camera.fx, camera.fy)

@@ -14,7 +14,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import write_json
 from surfkit.core.events import FileWritten, PhotoSkipped, Progress, Warned, emit
-from surfkit.core.files import replacing_folder
+from surfkit.core.files import refuse_own, replacing_folder
 from surfkit.core.lock import locked
 from surfkit.core.stages import kept_parts, key_of
 from surfkit.core.version import own_version
@@ -205,6 +205,9 @@ def textured(
 
     chosen = kept.once("chosen", choose)
     kept.forget(LOOKED)
+    if finer is None and (chosen["view"] == NONE).all():
+        told = f"of {len(views)} photographs, none shows a triangle whole, outside of masks and with nothing in front"
+        emit(Warned(f"{surface.path}: {told}: all of it has the colours of the mesh"))
     atlas, region = lay_out(mesh, views, chosen["view"], beyond, settings.size, region)
     gains = chosen["gains"]
     levels = kept.once("levels", lambda: asdict(level(mesh.faces, atlas.view, atlas.places, beyond, photos, gains)))
@@ -240,6 +243,7 @@ def refuse_foreign(out: Path) -> None:
     """OSError unless a folder is to be made, is empty, or has a textured mesh and nothing else: it will be replaced."""
     if out.exists() and not out.is_dir():
         raise OSError(errno.ENOTDIR, "a file; name a folder", str(out))
+    refuse_own(out)
     names = {path.name for path in out.iterdir()} if out.exists() else set()
     if names and RECORD not in names:
         raise OSError(errno.ENOTEMPTY, f"not empty and without {RECORD}; name another", str(out))

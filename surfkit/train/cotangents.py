@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,10 +57,23 @@ def pulled(shape: Splats, gradients: Gradients, leaves: Columns, terms: list[Ten
     """
     splats, grads = shape.named(), gradients.named()
     names = [name for name, value in splats.items() if value.requires_grad and name in grads]
-    raw = torch.autograd.grad(
-        [*(splats[name] for name in names), *terms],
-        list(leaves.values()),
-        [*(grads[name] for name in names), *(torch.ones_like(term) for term in terms)],
-        allow_unused=True,
-    )
+    known = _Known.apply([grads[name] for name in names], *(splats[name] for name in names))
+    raw = torch.autograd.grad([known, *terms], list(leaves.values()), allow_unused=True)
     return {name: grad.contiguous() for name, grad in zip(leaves, raw, strict=True) if grad is not None}
+
+
+class _Known(torch.autograd.Function):
+    """A scalar whose gradients by some tensors are known already.
+
+    To give them to `torch.autograd.grad` as `grad_outputs` comes to the same, but torch then imports sympy, which takes
+    longer than the first steps.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, grads: list[Tensor], *values: Tensor) -> Tensor:
+        ctx.grads = grads
+        return values[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *ctx.grads

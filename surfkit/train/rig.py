@@ -83,18 +83,40 @@ class Rig:
 
     def worth(self, at: int, places: Tensor) -> Tensor:
         """(V,) in [0, 1], how well each camera shows the places from another side than one does."""
-        local = self.rotations @ places + self.shifts  # (V, 3, P)
+        rows = torch.cat([torch.tensor([at]), self.turned_to(places)])
+        local = self.rotations[rows] @ places + self.shifts[rows]  # (R, 3, P)
         z = local[:, 2]
         ahead = z > 0
-        fx, fy, cx, cy, width, height = (self.lenses[:, k] for k in range(6))
+        fx, fy, cx, cy, width, height = (self.lenses[rows, k] for k in range(6))
         depth = torch.where(ahead, z, 1.0)
         x, y = fx * local[:, 0] / depth + cx, fy * local[:, 1] / depth + cy
         inside = ahead & (x > 0) & (x < width) & (y > 0) & (y < height)
-        rays = torch.nn.functional.normalize(places - self.centres, dim=1)
-        cosine = (rays * rays[at]).sum(1).clamp(-1, 1)
+        rays = torch.nn.functional.normalize(places - self.centres[rows], dim=1)
+        cosine = (rays * rays[0]).sum(1).clamp(-1, 1)
         angle = cosine.acos() * (180 / math.pi)
         spread = ANGLE * torch.where(angle < ANGLE, NARROW, WIDE)
         size = depth / fx
-        ratio = size / size[at]
+        ratio = size / size[0]
         worth = (-((angle - ANGLE) ** 2) / (2 * spread**2)).exp() * torch.minimum(ratio, 1 / ratio)
-        return torch.where(inside, worth, 0.0).mean(1)
+        found = torch.zeros(len(self.cameras))
+        found[rows] = torch.where(inside, worth, 0.0).mean(1)
+        return found
+
+    def turned_to(self, places: Tensor) -> Tensor:
+        """Positions of the cameras with some of a ball around the places in their pictures: of many, only these few
+        need be looked at place by place."""
+        middle = places.mean(1, keepdim=True)
+        radius = float((places - middle).norm(dim=0).max())
+        ball = (self.rotations @ middle + self.shifts)[..., 0]  # (V, 3)
+        fx, fy, cx, cy, width, height = (self.lenses[:, k, 0] for k in range(6))
+        none = torch.zeros_like(fx)
+        planes = (
+            (none, none, none + 1),
+            (fx, none, cx),
+            (-fx, none, width - cx),
+            (none, fy, cy),
+            (none, -fy, height - cy),
+        )
+        normals = torch.stack([torch.stack(plane, 1) for plane in planes])  # (5, V, 3), into what is seen
+        slack = radius + 1e-4 * (ball.norm(dim=1) + radius)  # of what float32 rounds
+        return ((normals * ball).sum(2) + normals.norm(dim=2) * slack >= 0).all(0).nonzero()[:, 0]

@@ -24,7 +24,7 @@ from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, 
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by, refuse_wrong_maps
-from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, observe, withheld
+from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, observe, sound, withheld
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
@@ -364,7 +364,8 @@ class Trainer:
         """What the policies ask for together, of what is allowed."""
         for policy in self.stage.policies:
             policy.watch(points, step)
-        edit = merge([policy.edit(points, step) for policy in self.stage.policies])
+        count = len(points)
+        edit = merge([sound(policy.edit(points, step), count, policy) for policy in self.stage.policies])
         return edit if edit is None or self.owns is None else withheld(edit, step.may_be_densified())
 
     def edited(self, state: StageState, edit: Edit, index: int) -> Points:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfkit.render.path import beside
+from surfkit.view.cursor import Cursor, serve_cursors
 from surfkit.view.layers import Layers
 from surfkit.view.photographs import Photographs
 from surfkit.view.screen import WORLD, ray_of, telling
@@ -24,6 +25,8 @@ HELP = """
 **Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
 
 **Keys.** W A S D: fly; Q E: down, up; arrows: turn. They work after a click into the picture.
+
+**Pointer.** The coordinates under it stand at the lower left; a switch under *Measure* turns that off.
 
 **Click.** On a camera: its photograph. On the surface: its coordinates; a point of the line, while *measure* is on.
 """
@@ -46,15 +49,18 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     server.initial_camera.up = up
     server.initial_camera.position = at * WORLD
     server.initial_camera.look_at = middle * WORLD
-    if subject.mesh is not None:  # so that the first click need not wait
-        threading.Thread(target=lambda: shelf.triangles, daemon=True).start()
-
+    threading.Thread(target=shelf.prepare, daemon=True).start()
     pages: dict[int, Page] = {}
+
+    def cursor_of(client_id: int) -> Cursor | None:
+        return page.cursor if (page := pages.get(client_id)) is not None else None
+
+    serve_cursors(served.script, cursor_of)
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
-            pages[client.client_id] = Page(shelf, client, folder, served.closing)
+            pages[client.client_id] = Page(shelf, client, folder, served)
             if client.client_id not in server.get_clients():  # it left meanwhile
                 leave(client)
 
@@ -70,15 +76,16 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
 class Page:
     """What one browser shows; another has its own layers, measures, box and path."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, closing: threading.Event) -> None:
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, served: Served) -> None:
         """Build the page."""
         self.shelf, self.client, self.fov = shelf, client, client.camera.fov
         client.gui.add_button("show all").on_click(lambda _: self._show_all())
         self.layers = Layers(shelf, client)
         self.measure = Measure(shelf, client)
+        self.cursor = None if served.script.missing else Cursor(shelf, client, self.measure.folder, self._pick)
         self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
-        self.path = PathTool(shelf, client, folder, closing)
+        self.path = PathTool(shelf, client, folder, served.closing)
         with client.gui.add_folder("Help", expand_by_default=False):
             client.gui.add_markdown(HELP)
         client.scene.on_click()(telling(client, self._click))
@@ -97,7 +104,11 @@ class Page:
             if camera is not None:
                 self.photographs.choose(camera, stand=self.photographs.follow.value)
                 return
-        self.measure.click(self.shelf.pick(origin, direction, mesh=self.layers.shows_mesh))
+        self.measure.click(self._pick(origin, direction))
+
+    def _pick(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """The local place on the surface that a ray meets."""
+        return self.shelf.pick(origin, direction, mesh=self.layers.shows_mesh)
 
 
 def first_view(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

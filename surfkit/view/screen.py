@@ -128,6 +128,19 @@ def ray_of(event: viser.SceneClickEvent) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(event.ray_origin, np.float64) / WORLD, direction / np.linalg.norm(direction)
 
 
+def ray_through(camera: viser.CameraHandle, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+    """Origin and unit direction of the ray of a pixel of a browser, local frame.
+
+    Args:
+        camera: Of the browser.
+        x: From the middle of the window to the right, in halves of its height.
+        y: Downwards.
+    """
+    pose, half = pose_of(camera), math.tan(camera.fov / 2)
+    direction = pose[:3, :3].T @ [x * half, y * half, 1.0]
+    return -pose[:3, :3].T @ pose[:3, 3], direction / np.linalg.norm(direction)
+
+
 def pose_of(camera: viser.CameraHandle) -> np.ndarray:
     """(4, 4) float64 world_to_camera of a browser's camera, local frame."""
     from viser import transforms

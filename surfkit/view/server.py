@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.optional import needed
+from surfkit.view.answers import Script, response
 from surfkit.view.gate import Asked, Gate
 
 if TYPE_CHECKING:
@@ -71,11 +72,13 @@ class Served:
         viser: What is shown; every client of it has come through the gate.
         url: With the token.
         closing: Set when the server is about to end, for whatever goes on for long.
+        script: That pages are given; none to begin with.
     """
 
     viser: viser.ViserServer
     url: str
     closing: threading.Event
+    script: Script
 
     def open_browser(self) -> bool:
         """Open the page in a browser; False where there is no display to open one on."""
@@ -103,16 +106,17 @@ def served(address: Address, title: str, what: str = "surfkit view") -> Iterator
     """
     package = require_viser(what)
     listener = listen(address)
-    gate = Gate(secrets.token_urlsafe(24), listener.getsockname()[1])
+    gate, script = Gate(secrets.token_urlsafe(24), listener.getsockname()[1]), Script()
     try:
-        with _gated(gate, listener) as used, _quiet():
+        with _gated(gate, listener, script) as used, _quiet():
             server = package.ViserServer(address.host, gate.port, label=title, verbose=False)
         closing = threading.Event()
         try:
             if not used:
                 raise Fault(f"viser {package.__version__} starts its server in an unknown way: pip install 'viser<1.2'")
             _never_share(server)
-            yield Served(server, f"http://{_shown_host(address.host)}:{gate.port}/?token={gate.token}", closing)
+            url = f"http://{_shown_host(address.host)}:{gate.port}/?token={gate.token}"
+            yield Served(server, url, closing, script)
         finally:
             closing.set()
             with _quiet():
@@ -163,8 +167,8 @@ def _shown_host(host: str) -> str:
 
 
 @contextmanager
-def _gated(gate: Gate, listener: socket.socket) -> Iterator[list[bool]]:
-    """Within, the server that viser starts serves at `listener`, and asks the gate first.
+def _gated(gate: Gate, listener: socket.socket, script: Script) -> Iterator[list[bool]]:
+    """Within, the server that viser starts serves at `listener`, asks the gate first, and has the script on its page.
 
     viser has no place for a hook of its own, so that the function by which it opens its port is replaced for as long as
     it takes to start; the list says whether viser has called it.
@@ -175,7 +179,11 @@ def _gated(gate: Gate, listener: socket.socket) -> Iterator[list[bool]]:
 
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **settings: Any) -> Any:
         async def answer(connection: Any, request: Any) -> Any:
-            return _refusal_or_cookie(gate, request) or process_request(connection, request)
+            if (refusal := _refusal_or_cookie(gate, request)) is not None:
+                return refusal
+            if (own := await script.respond(request.path)) is not None:
+                return own
+            return script.into(process_request(connection, request))
 
         used.append(True)
         settings |= {"process_request": answer, "logger": SILENT, "close_timeout": CLOSE_S}
@@ -194,19 +202,11 @@ def _refusal_or_cookie(gate: Gate, request: Any) -> Any:
     headers = request.headers
     asked = Asked(request.path, *(headers.get_all(name) for name in ("Cookie", "Origin", "Host")))
     if not gate.admits(asked):
-        return _response(http.HTTPStatus.FORBIDDEN, {}, b"surfkit view: open the address that the terminal shows\n")
+        return response(http.HTTPStatus.FORBIDDEN, "surfkit view: open the address that the terminal shows\n")
     is_page = "upgrade" not in headers
     if is_page and gate.brings_token(asked):  # so that it does not stay in the address bar and the history
-        return _response(http.HTTPStatus.SEE_OTHER, {"Location": "/", "Set-Cookie": gate.cookie}, b"")
+        return response(http.HTTPStatus.SEE_OTHER, "", {"Location": "/", "Set-Cookie": gate.cookie})
     return None
-
-
-def _response(status: http.HTTPStatus, headers: dict[str, str], body: bytes) -> Any:
-    from websockets.datastructures import Headers
-    from websockets.http11 import Response
-
-    plain = {"Content-Type": "text/plain", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
-    return Response(status, status.phrase, Headers({**plain, **headers, "Referrer-Policy": "no-referrer"}), body)
 
 
 def _never_share(server: viser.ViserServer) -> None:

@@ -28,7 +28,7 @@ from surfkit.view.display import (
     normals_of,
     unit_of,
 )
-from surfkit.view.picking import Triangles, hit_points, hit_splats
+from surfkit.view.picking import Places, Triangles, hit_splats
 from surfkit.view.subject import Subject
 
 Form = Literal["splats", "points", "points-while-moving"]
@@ -58,6 +58,7 @@ class Shelf:
         self.heights = height_bounds(subject.positions() @ subject.up)
         self.drawing, self.making = threading.Lock(), threading.RLock()
         self._triangles: Triangles | None = None
+        self._places: Places | None = None
         self._splats = lru_cache(KEPT)(self._choose_splats)
         self._mesh = lru_cache(KEPT)(self._choose_mesh)
 
@@ -87,6 +88,22 @@ class Shelf:
                 self._triangles = Triangles(mesh.vertices, mesh.faces)
             return self._triangles
 
+    @property
+    def places(self) -> Places:
+        """Of all points, for clicks."""
+        with self.making:
+            if self._places is None:
+                points = self.subject.points
+                self._places = Places(points.xyz if points is not None else self.subject.positions())
+            return self._places
+
+    def prepare(self) -> None:
+        """Make what takes long at the first click."""
+        if self.subject.mesh is not None:
+            _ = self.triangles
+        elif self.subject.draw is None:
+            _ = self.places
+
     def draw(self, view: View) -> Maps:
         """Maps of a view."""
         assert self.subject.draw is not None
@@ -108,8 +125,7 @@ class Shelf:
             with self.drawing:
                 along = hit_splats(subject.draw, origin, direction)
         else:
-            xyz = subject.points.xyz if subject.points is not None else subject.positions()
-            along = hit_points(xyz, origin, direction, CONE)
+            along = self.places.hit(origin, direction, CONE)
         return None if along is None else origin + along * direction
 
     def _choose_mesh(self, budget: int) -> Mesh:

@@ -43,7 +43,8 @@ class Measure:
         self.shelf, self.client = shelf, client
         self.points: list[np.ndarray] = []
         gui = client.gui
-        with gui.add_folder("Measure"):
+        self.folder = gui.add_folder("Measure")
+        with self.folder:
             self.place = gui.add_markdown("Click on the surface to see its coordinates.")
             self.on = gui.add_checkbox("measure", False, hint="Each click adds a point of a line.")
             self.closed = gui.add_checkbox("close the line", False, visible=False)

@@ -235,6 +235,18 @@ def test_our_own_mistakes_keep_their_traceback(monkeypatch):
         main(["export"])
 
 
+@pytest.mark.parametrize(
+    ("encoding", "text", "shown"),
+    [("ascii", "20.1 ± 0.3 m³", b"20.1 ? 0.3 m?"), ("utf-8", "wall-\udce9 ±", b"wall-? \xc2\xb1")],
+)
+def test_letters_that_the_terminal_lacks_are_question_marks(monkeypatch, encoding, text, shown):
+    """Also names of files whose bytes are no UTF-8: the work is done, and then its place is printed."""
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding))
+    command(monkeypatch, lambda: print(text))
+    assert main(["export"]) == 0 and raw.getvalue() == shown + b"\n"
+
+
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_closed_pipe_is_quiet(unbuffered):
     code = "import sys; from surfkit.cli import main; sys.exit(main(['--help']))"

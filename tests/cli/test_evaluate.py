@@ -89,6 +89,10 @@ def test_a_file_needs_no_run(folder, capsys, tmp_path, views):
         (["{f}/run", "--gt", "{f}/truth.ply", "--device", "cpu"], "has no effect with --gt"),
         (["{f}/run", "--gt", "{f}/truth.ply", "--views", "{f}/data"], "a run has views of its own"),
         (["{f}/data", "--gt", "{f}/truth.ply"], "no run folder"),
+        (
+            ["{f}/run", "--gt", "{f}/truth.ply", "--out", "{f}/truth.ply"],
+            "truth.ply: a file is in the place of a folder",
+        ),
         (["{f}/run", "--gt", "{f}/truth.ply", "--tau", "0"], "--tau 0: it is a length"),
         (["{f}/run", "--gt", "{f}/truth.ply", "--crop", "{f}/data"], "cannot be read"),
         (["{f}/run", "--lpips-weights", "{f}"], "neither vgg16.ckpt"),

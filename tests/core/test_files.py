@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from surfkit.core.files import refuse_special, replacing, replacing_folder, sweep
+from surfkit.core.caches import cache_root
+from surfkit.core.check import BadInput
+from surfkit.core.files import refuse_own, refuse_special, refuse_unwritable, replacing, replacing_folder, sweep
 
 
 def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
@@ -103,3 +105,35 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
             refuse_special(Path("/dev") / name)
     refuse_special(Path("/dev/shm/new.png"))
     refuse_special(tmp_path / "new.png")
+
+
+def test_the_folder_one_is_in_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "out" / "here").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "out" / "here")
+    for path in (Path("."), Path(".."), tmp_path / "out"):
+        with pytest.raises(OSError, match="the folder that you are in"):
+            refuse_own(path)
+    for path in (Path("new"), Path("../there"), tmp_path / "out" / "here" / "in"):
+        path.mkdir()
+        refuse_own(path)
+    refuse_own(Path("none"))
+
+
+def test_without_a_home_folder_the_user_is_told_what_to_set(monkeypatch, tmp_path):
+    for name in ("SURFKIT_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as it does for a user without a name
+    with pytest.raises(BadInput, match="HOME is not set.* set HOME, or SURFKIT_CACHE"):
+        cache_root()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_root() == tmp_path / "surfkit"
+    monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "own"))
+    assert cache_root() == tmp_path / "own"
+
+
+def test_what_cannot_be_written_is_told_before(tmp_path):
+    refuse_unwritable(tmp_path / "new" / "folders")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError):
+        refuse_unwritable(tmp_path / "file" / "inside")

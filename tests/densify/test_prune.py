@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -90,16 +91,43 @@ def test_trims_at_given_steps_whatever_an_epoch_is(crowd):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    "policy",
+    [
+        Trim(start=1_000, until=2_000, every=300),
+        Importance(at=(0, 7, 1_200, 9_000)),
+        Faint(start=500, until=1_100, every=100),
+        Importance(at=(9_000,)),
+        Trim(until=900),
+    ],
+)
+@pytest.mark.parametrize("steps", [900, 1_500])
+def test_steps_that_remove_points_are_foretold(crowd, policy, steps):
+    unseen = isinstance(policy, Trim)  # which drops, at the first step, what no view sees
+    found = [i for i in range(1 + unseen, steps + 1) if dropped(policy, crowd, i) is not None]
+    assert list(policy.edits(steps, 7)) == found
+
+
 def schedule(recipe_steps, epoch):
     """Steps that add points and steps that trim, of a run of so many steps with so many views."""
     adc, trim = (rescale(policy, recipe_steps / 30_000) for policy in (ADC(), Trim()))
     edits, trims, reset = list(adc.edits(recipe_steps)), [], 0
     for index in range(2, recipe_steps + 1):
-        if index in trim.trims(epoch) and index - reset >= trim.recovery:
+        if trim.is_due(index, index - reset, epoch):
             trims.append(index)
         if index % adc.reset_every == 0 and index < adc.until:
             reset = index
     return edits, trims
+
+
+def test_a_trim_that_falls_into_a_recovery_is_put_off_and_two_are_never_close():
+    assert schedule(30_000, 3_001)[1] == [3_500, 6_500, 9_500, 12_500]
+    assert schedule(30_000, 502)[1].count(3_500) == 0, "3,012 is left out, as 3,514 follows"
+    epochs = {3_000: range(1, 1_400, 13), 4_000: range(1, 1_900, 17), 30_000: (1, 958, 3_124, 6_249, 9_499, 12_499)}
+    for steps, epoch in ((steps, epoch) for steps, some in epochs.items() for epoch in some):
+        trims = schedule(steps, epoch)[1]
+        assert trims or not rescale(Trim(), steps / 30_000).edits(steps, epoch), f"{steps} steps with {epoch} views"
+        assert all(b - a >= 500 for a, b in pairwise(trims))
 
 
 @pytest.mark.parametrize("epoch", [1, 7, 21, 24, 45, 70, 100])

@@ -10,7 +10,9 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
-from surfkit.depth.patch_match import PatchMatch
+from surfkit.depth.neighbours import neighbours
+from surfkit.depth.patch_match import PatchMatch, Work
+from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
@@ -124,6 +126,24 @@ def test_the_kernel_is_the_weighted_correlation_of_windows(samples):
     assert np.ptp(planes.cost[4:20, 4:28]) > 0.3
 
 
+def test_a_window_of_which_nothing_counts_matches_nothing():
+    """With a narrow spread, as settings allow it, a bright pixel is compared with none of the dark ones around it."""
+    here, there = two_pictures(0)
+    dark = np.zeros_like(here.value)
+    dark[4::9, 4::9] = 255
+    here, terms = Grey(here.camera, dark), replace(STILL, spread=255 * 1e-4, samples=16, window=7)
+    assert not (pattern(7)[:2, :16] == 0).all(0).any()
+    for kernels in module().kernels():
+        module().use_kernels(kernels)
+        try:
+            planes = Planes.at(np.full(dark.shape, 0.5, np.float32), 1)
+            improve(here, [there], planes, terms, seed=0)
+        finally:
+            module().use_kernels(module().kernels()[0])
+        assert (planes.each[4::9, 4::9] == 255).all(), kernels
+        assert planes.cost.max() <= 2, kernels
+
+
 def test_the_reprojection_error_counts_up_to_its_limit():
     here, there = two_pictures(1)
     plain, with_maps, with_wrong = (Planes.at(np.full((24, 32), 0.5, np.float32), 1) for _ in range(3))
@@ -163,6 +183,35 @@ def test_a_plane_counts_in_the_views_that_match_it_best():
         improve(Grey(Camera(torch.eye(4, dtype=torch.float64), *lens), ours), others, planes, terms, seed=index)
     inner = planes.value[8:-8, 16:-16, 0]
     assert (np.abs(inner - behind) < 0.02).mean() > 0.95
+
+
+def test_fewer_large_pictures_are_kept_in_memory(farm, tmp_path):
+    scene, tracks, _ = farm
+    given, pairs = DepthInput(scene.train, tracks, CPU, tmp_path), [[1, 2, 3], *[[0]] * 19]
+    assert Work(PatchMatch(), given, pairs, []).room() == 48
+    large = [replace(view, camera=view.camera.resized(4000, 3000)) for view in scene.train]
+    kept = Work(PatchMatch(longest=4000), replace(given, views=large), pairs, []).room()
+    assert 5 < kept < 16 and kept * 15 * 12e6 <= 2**31
+    huge = [replace(view, camera=view.camera.resized(20_000, 15_000)) for view in scene.train]
+    assert Work(PatchMatch(longest=20_000), replace(given, views=huge), pairs, []).room() == 5
+
+
+def test_maps_that_nobody_needs_any_more_are_deleted(farm, tmp_path):
+    """While twenty views are estimated one after the other, and with the same result."""
+    scene, tracks, _ = farm
+    settings = PatchMatch(coarsest=60, passes=1, neighbours=2, best=1, longest=60)
+    found, most, pairs = {}, 0, neighbours(scene.train, tracks, 2, settings.angle)
+    given = DepthInput(scene.train, tracks, CPU, tmp_path / "all")
+    for estimate in settings.estimate(given, range(20)):
+        found[estimate.at] = estimate
+        left = set(range(estimate.at, 20))
+        there = {int(path.stem) for path in (given.work / "comparing-depth-maps").glob("*.npy")}
+        assert there >= {at for at in left for at in (at, *pairs[at])} & set(range(estimate.at))
+        most = max(most, len(list(given.work.rglob("*.npy"))))
+    assert most < 30 and not list(given.work.rglob("*.npy"))
+    alone = DepthInput(scene.train, tracks, CPU, tmp_path / "alone")
+    (again,) = settings.estimate(alone, [9])
+    assert torch.equal(again.inverse, found[9].inverse) and torch.equal(again.confidence, found[9].confidence)
 
 
 def test_the_number_of_threads_changes_nothing(farm, tmp_path):

@@ -15,8 +15,9 @@ from surfkit.evaluate.geometry.comparison import Comparison, compare
 from surfkit.evaluate.geometry.errors import error_colors
 from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.repetition import cloud_side
+from surfkit.evaluate.geometry.sampling import face_areas, sample_faces
 from surfkit.evaluate.geometry.scores import shares
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.surface import Surface, part_within, read_surface
 from surfkit.evaluate.geometry.transform import apply, write_transform
 from surfkit.export.ply import read_vertices, write_points
 from surfkit.scene.crop import Crop, write_crop
@@ -102,6 +103,44 @@ def test_a_coarse_mesh_gets_enough_samples():
     p, r, _ = f1(compare(square, surface(lattice(side=61)), still(tau=0.15)))
     assert p > 0.999 and r > 0.999
     assert f1(compare(square, surface(lattice(side=61)), still(tau=0.15, samples=200)))[1] < 0.5
+
+
+@pytest.mark.parametrize("far", ["reconstruction", "truth", "both"])
+def test_a_large_triangle_far_away_takes_no_samples(tmp_path, monkeypatch, told, far):
+    """Half a square is there: recall 1/2, whatever lies beyond the crop volume, and however large."""
+    monkeypatch.setattr(repetition, "MOST", 60_000)
+    sky = [[-1e5, -1e5, 500], [1e5, -1e5, 500], [0, 2e5, 500], [2.6, -7e4, 0], [9e4, 0, 0], [2.6, 7e4, 0]]
+
+    def mesh(width, beyond):
+        x, y = np.meshgrid(np.linspace(0, width, 9), np.linspace(0, 6, 9))
+        corners = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
+        at = np.arange(81).reshape(9, 9)
+        a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, :-1], at[1:, 1:]))
+        faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, d, c], 1)])
+        if beyond:
+            corners, faces = np.concatenate([corners, sky]), np.concatenate([faces, [[81, 82, 83], [84, 85, 86]]])
+        return surface(corners, faces)
+
+    square = Crop(np.array([[0.0, 0], [2.4, 0], [2.4, 6], [0, 6]]), -1, 1)
+    write_crop(tmp_path / "c.json", square)
+    settings = still(crop=str(tmp_path / "c.json"), tau=0.1, draws=1)
+    pair = mesh(1.2, far != "truth"), mesh(6, far != "reconstruction")
+    p, r, _ = f1(compare(*pair, settings))
+    assert p > 0.999 and 0.5 < r < 0.5 + 0.1 / 2.4, "half, and what lies within tau of it"
+    assert not told
+
+
+def test_a_part_of_a_mesh_is_all_of_it_within_the_box():
+    low, high = np.array([-2.0, -1, -9]), np.array([5.0, 4, 9])
+    for mesh in (GLOBE, surface([[-50, -50, 1], [90, -40, 1.5], [3, 70, 0]], np.array([[0, 1, 2]]))):
+        part = part_within(mesh, low, high)
+        points, _ = sample_faces(mesh, 200_000, np.random.default_rng(0))
+        own, _ = sample_faces(part, 20_000, np.random.default_rng(0))
+        inside = ((points > low) & (points < high)).all(1)
+        share = ((own > low) & (own < high)).all(1).mean()
+        area, whole = face_areas(part).sum(), face_areas(mesh).sum()
+        assert area * share == pytest.approx(whole * inside.mean(), rel=0.03) and share > 0.5
+    assert not len(part_within(GLOBE, np.full(3, 20.0), np.full(3, 30.0)).faces)
 
 
 def test_draws_differ_and_seeds_repeat():

@@ -58,6 +58,12 @@ def test_contours_of_a_cone_are_circles_and_meet_where_tiles_do():
     assert len(inner) > 10 and all(inner.count(end) == 2 for end in inner)
 
 
+def test_levels_are_as_people_write_them():
+    grid = grid_of(1.0, 0, 0, 30, 30)
+    lines = contour_lines(centres(grid)[0] / 30, grid, Window(0, 0, 30, 30), 0.1)
+    assert [level for level, _ in lines] == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+
+
 def test_contours_end_at_holes_and_have_a_limit():
     grid = grid_of(1.0, 0, 0, 30, 30)
     slope = centres(grid)[0]

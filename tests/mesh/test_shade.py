@@ -1,6 +1,7 @@
 """Pictures of meshes show what a ray would meet."""
 
 import numpy as np
+import pytest
 from needs import needs, needs_native
 
 from surfkit.mesh.base import Mesh
@@ -28,6 +29,26 @@ def test_compiled_and_numpy_agree():
     draw_in_numpy(vertices, faces, *plain)
     assert np.array_equal(depth, plain[0]) and np.array_equal(face, plain[1])
     assert (face >= 0).mean() > 0.5 and not {1, 3} & set(face.ravel().tolist())
+
+
+@needs_native
+@pytest.mark.parametrize("far", [1e4, 3e9, 1e12, 1e30])
+def test_a_corner_hardly_in_front_of_the_camera_takes_nothing_away(far):
+    """It falls far out of the picture, beyond what an int holds; the triangle still covers what it covers."""
+    vertices = np.array([[-1, -1, 2], [far, -1, 1e-3], [-1, far, 1e-3]], np.float32)
+    turned = np.array([[101, 71, 2], [-far, 71, 1e-3], [101, -far, 1e-3]], np.float32)
+    for corners in (vertices, turned):
+        depth, face = draw_faces(corners, np.array([[0, 1, 2]]), 100, 70)
+        plain = np.full((70, 100), np.inf, np.float32), np.full((70, 100), -1, np.int32)
+        draw_in_numpy(corners, np.array([[0, 1, 2]]), *plain)
+        assert (face == 0).all() and np.array_equal(face, plain[1]) and np.array_equal(depth, plain[0])
+
+
+@needs_native
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_corner_that_is_nowhere_draws_nothing(wrong):
+    corners = np.array([[-1, -1, 2], [200, -1, 2], [-1, wrong, 2]], np.float32)
+    assert (draw_faces(corners, np.array([[0, 1, 2]]), 100, 70)[1] == -1).all()
 
 
 def test_depth_is_that_of_the_solid():

@@ -33,6 +33,23 @@ def stereo_subject(cameras, confidence=1.0, **changes):
     return subject(cameras, sphere, **(given | changes))
 
 
+def test_photographs_without_a_prior_are_not_read():
+    """A damaged photograph has no prior; to read it again would end the fusion. Where to look takes no photograph."""
+    read, cameras = [], around(8)
+
+    def photo(at):
+        if at == 3:
+            raise BadInput("damaged")
+        read.append(at)
+        return torch.zeros(3, 72, 96, dtype=torch.uint8)
+
+    given = stereo_subject(cameras, photo=photo)
+    given.priors[3] = None
+    mesh = Stereo().mesh(given)
+    assert len(mesh.faces) > 300
+    assert sorted(read) == sorted([0, 1, 2, 4, 5, 6, 7] * 2), "for automatic lengths, and for the fusion"
+
+
 def test_priors_alone_give_the_surface_and_photographs_its_colours():
     given = stereo_subject(around(20))
     mesh = Stereo().mesh(given)

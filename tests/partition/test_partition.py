@@ -22,7 +22,7 @@ from surfkit.partition import (
 )
 from surfkit.partition.base import Contraction, Ground
 from surfkit.partition.merge import Merge
-from surfkit.partition.plan import Fewest, Plan, plan, touch, with_enough
+from surfkit.partition.plan import Fewest, Plan, plan, touching, with_enough
 from surfkit.testing import check_partition
 from surfkit.testing.inputs import above, coarse_model
 
@@ -70,8 +70,18 @@ def test_random_cells_tile_the_ground():
         grid = torch.tensor([-1e9, *cuts, 1e9], dtype=torch.float64)
         points = torch.cat([torch.cartesian_prod(grid, grid), torch.zeros(len(grid) ** 2, 1)], 1)
         cells = Cells(FLAT, tuple(boxes), tuple(range(6)))
-        one_by_one = sum((replace(cells, boxes=(box,), blocks=(0,)).owner(points) == 0).long() for box in boxes)
-        assert (one_by_one == 1).all() and (cells.owner(points) >= 0).all()
+        inside = torch.stack([in_box(points, box) for box in boxes])
+        assert (inside.sum(0) == 1).all() and torch.equal(cells.owner(points), inside.long().argmax(0))
+
+
+def in_box(points, box):
+    """(N,) bool, by comparing with each side: lower ones belong to the cell, upper ones do not."""
+    low, high = (
+        torch.tensor([end if side is None else side for side in sides], dtype=torch.float64)
+        for sides, end in ((box[:2], -math.inf), (box[2:], math.inf))
+    )
+    flat = points[:, :2].double()
+    return ((flat >= low) & (flat < high)).all(1)
 
 
 def test_points_that_are_no_numbers_have_no_owner():
@@ -191,7 +201,7 @@ def test_blocks_with_few_views_join_the_neighbour_that_shares_them():
     assert found.blocks == (0, 1, 1) and found.count == 2
     assert views.tolist() == [[True, False]] * 3 + [[False, True]] * 2
     assert with_enough(cells, joins, joins, 100, torch.zeros(3).bool())[0].blocks == (0, 0, 0)
-    assert touch(cells, {0}, {1}) and not touch(cells, {0}, {2})
+    assert touching(cells) == {0: {1}, 1: {0, 2}, 2: {1}}
 
 
 def test_blocks_with_hardly_any_points_join_too():
@@ -221,7 +231,7 @@ class Fixed(Partition):
 def test_corners_do_not_touch():
     quarters = ((None, None, 0.0, 0.0), (0.0, None, None, 0.0), (None, 0.0, 0.0, None), (0.0, 0.0, None, None))
     cells = Cells(FLAT, quarters, (0, 1, 2, 3))
-    assert not touch(cells, {0}, {3}) and touch(cells, {0}, {1}) and touch(cells, {0}, {2})
+    assert touching(cells) == {0: {1, 2}, 1: {0, 3}, 2: {0, 3}, 3: {1, 2}}
 
 
 def test_small_scenes_need_fewer_views():

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -5,6 +7,7 @@ from surfkit.core.check import BadInput
 from surfkit.primitives import Surfel2D
 from surfkit.primitives.edit import Edit, NewPoints, apply, merge, withheld
 from surfkit.primitives.points import Points
+from surfkit.train.stage import Trainer
 
 
 def points(count: int = 6) -> Points:
@@ -27,6 +30,37 @@ def test_take_moves_every_column_with_its_row():
     assert taken.exp_avg["opacities"].tolist() == [14, 11]
     assert taken.exp_avg_sq["means"][:, 0].tolist() == [112, 103]
     assert taken.stat("a/count").tolist() == [4, 1]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (Edit(drop=torch.ones(6)), r"edit: drop is torch.float32 of shape \(6,\); it must be bool of shape \(6,\)"),
+        (Edit(drop=torch.ones(6, dtype=torch.int64)), "drop is torch.int64"),
+        (Edit(split=torch.tensor([2, 5])), r"split is torch.int64 of shape \(2,\)"),
+        (Edit(clone=mask(1, count=5)), r"clone is torch.bool of shape \(5,\); it must be bool or int64 of shape"),
+        (Edit(move=torch.ones(6)), r"move is .* it must be float32 or float64 of shape \(6, 3\)"),
+        (Edit(opacities=0.5), "opacities is float; it must be"),
+        (mask(1), "edit gives Tensor; it must be a surfkit.Edit, or None"),
+    ],
+)
+def test_what_a_policy_gives_must_fit_the_points(asked, message):
+    """A mask of whole numbers would be inverted bit by bit, and then be rows: all points but two would be lost."""
+
+    class Policy:
+        def watch(self, points, step):
+            pass
+
+        def edit(self, points, step):
+            return asked
+
+    trainer = SimpleNamespace(stage=SimpleNamespace(policies=[Policy()]), owns=None)
+    with pytest.raises(BadInput, match=message):
+        Trainer.wanted(trainer, points(), None)
+    asked = Edit(drop=mask(1), clone=torch.ones(6, dtype=torch.int64), move=torch.ones(6, 3))
+    assert Trainer.wanted(trainer, points(), None).counts == (1, 5, 0)
+    asked = None
+    assert Trainer.wanted(trainer, points(), None) is None
 
 
 def test_new_rows_start_without_a_past():

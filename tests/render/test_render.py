@@ -2,6 +2,7 @@
 
 import json
 import math
+import resource
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from PIL import Image
 
 from surfkit.cli import main
 from surfkit.cli.render import identity
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.export.cameras import write_cameras
@@ -337,3 +338,23 @@ def trained(tmp_path_factory):
     assert main([*words, "--steps", "10", "--device", "cpu"]) == 0
     shutil.rmtree(folder / "run" / "progress", ignore_errors=True)
     return folder / "run"
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".webm"])
+def test_a_video_that_finds_no_room_is_not_there(tmp_path, ending):
+    """OpenCV says nothing; the frames stay, and the same command makes the video from them."""
+    needs("cv2")
+    noise = np.random.default_rng(0)
+    paths = [tmp_path / f"{at}.png" for at in range(12)]
+    for path in paths:
+        Image.fromarray(noise.integers(0, 255, (48, 64, 3), np.uint8)).save(path)
+    known = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, known[1]))
+    try:
+        with pytest.raises(Fault, match="could not be written to its end"):
+            write_video(tmp_path / f"cut{ending}", paths, 12.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, known)
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    write_video(tmp_path / f"whole{ending}", paths, 12.0)
+    assert (tmp_path / f"whole{ending}").stat().st_size > 8_000

@@ -99,6 +99,19 @@ def test_each_note_is_stated_once_with_its_rows(data, tmp_path):
     assert note_lines({"data_sets": [entry, entry]})[2:] == ["row 1, farm: one", "rows 1 and 2, farm: two"]
 
 
+def test_rows_of_several_devices_are_told_apart(data, tmp_path):
+    """A table that began on one machine and went on on another: its minutes cannot be compared."""
+    trials = []
+    for label, device in {"a": "cpu avx2", "b": "cpu avx2", "c": "NVIDIA H200"}.items():
+        (tmp_path / label).mkdir()
+        (tmp_path / label / "run.json").write_text(json.dumps({"notes": [], "device": device, "threads": 4}))
+        trials.append(Trial(label, 0, PLAIN, tmp_path / label, data))
+    assert notes_of(trials[:2]) == []
+    first, second = notes_of(trials)
+    assert first["text"].startswith("trained on cpu avx2, threads: 4: minutes") and first["rows"] == ["a", "b"]
+    assert second["text"].startswith("trained on NVIDIA H200") and second["rows"] == ["c"]
+
+
 def test_a_run_that_takes_a_stage_notes_what_was_switched_off_in_it(data, tmp_path):
     stage = Stage(steps=2, losses=Stage().losses | {"depth": DepthRegression()})
     store, recipe = StageStore(tmp_path / "stages"), Recipe(pretrain=stage)

@@ -5,18 +5,24 @@ import json
 from dataclasses import replace
 
 import pytest
+from PIL import Image
 from rich.console import Console
 
+from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.densify import CountCap, Elongation
 from surfkit.readers.data import Data
+from surfkit.readers.fingerprint import fingerprint as data_fingerprint
+from surfkit.readers.read import read
 from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
 from surfkit.report import rows
 from surfkit.report.ablation import Row, Table
+from surfkit.report.rows import Outcome
 from surfkit.report.screen import Screen
 from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
 from surfkit.report.table import lines, markdown
+from surfkit.report.truth import Truth
 from surfkit.run import shared
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
@@ -103,6 +109,9 @@ def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
     recipes = [trial.recipe for trial in trials(plan)]
     assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * len(MODEL.rows)
     assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
+    stages = [(path, stage) for recipe in recipes for path, stage, _ in recipe.stages() if stage.densify is not None]
+    assert {path for path, _ in stages} == {"pretrain", "partition_pretrain", "tune"}, "in blocks, too"
+    assert all(stage.densify.most_points == 500 for _, stage in stages)
     free = trials(replace(plan, max_points=None))
     assert not {trial.folder for trial in trials(plan)} & {trial.folder for trial in free}
     assert "at most 500 points" in markdown(report_of(plan, [], {}))
@@ -150,6 +159,31 @@ def test_a_finished_table_needs_nothing(data, runs, tmp_path):
     runs.calls = []
     ablate(replace(plan, steps=20), Silent())
     assert len(runs.calls) == 2, "other steps are other runs"
+
+
+def test_rows_of_other_data_do_not_stand_beside_those_that_are_there(runs, tmp_path):
+    """Photographs were replaced after some rows were finished: the others would be trained on what is there now."""
+    write_colmap(tmp_path / "scene", photograph(Flight(views=9, width=24, height=18, points=40)))
+    plan = Plan(TABLE, (Data(tmp_path / "scene"),), tmp_path / "out")
+    first = ablate(plan, Silent())
+    for trial in trials(plan):
+        write_json(trial.folder / "inputs.json", data_fingerprint(read(trial.data)))
+    more = replace(plan, seeds=2, rows=("1",))
+    assert len(ablate(more, Silent())["data_sets"][0]["rows"][0]["runs"]) == 2, "the data are as they were"
+    photo = read(plan.data[0]).train[3].path
+    Image.new("RGB", (24, 18)).save(photo)
+    runs.calls = []
+    with pytest.raises(BadInput, match=rf"--out {plan.out} has rows .* photograph {photo.name} has changed"):
+        ablate(replace(plan, seeds=2), Silent())
+    assert runs.calls == [] and rows_in(ablate(plan, Silent()))[0]["runs"] == rows_in(first)[0]["runs"]
+
+
+def test_a_row_that_draws_nothing_is_done_without_lpips(data, tmp_path):
+    plan = Plan(TABLE, (data,), tmp_path, columns=("lpips",))
+    trial, spent = trials(plan)[0], {"seconds": 1.0, "cpu_seconds": 1.0}
+    assert plan.is_done(trial, Outcome(spent)) and not plan.is_done(trial, Outcome())
+    assert not plan.is_done(trial, Outcome(spent | {"psnr": 20.0}))
+    assert plan.is_done(trial, Outcome(spent | {"psnr": 20.0, "lpips": 0.3}))
 
 
 def test_some_rows_now_and_the_others_later(data, runs, tmp_path):
@@ -260,6 +294,55 @@ def test_a_fingerprint_tells_what_a_run_is_made_from(data, monkeypatch):
     monkeypatch.setattr(shared, "records", lambda: newer)
     others.append(fingerprint(recipe, data))
     assert len({first, *others}) == 5
+
+
+def test_other_code_of_a_plugin_is_another_run(data, tmp_path, monkeypatch):
+    """Its author changes the code, and the version much later."""
+    info = tmp_path / "acme-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[surfkit]\nacme = acme_parts\n")
+    (tmp_path / "acme_parts").mkdir()
+    start = "from dataclasses import dataclass\nfrom surfkit import Prune, hookimpl\nfrom acme_parts.rule import ODD\n"
+    part = "@dataclass(frozen=True)\nclass Odd(Prune):\n    def edit(self, points, step):\n        return ODD\n"
+    hook = "@hookimpl\ndef surfkit_components():\n    return {'odd': Odd}\n"
+    (tmp_path / "acme_parts" / "__init__.py").write_text(start + part + hook)
+    rule = tmp_path / "acme_parts" / "rule.py"
+    rule.write_text("ODD = None\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("SURFKIT_PLUGINS", "acme")
+    registry.reload()
+    try:
+        known, first = shared.versions(), fingerprint(COARSE_BASELINE, data)
+        assert known.keys() == {"surfkit", "acme"} and known["acme"].startswith("1.0+") and "+" not in known["surfkit"]
+        assert fingerprint(COARSE_BASELINE, data) == first
+        rule.write_text("ODD = 1 - 1\n")
+        assert fingerprint(COARSE_BASELINE, data) != first
+        rule.write_text("ODD = None\n")
+        assert fingerprint(COARSE_BASELINE, data) == first
+    finally:
+        monkeypatch.undo()
+        registry.reload()
+
+
+def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):
+    file = tmp_path / "gt.ply"
+    file.write_text("a truth")
+    automatic, given = Truth(file), Truth(file, 0.5)
+
+    def metrics(truth):
+        return {
+            "geometry": {"f1": 0.5, "truth": str(file), "tau": 0.5, "table": {"tau": truth.tau, "truth": truth.stamp}}
+        }
+
+    assert given.known(metrics(given)) and automatic.known(metrics(automatic))
+    assert not automatic.known(metrics(given)), "the threshold was given, and is now that of the spacing"
+    assert not given.known({"geometry": {"f1": 0.9, "truth": str(file), "tau": 0.5, "align": "rigid"}}), "by evaluate"
+    before, crop = metrics(given), given.crop(tmp_path)
+    file.write_text("another truth")
+    assert not given.known(before) and given.crop(tmp_path) != crop
+    file.unlink()
+    assert given.known(before), "what was measured is shown where the truth is gone"
 
 
 def test_a_terminal_shows_one_live_table(data, monkeypatch, tmp_path, capsys):

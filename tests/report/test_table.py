@@ -7,6 +7,7 @@ import re
 import pytest
 from rich.console import Console
 
+from surfkit.core.check import BadInput
 from surfkit.recipes.ablations import COARSE_BASELINE
 from surfkit.report.ablation import Row, Table
 from surfkit.report.compare import compare
@@ -153,6 +154,15 @@ def test_latex_has_best_numbers_bold_and_given_up_rows_grey():
     assert escape(r"a_b \ {x} ~ ^ <2 × 3>") == (
         r"a\_b \textbackslash{} \{x\} \textasciitilde{} \textasciicircum{} \textless{}2 $\times$ 3\textgreater{}"
     )
+
+
+def test_latex_takes_what_users_name_their_rows():
+    assert escape("[1] ours*") == "{[}1] ours{*}", r"\\[1] would be a length, \\* a command"
+    assert escape("α ≥ 0.5, λ → Σ") == r"$\alpha$ $\geq$ 0.5, $\lambda$ $\rightarrow$ $\Sigma$"
+    tex = latex(report_of() | {"table": "50% of #1", "about": ""})
+    assert "\\label{tab:50-of-1}" in tex and "\\caption{Data: first\\_town;" in tex
+    with pytest.raises(BadInput, match="one line"):
+        Row("two\nlines")
 
 
 def test_csv_has_a_line_for_each_run_with_plain_numbers():

@@ -69,9 +69,13 @@ def test_maps_that_are_there_are_not_made_again(farm, tmp_path, own_cache):
     matched = arrays(cache)
     assert len(matched) == 4 and all("matching-photographs" in name for name in matched)
     assert list(cache.rglob(".*.part")), "it died while it wrote"
-    killed(farm, here, at=10 + 3 * 3 + 2)  # ten more before the first map, each of which is three files
+    killed(farm, here, at=8 + 1)  # eight more before the first map, each of which is three files
+    assert arrays(cache).items() >= matched.items() and len(arrays(cache)) == 12
+    killed(farm, here, at=2 + 3 * 3 + 2)
     there, before = arrays(cache), read_made(cache)
-    assert there.items() >= matched.items() and before.maps == 3 and not (out / "recipe.json").exists()
+    assert before.maps == 3 and not (out / "recipe.json").exists()
+    work = [name for name in there if ".work" in name]
+    assert len(work) == 7 and all("comparing-depth-maps" in name for name in work), "of the others, none is needed"
     killed(farm, here, at=-1)
     found, wanted, after = arrays(cache), arrays(made), read_made(cache)
     assert {name: content for name, (_, content) in found.items()} == {n: content for n, (_, content) in wanted.items()}

@@ -54,6 +54,9 @@ def test_focal_lengths():
     half = facts({}, plane | {exif.PER_UNIT_X: 5472 / 1.32}, {}, {}, (2736, 1824)).focal_px
     assert half == pytest.approx(8.8 / 13.2 * 2736)  # reduced by a program that kept EXIF
     assert facts({}, {exif.FOCAL_MM: 8.8}, {}, {}, size).focal_px is None
+    dpi = {exif.FOCAL_MM: 8.8, exif.PIXELS_X: 5472, exif.PER_UNIT_X: 72, exif.UNIT: 2}
+    for wrong in ({exif.FOCAL35_MM: 65535}, {exif.FOCAL35_MM: 1}, dpi):
+        assert facts({}, wrong, {}, {}, size).focal_px is None, "a wrong one would be held to"
 
 
 @pytest.mark.parametrize(
@@ -63,12 +66,29 @@ def test_focal_lengths():
         (PIX4D, (1.5, 1.5, 3.0)),
         ('drone-dji:RtkStdLon="0"', None),
         ("<", None),
+        (PIX4D.replace("1.5", "150/100"), None),  # a fraction is no 150 m
         (None, None),
     ],
 )
 def test_accuracies(xmp, found):
     assert facts({}, {}, {}, exif._xmp(xmp and xmp.encode()), (40, 30)).accuracy_m == found
     assert facts({}, {}, {exif.ERROR_M: 4.0}, {}, (40, 30)).accuracy_m == (4, 4, 8)
+
+
+@pytest.mark.parametrize("south, below, height", [("S", b"\x03", -12.5), ("South", b"\x02", 12.5), ("s", 1, -12.5)])
+def test_halves_of_the_earth_and_heights_below_either_zero(south, below, height):
+    gps = {exif.LATITUDE_REF: south, exif.LATITUDE: (33, 30, 0), exif.LONGITUDE_REF: "W", exif.LONGITUDE: (70, 0, 0)}
+    found = facts({}, {}, gps | {exif.ALTITUDE_REF: below, exif.ALTITUDE: 12.5}, {}, (40, 30)).position
+    assert found == (-33.5, -70, height)
+
+
+def test_which_of_several_equal_cameras_it_is():
+    basic = {exif.MAKE: "MicaSense", exif.MODEL: "RedEdge", exif.ORIENTATION: IFDRational(6)}
+    rig = exif._xmp("<Camera:RigCameraIndex>2</Camera:RigCameraIndex>")
+    found = facts(basic, {exif.BODY: "RX01-17"}, {}, rig, (40, 30))
+    assert found.which == "MicaSense RedEdge RX01-17 2.0" and found.camera == "MicaSense RedEdge"
+    assert facts(basic, {}, {}, {}, (40, 30)).which == "MicaSense RedEdge"
+    assert type(found.orientation) is int and found.orientation == 6, "it is kept as a whole number"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
+from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import from_utm
 from surfkit.sfm.exif import Exif
 from surfkit.sfm.georeference import Chart, Placement, Refused, chart_of, place, to_chart
@@ -78,6 +79,41 @@ def test_rtk_positions_are_believed():
     assert isinstance(found, Placement) and found.fit.sigma.max() < 0.05
 
 
+@pytest.mark.parametrize("count", [5, 20])
+def test_a_receiver_that_gave_one_position_only_determines_nothing(count):
+    shots, photos = survey(grid(count))
+    photos = [Photo(photo.name, (0, 0), exif=photos[0].exif) for photo in photos]
+    found = place(shots, photos, Chart("EPSG:32633", (EAST, NORTH, 0.0)))
+    assert isinstance(found, Refused) and f"{count} of {count} positions are one place" in found.reason
+
+
+@pytest.mark.parametrize("crs", ["auto", "EPSG:2180"])
+@pytest.mark.parametrize("wrong", [(90.0, 0.0, 10.0), (0.0, -75.0, 10.0), (-52.0, -164.0, 10.0)])
+def test_a_position_beyond_the_map_is_named_and_left_out(crs, wrong, capsys):
+    if crs != "auto":
+        needs("pyproj")
+    onto = grid()
+    shots, photos = survey(onto)
+    photos[7] = Photo("7.jpg", (0, 0), exif=Exif(position=wrong))
+    with collect_notes():
+        found = place(shots, photos, chart_of(np.array([photo.exif.position for photo in photos]), crs))
+    left = [name for name, good in zip(found.names, found.fit.inside, strict=True) if not good]
+    assert "7.jpg" in left or "'7.jpg'" in capsys.readouterr().err
+    assert np.isfinite(found.onto).all() and np.abs(found.onto).max() < 1e8 and found.fit.inside.sum() == 24
+
+
+def test_positions_on_both_sides_of_180_degrees():
+    corner = np.array([180_240.0, 8_140_100.0, 0.0])  # zone 1 south, 30 m from its western border
+    onto = grid()
+    latitude, longitude = from_utm(onto[:, 0] + corner[0], onto[:, 1] + corner[1], 1, True)
+    longitude = (longitude + 180) % 360 - 180
+    assert (longitude > 0).any() and (longitude < 0).any()
+    at = np.column_stack([latitude, longitude, onto[:, 2]])
+    chart = chart_of(at, "auto")
+    assert chart.crs == "EPSG:32701" and abs(chart.offset[0] - corner[0]) <= 100
+    np.testing.assert_allclose(to_chart(chart, at) + chart.offset, onto + corner, atol=1e-3)
+
+
 @pytest.mark.parametrize(
     "place, zone", [((52.0, 16.0), 32633), ((-33.9, 151.2), 32756), ((0.1, -180.0), 32601), ((1, 179.9), 32660)]
 )
@@ -100,16 +136,30 @@ def test_other_systems_agree_with_proj():
     np.testing.assert_allclose(to_chart(utm, positions)[:, :2] + utm.offset[:2], wanted, atol=1e-3)
     feet = chart_of(np.array([[40.7, -74.0, 30.48]]), "EPSG:2263+6360")  # New York, US survey feet, heights too
     assert feet.metres == pytest.approx(0.3048, rel=1e-3)
-    assert to_chart(feet, np.array([[40.7, -74.0, 30.48]]))[0, 2] == pytest.approx(100, rel=1e-3)
+    assert to_chart(feet, np.array([[40.7, -74.0, 1219.2]]))[0, 2] == pytest.approx(4000, abs=0.01)
 
 
 @pytest.mark.parametrize(
-    "crs, said", [("EPSG:4326", "axes|place"), ("EPSG:1", "--crs EPSG:1"), ("nonsense", "--crs nonsense")]
+    "crs, said",
+    [
+        ("EPSG:4326", "axes|place"),
+        ("EPSG:1", "--crs EPSG:1"),
+        ("nonsense", "--crs nonsense"),
+        ("EPSG:32755", "--crs EPSG:32755: it does not reach 52.0000, 16.0000"),
+    ],
 )
 def test_systems_that_will_not_do(crs, said):
     needs("pyproj")
     with pytest.raises(BadInput, match=said):
         chart_of(np.array([[52.0, 16.0, 100.0]]), crs)
+
+
+def test_a_group_without_positions_is_refused_on_every_map():
+    needs("pyproj")
+    shots, _ = survey(grid(5))
+    for crs in ("EPSG:32633", "EPSG:2180"):
+        found = place(shots, [Photo(name, (0, 0)) for name in shots], Chart(crs, (0.0, 0.0, 0.0)))
+        assert isinstance(found, Refused) and "0 of 5 placed photographs have a position" in found.reason
 
 
 def test_at_the_pole_a_system_must_be_named():

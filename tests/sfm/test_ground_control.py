@@ -9,9 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
 from surfkit.readers.capture import load_pycolmap
-from surfkit.scene.earth import utm
+from surfkit.run.notes import collect_notes
+from surfkit.scene.earth import from_utm, utm
+from surfkit.sfm.exif import Exif
 from surfkit.sfm.georeference import Refused
-from surfkit.sfm.ground_control import place_by_points, read_ground, read_list, triangulate
+from surfkit.sfm.ground_control import doubts, place_by_points, read_ground, read_list, triangulate
+from surfkit.sfm.photographs import Photo
 
 from .pictures import arc
 
@@ -19,6 +22,7 @@ OFFSET = np.array([512_000.0, 5_800_000.0, 90.0])
 PLACES = np.random.default_rng(0).uniform(-6, 6, (9, 3)) * (1, 1, 0.2)
 TURN = Rotation.from_rotvec([0.7, -0.2, 1.1]).as_matrix()
 POSES = {f"{at}.jpg": pose for at, pose in enumerate(arc(5))}
+SIZES = dict.fromkeys(POSES, (400, 400))  # room for what is just outside
 
 
 def lens():
@@ -74,7 +78,7 @@ def test_rays_meet_in_the_point():
 
 @pytest.mark.parametrize("first", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
 def test_points_place_the_model_and_checkpoints_check_it(tmp_path, first):
-    ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", list(POSES))
+    ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", SIZES)
     found = place_by_points(model(), ground, 3)
     assert found.chart.crs == "EPSG:32633" and found.similarity.scale == pytest.approx(10, rel=1e-4)
     assert len(found.control) == 6 and len(found.checkpoints) == 3 and not set(found.control) & set(found.checkpoints)
@@ -86,13 +90,13 @@ def test_points_place_the_model_and_checkpoints_check_it(tmp_path, first):
 def test_a_checkpoint_has_no_say_and_a_wrong_point_is_found(tmp_path):
     places = PLACES.copy()
     path = tmp_path / "gcp_list.txt"
-    held = place_by_points(model(), read_ground(written(path), "auto", list(POSES)), 1).checkpoints[0]
+    held = place_by_points(model(), read_ground(written(path), "auto", SIZES), 1).checkpoints[0]
     places[int(held[1:])] += (0.5, 0, -1)
-    found = place_by_points(model(), read_ground(written(path, places=places), "auto", list(POSES)), 1)
+    found = place_by_points(model(), read_ground(written(path, places=places), "auto", SIZES), 1)
     assert found.residuals[held] == pytest.approx((0.5, 0, -1), abs=0.01)
     assert max(found.rms(found.control).values()) < 0.005
     places[int(found.control[2][1:])] += (0, 40, 0)
-    wrong = place_by_points(model(), read_ground(written(path, places=places), "auto", list(POSES)), 1)
+    wrong = place_by_points(model(), read_ground(written(path, places=places), "auto", SIZES), 1)
     assert wrong.wrong == (found.control[2],) and max(wrong.rms(wrong.control).values()) < 0.005
 
 
@@ -103,14 +107,84 @@ def test_degrees_come_to_utm(tmp_path):
     for at, place in enumerate(PLACES[:4] + OFFSET):
         longitude, latitude = back.transform(*place[:2])
         assert utm(latitude, longitude, 33, False) == pytest.approx(place[:2], abs=1e-3)
-        lines.append(f"{longitude:.10f} {latitude:.10f} {place[2]} 1 2 0.jpg P{at}")
+        lines += [f"{longitude:.10f} {latitude:.10f} {place[2]} 1 2 {photo} P{at}" for photo in ("0.jpg", "1.jpg")]
     (tmp_path / "gcp_list.txt").write_text("\n".join(lines))
-    ground = read_ground(tmp_path / "gcp_list.txt", "auto", list(POSES))
+    ground = read_ground(tmp_path / "gcp_list.txt", "auto", SIZES)
     np.testing.assert_allclose(ground.onto + ground.chart.offset, PLACES[:4] + OFFSET, atol=1e-3)
+    with pytest.raises(BadInput, match="'P0', 'P1', 'P2' and 6 more is not in degrees, as line 1, 'EPSG:4326', says"):
+        read_ground(written(tmp_path / "gcp_list.txt", "EPSG:4326"), "auto", SIZES)
+
+
+@pytest.mark.parametrize(
+    "first, crs, metres",
+    [
+        ("+proj=utm +south +zone=33 +datum=WGS84 +units=m +no_defs", "EPSG:32733", 1),
+        ("+proj=utm +zone=33 +south +datum=WGS84 +units=m +no_defs", "EPSG:32733", 1),
+        ("+proj=utm +zone=33 +ellps=intl +towgs84=-87,-98,-121,0,0,0,0 +units=m", None, 1),  # ED50, 150 m away
+        ("+proj=utm +zone=33 +datum=NAD83 +units=us-ft +vunits=us-ft", None, 0.3048),
+    ],
+)
+def test_other_systems_are_not_taken_for_utm_on_wgs84(tmp_path, first, crs, metres):
+    if crs is None:
+        needs("pyproj")
+    ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", SIZES)
+    assert ground.chart.crs == (crs or first) and ground.chart.metres == pytest.approx(metres, rel=1e-5)
+
+
+def test_photographs_of_equal_names_in_two_folders_are_told_apart(tmp_path, capsys):
+    path = written(tmp_path / "gcp_list.txt")
+    sizes = {f"{folder}/{name}": size for folder in ("100", "101") for name, size in SIZES.items()}
+    with pytest.raises(BadInput, match="'0.jpg' may be '100/0.jpg', '101/0.jpg'; write the folder too"):
+        read_ground(path, "auto", sizes)
+    path.write_text(path.read_text().replace(" 0.jpg", " 101/0.jpg"))
+    with collect_notes():
+        ground = read_ground(path, "auto", dict.fromkeys(["101/0.jpg", "100/0.jpg", "b/1.jpg"], (400, 400)))
+    assert set(ground.points[0].marks) == {"101/0.jpg", "b/1.jpg"}
+    assert "3 of its photographs are not in the folder, or cannot be used" in capsys.readouterr().err
+
+
+def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
+    flat, offset = PLACES * (1, 1, 0), np.array([512_000.0, 580_000.0, 90.0])  # as if flat, and near the equator
+    path = tmp_path / "gcp_list.txt"
+    lines = ["EPSG:32633"]
+    for at, place in enumerate(flat):
+        x, y, z = place + offset
+        lines += [f"{x} {y} {z} {a} {d} {photo} P{at}" for photo, (a, d) in pixels(place).items()]
+    path.write_text("\n".join(lines))
+    images = [model().image(number) for number in model().reg_image_ids()]
+    centres = {image.name: np.asarray(image.projection_center()) for image in images}
+    latitude, longitude = from_utm(*offset[:2], 33, False)
+    near = Exif(position=(float(latitude), float(longitude), 120.0))
+    photos = [Photo(name, (0, 0), exif=near) for name in centres]
+
+    def told():
+        found = place_by_points(model(), read_ground(path, "auto", SIZES), 0)
+        assert max(found.rms(found.control).values()) < 0.01, "the residuals are no help"
+        return doubts(found, centres, TURN @ (0, 0, 1), photos)
+
+    assert told() == []
+    path.write_text("\n".join(lines).replace("EPSG:32633", "EPSG:32634"))
+    (far,) = told()
+    assert "km from their positions in EXIF: is EPSG:32634 the system" in far
+    exchanged = [lines[0]] + [" ".join([y, x, *rest]) for x, y, *rest in (line.split() for line in lines[1:])]
+    path.write_text("\n".join(exchanged))
+    upside, far = told()
+    assert "upside down" in upside and "96 km from" in far
+    path.write_text("\n".join([lines[0]] + ["5" + line for line in exchanged[1:]]))  # where no zone reaches
+    with pytest.raises(BadInput, match="x is east and y north"):
+        read_ground(path, "auto", SIZES)
+
+
+def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):
+    places = np.random.default_rng(5).permutation(PLACES)
+    found = place_by_points(model(), read_ground(written(tmp_path / "gcp_list.txt", places=places), "auto", SIZES), 0)
+    assert isinstance(found, Refused) and "too large for" in found.reason
 
 
 def test_too_few_points_and_points_on_a_line(tmp_path):
-    ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", list(POSES))
+    ground = read_ground(written(tmp_path / "gcp_list.txt"), "auto", SIZES)
+    with pytest.raises(BadInput, match="9 of its 9 points are marked .* 3 are needed besides 7 --checkpoints"):
+        read_ground(tmp_path / "gcp_list.txt", "auto", SIZES, 7)
     found = place_by_points(model(), ground, 7)
     assert isinstance(found, Refused) and "3 are needed besides 7 checkpoints" in found.reason
     line = [np.array([at, 2 * at, 0.1 * at]) - 3 for at in range(4)]
@@ -129,13 +203,15 @@ def test_too_few_points_and_points_on_a_line(tmp_path):
         ("EPSG:32633\n1 2 3 4 5 0.jpg P\n1 2 9 4 5 1.jpg P", "puts 'P' elsewhere"),
         ("EPSG:32633\n1 2 3 4 5 a.jpg", "none of its photographs is in the folder: 'a.jpg'"),
         ("EPSG:32633", "no points"),
-        ("EPSG:32633\n1 2 3 4 5 0.jpg", "--crs EPSG:2180"),
+        ("EPSG:32633\n1 2 3 4 500 0.jpg P", "'P' is marked at 4 500 in '0.jpg', outside of its 400 x 400 pixels"),
+        ("EPSG:32633\n1 2 3 4 5 0.jpg\n1 2 3 4 5 1.jpg", "1 of its 1 points are marked in 2 or more photographs"),
+        ("EPSG:32633" + "".join(f"\n{x} {x * x} 3 4 5 {y}.jpg" for x in range(3) for y in range(2)), "--crs EPSG:2180"),
     ],
 )  # fmt: skip
 def test_lists_that_will_not_do(tmp_path, text, said):
     (tmp_path / "gcp.txt").write_text(text)
     with pytest.raises(BadInput, match=said) as raised:
-        read_ground(tmp_path / "gcp.txt", "EPSG:2180", list(POSES))
+        read_ground(tmp_path / "gcp.txt", "EPSG:2180", SIZES)
     assert "\n" not in str(raised.value)
     with pytest.raises(BadInput, match="no such file"):
         read_list(tmp_path / "no.txt")

@@ -55,9 +55,18 @@ def test_neighbours_are_the_nearest():
 
 
 def test_likeness_finds_the_same_scene():
-    found = alike(24, 3, scenes(24, 4), seed=0)
+    found = alike(24, 3, scenes(24, 4), 0, range(24))
     assert len(found) >= 24 * 3 / 2 and all((one - two) % 4 == 0 for one, two in found)
-    assert found == alike(24, 3, scenes(24, 4), seed=0)
+    assert found == alike(24, 3, scenes(24, 4), 0, range(24))
+
+
+def test_only_photographs_without_a_position_are_compared_by_likeness_besides_gps():
+    grid = {at: (52 + 2e-4 * (at // 10), 16 + 3e-4 * (at % 10), 100.0) for at in range(100)}
+    by_gps = set(choose_pairs(photos(100, grid.get), Settings(neighbours=8), lambda at: 1 / 0))
+    del grid[45]
+    found = set(choose_pairs(photos(100, grid.get), Settings(neighbours=8), scenes(100, 5)))
+    assert {pair for pair in found - by_gps if 45 in pair} and sum(45 in pair for pair in found) >= 8
+    assert len([pair for pair in found - by_gps if 45 not in pair]) < 10, "what takes the place of 45 among the nearest"
 
 
 def test_a_large_set_without_gps_is_compared_by_likeness_and_sequence():

@@ -8,7 +8,7 @@ from PIL import Image, ImageFilter
 from surfkit.core.check import BadInput
 from surfkit.run.notes import collect_notes
 from surfkit.sfm import photographs
-from surfkit.sfm.photographs import Photo, is_blurred, lens_groups, look
+from surfkit.sfm.photographs import Photo, blurred_below, lens_groups, look
 
 from .pictures import arc, picture, save
 
@@ -36,9 +36,8 @@ def test_what_each_photograph_is(folder, capsys):
     assert list(found) == ["a.jpg", "c.png", "d.jpg", "deep er/b.JPG", "e.jpg", "f.png", "g.jpg"]
     wrong = {name: photo.problem for name, photo in found.items() if not photo.usable}
     assert wrong.pop("g.jpg") and wrong == {"d.jpg": "a copy of a.jpg", "e.jpg": "black", "f.png": "of one colour"}
-    assert [name for name, photo in found.items() if photo.usable and is_blurred(photo, list(found.values()))] == [
-        "c.png"
-    ]
+    least = blurred_below(list(found.values()))
+    assert [name for name, photo in found.items() if photo.usable and photo.sharpness < least] == ["c.png"]
     assert found["a.jpg"].size == (240, 180)
 
 
@@ -55,8 +54,8 @@ def test_what_is_known_is_not_looked_at_again(folder, monkeypatch):
 
 
 def test_lenses_are_shared_by_camera_size_and_focal_length():
-    def photo(camera=None, size=(40, 30), focal=None):
-        return Photo("x", (0, 0), size=size, exif=photographs.Exif(camera=camera, focal_px=focal))
+    def photo(camera=None, size=(40, 30), focal=None, serial=None):
+        return Photo("x", (0, 0), size=size, exif=photographs.Exif(camera, serial=serial, focal_px=focal))
 
     given = [
         photo(),
@@ -65,8 +64,29 @@ def test_lenses_are_shared_by_camera_size_and_focal_length():
         photo("A", focal=49.9),
         photo("A", focal=70.0),
         photo(),
+        photo("A", focal=50.0, serial="17"),  # another of the same kind: two drones, or a rig
+        photo("A", focal=50.0, serial="18"),
     ]
-    assert lens_groups(given) == [0, 1, 2, 2, 3, 0]
+    assert lens_groups(given) == [0, 1, 2, 2, 3, 0, 4, 5]
+
+
+def test_folders_behind_links_are_looked_into_once(folder, tmp_path_factory):
+    flight = tmp_path_factory.mktemp("flight")
+    save(flight / "x.jpg", picture(arc(4)[3]))
+    save(folder / "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg", picture(arc(5)[4]))
+    (folder / "second").symlink_to(flight)
+    (folder / "deep again").symlink_to(folder / "deep er")  # before the folder itself, by name
+    (flight / "back").symlink_to(folder)
+    (folder / "gone.jpg").symlink_to(flight / "no.jpg")
+    found = {photo.name: photo for photo in look(folder)}
+    assert len(found) == 9 and found["second/x.jpg"].usable and "deep er/b.JPG" in found
+    assert "leads nowhere" in found["gone.jpg"].problem
+
+
+def test_a_name_that_is_no_text_is_left_out(folder):
+    os.rename(os.path.join(os.fsencode(folder), b"a.jpg"), os.path.join(os.fsencode(folder), b"a\xfc.jpg"))
+    found = {photo.name: photo for photo in look(folder)}
+    assert "not UTF-8" in found["a\udcfc.jpg"].problem and found["d.jpg"].usable
 
 
 def test_folders_without_photographs(tmp_path):

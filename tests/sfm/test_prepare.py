@@ -11,7 +11,7 @@ from surfkit.cli import main
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.earth import from_utm
-from surfkit.sfm import features, mapping, matching
+from surfkit.sfm import deliver, features, mapping, matching
 from surfkit.sfm.similarity import umeyama
 from surfkit.testing.exif import write_exif
 
@@ -130,6 +130,10 @@ def files(scene):
     return {path.relative_to(scene): path.read_bytes() for path in scene.rglob("*.bin")}
 
 
+def images(scene):
+    return {path.relative_to(scene): path.read_bytes() for path in (scene / "images").rglob("*.jpg")}
+
+
 def test_what_is_complete_is_not_repeated(folder, prepared, monkeypatch):
     before, seen = files(prepared), watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), *QUICK]) == 0
@@ -155,6 +159,26 @@ def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkey
     assert "_keep" not in seen
     assert files(tmp_path / "s") == files(prepared), "to the bit as without interruption"
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_killed_with_another_lens_no_photograph_of_it_stays(folder, prepared, tmp_path, monkeypatch):
+    shutil.copytree(prepared, tmp_path / "s")
+    words = ["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]
+    write, record, calls = deliver._write, deliver.write_json, []
+
+    def stop(*given):
+        calls.append(1)
+        if len(calls) > 3:
+            raise KeyboardInterrupt
+        return write(*given)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(deliver, "_write", stop)
+        patch.setattr(deliver, "write_json", lambda *given: None if len(calls) > 3 else record(*given))  # it is dead
+        assert main([*words, "--lens", "OPENCV"]) == 130
+    assert images(tmp_path / "s") != images(prepared)
+    assert main(words) == 0
+    assert images(tmp_path / "s") == images(prepared) and files(tmp_path / "s") == files(prepared)
 
 
 def test_without_gps_it_is_level_and_features_are_kept(folder, prepared, tmp_path, monkeypatch, capsys):
@@ -253,7 +277,8 @@ def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared,
         for name, pose in POSES.items():
             ray = pose[:3, :3] @ corner + pose[:3, 3]
             across, down = 260 * ray[:2] / ray[2] + (120, 90)
-            lines.append(f"{x} {y} {z} {across} {down} {name.replace(' ', '_')} P{at}")
+            if 0 <= across <= 240 and 0 <= down <= 180:
+                lines.append(f"{x} {y} {z} {across} {down} {name.replace(' ', '_')} P{at}")
     shutil.copytree(folder, tmp_path / "p")
     for path in (tmp_path / "p").glob("view *.jpg"):  # names in a list have no spaces
         path.rename(path.with_name(path.name.replace(" ", "_")))

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surfkit.readers.georeference import Similarity
+from surfkit.sfm import similarity
 from surfkit.sfm.similarity import fit_robustly, umeyama
 
 
@@ -69,6 +70,18 @@ def test_small_residuals_are_not_held_against_a_position():
     onto[3] += 0.01  # of others that fit to the last bit
     assert np.flatnonzero(~fit_robustly(xyz, onto).inside).tolist() == [3]
     assert fit_robustly(xyz, onto, least=0.05).inside.all()
+
+
+def test_of_many_positions_a_part_is_searched_and_all_decide(monkeypatch):
+    xyz, onto, truth = known(20_000, noise=2.0)
+    wrong = np.arange(20_000) % 5 < 2
+    onto[wrong] += 400
+    seen, plain = [], similarity.umeyama
+    monkeypatch.setattr(similarity, "umeyama", lambda *given: seen.append(len(given[0])) or plain(*given))
+    fit = fit_robustly(xyz, onto)
+    assert (fit.inside == ~wrong).mean() > 0.998 and not fit.inside[wrong].any()
+    same(fit.similarity, truth, 1e-3)
+    assert sum(count > similarity.MOST for count in seen) <= similarity.ROUNDS
 
 
 def test_the_same_draws_give_the_same_bits():

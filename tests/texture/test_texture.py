@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image
 from town import BOX, HALF, HEIGHT, HIDDEN, WIDTH, YELLOW, is_clear, is_seen, on_box, sheet, surface, town, truth
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned
+from surfkit.core.events import PhotoSkipped, Warned
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.export.glb import read_glb
 from surfkit.mesh.base import Mesh
@@ -120,6 +121,18 @@ def test_no_color_of_what_is_in_front_or_has_moved(plain):
     assert (np.abs(colors - 255 * YELLOW).max(1) > 60).all(), "the car"
     shown = np.abs(places[:, :2] - [3.5, 2.6]).max(1) < 0.5
     assert (colors[shown & (places[:, 2] < 1e-3)][:, 1] > 150).all(), "the ground below the car is green"
+
+
+@pytest.mark.parametrize("behind", [1e-9, 0.0, -2.0])
+def test_what_passes_the_camera_hides_what_lies_behind_it(behind):
+    """A wall beside a street: one corner of a triangle is beside the camera, or further back."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), 60.0, 60.0, 48.0, 36.0, 96, 72)
+    wall = np.array([[-3, -8, 2], [-3, 8, 2], [6, 0, behind]], np.float32)
+    far = np.array([[-0.5, -0.5, 9], [0.5, -0.5, 9], [0, 0.5, 9]], np.float32)
+    photo = np.zeros((3, 72, 96), np.uint8)
+    alone = sight(Mesh(far, np.array([[0, 1, 2]], np.int32)), camera, photo)
+    both = sight(Mesh(np.concatenate([wall, far]), np.arange(6, dtype=np.int32).reshape(2, 3)), camera, photo)
+    assert alone.faces.tolist() == [0] and not len(both.faces)
 
 
 def test_a_car_in_every_photograph_would_be_there(tmp_path):
@@ -549,3 +562,23 @@ def test_what_is_refused(tmp_path):
     scene.views[2].path.write_bytes(b"damaged")
     record = made(scene, tmp_path / "out")
     assert record["photographs"] <= 11, "the damaged one is passed over"
+
+
+def test_the_folder_one_is_in_is_not_replaced(tmp_path, monkeypatch):
+    scene = town(tmp_path)
+    (tmp_path / "out" / "here").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "out" / "here")
+    for out in (".", "..", tmp_path / "out"):
+        with pytest.raises(OSError, match="the folder that you are in"):
+            made(scene, Path(out))
+
+
+def test_photographs_that_are_all_damaged_make_a_note(tmp_path, monkeypatch):
+    scene, told = town(tmp_path), []
+    for view in scene.views:
+        view.path.write_bytes(b"damaged")
+    monkeypatch.setattr(make, "emit", told.append)
+    record = made(scene, tmp_path / "out", replace(PNG, formats=("obj",)))
+    assert record["seen"] == 0 and sum(isinstance(event, PhotoSkipped) for event in told) == 12
+    (warned,) = [event.text for event in told if isinstance(event, Warned)]
+    assert "of 12 photographs, none shows a triangle whole" in warned

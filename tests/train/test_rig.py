@@ -51,6 +51,25 @@ def test_neighbours_stand_at_an_angle_see_the_same_and_are_as_far():
     assert Rig.of(cameras[:1]).neighbours(0, depth) == []
 
 
+def test_views_that_cannot_show_the_places_are_left_out_and_no_others(monkeypatch):
+    """300 cameras above a plane, turned this way and that, some of them with a principal point beside the picture."""
+    draw, cameras = torch.Generator().manual_seed(0), []
+    for x, y, turn, tilt, off in torch.rand(300, 5, generator=draw, dtype=torch.float64).tolist():
+        camera, a = facing(80 * tilt - 40), 7 * turn
+        about = torch.tensor([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]]).double()
+        pose = camera.world_to_camera.clone()
+        pose[:3, :3] = pose[:3, :3] @ about
+        pose[:3, 3] -= pose[:3, :3] @ torch.tensor([20 * x, 20 * y, 0], dtype=torch.float64)
+        cameras.append(replace(camera, world_to_camera=pose, cx=camera.cx + 60 * (off > 0.8)))
+    rig = Rig.of(cameras)
+    asked = [(at, rig.places(at, torch.full((30, 40), 2.0))) for at in range(0, 300, 20)]
+    few = [rig.worth(*pair) for pair in asked]
+    assert max(len(rig.turned_to(places)) for _, places in asked) < 100
+    monkeypatch.setattr(Rig, "turned_to", lambda rig, places: torch.arange(300))
+    for found, pair in zip(few, asked, strict=True):
+        assert torch.allclose(found, rig.worth(*pair), atol=1e-6) and int((found > 0).sum()) > 1
+
+
 def test_the_worth_of_a_view_is_that_of_its_places():
     cameras = [facing(0), facing(15, 3.0)]
     places = torch.tensor([[0.0, 0.3, -0.2, 9.0], [0.0, 0.1, 0.2, 0.0], [0.0, 0.0, 0.1, 0.0]])

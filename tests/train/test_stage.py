@@ -1,3 +1,4 @@
+import sys
 from dataclasses import dataclass, replace
 
 import pytest
@@ -60,6 +61,13 @@ def test_one_step_moves_parameters_against_a_numerical_gradient(begin):
     assert float(slopes.abs().sum()) == pytest.approx((loss(0.01) - loss(-0.01)) / 0.02, rel=0.02)
     moved = state.points.params["sh0"] - before["sh0"]
     assert torch.allclose(moved, -1e-3 * slopes.sign(), atol=1e-6)
+
+
+def test_a_step_needs_no_sympy(begin, monkeypatch):
+    """torch imports it, for a second or more, where gradients are given to `torch.autograd.grad`."""
+    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
+    trainer, state = begin(replace(QUIET, regularizers={"opacity": MeanOpacity(weight=0.1)}))
+    trainer.step(state)
 
 
 def test_harmonics_grow_by_a_degree_every_so_often(begin):

@@ -1,5 +1,6 @@
 """A browser without a screen, which speaks viser's protocol: it has a camera, clicks, and keeps what it is told."""
 
+import http.client
 import time
 from urllib.parse import urlsplit
 
@@ -82,3 +83,12 @@ class Browser:
 
     def close(self):
         self.socket.close()
+
+
+def get(page, target, **headers):
+    """Status, body and headers of the answer of a served page to a request."""
+    at = urlsplit(page.url)
+    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=10)
+    connection.request("GET", target, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read(), answer.headers

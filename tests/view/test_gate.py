@@ -1,13 +1,13 @@
 """The gate of the viewer: without the token, neither pages nor websockets nor files are served."""
 
 import asyncio
-import http.client
 import os
 import socket
 from contextlib import suppress
 from urllib.parse import urlsplit
 
 import pytest
+from browser import get
 from needs import needs
 
 from surfkit.core.check import BadInput
@@ -15,6 +15,7 @@ from surfkit.view.gate import Asked, Gate
 from surfkit.view.server import Address, listen, served
 
 GATE = Gate("right", 8080)
+OURS = "/surfkit/script.js", "/surfkit/ask?client=0&x=0&y=0"
 
 
 @pytest.mark.parametrize(
@@ -58,19 +59,13 @@ def page():
         yield found
 
 
-def get(page, target, **headers):
-    at = urlsplit(page.url)
-    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=10)
-    connection.request("GET", target, headers=headers)
-    answer = connection.getresponse()
-    return answer.status, answer.read(), answer.headers
-
-
 def token_of(page):
     return urlsplit(page.url).query.partition("=")[2]
 
 
-@pytest.mark.parametrize("target", ["/", "/index.html", "/?token=wrong", "/nowhere", "/../viser", "/%2e%2e/x", "//"])
+@pytest.mark.parametrize(
+    "target", ["/", "/index.html", "/?token=wrong", "/nowhere", "/../viser", "/%2e%2e/x", "//", *OURS]
+)
 def test_http_without_the_token_gets_nothing(page, target):
     for headers in ({}, {"Cookie": "surfkit-view-8080=wrong"}, {"Origin": "http://x", "Cookie": "=;"}):
         status, body, _ = get(page, target, **headers)
@@ -85,7 +80,9 @@ def test_the_token_becomes_a_cookie_that_opens_the_page(page):
     assert "HttpOnly" in cookie and "SameSite=Lax" in cookie
     status, body, _ = get(page, "/", Cookie=cookie.partition(";")[0])
     assert status == 200 and b"<html" in body[:2000] and len(body) > 10_000
-    assert get(page, "/nowhere", Cookie=cookie.partition(";")[0])[0] == 404
+    for target in ("/nowhere", *OURS):  # no script was set
+        assert get(page, target, Cookie=cookie.partition(";")[0])[0] == 404
+    assert b"surfkit/script.js" not in body
 
 
 def knock(page, query="", **headers):

@@ -17,6 +17,7 @@ namespace {
 
 constexpr int kVectors = kSamples / kLanes;  // at most
 constexpr float kNoise = 1.0f;       // variance of grey values below which a window shows nothing
+constexpr float kTiny = 1e-30f;      // added to weights, which may all be zero where the middle of a window is not compared
 constexpr float kNothing = 2.0f;     // cost of a plane that a view does not show; more than that of any match
 constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
 constexpr float kMostError = 3.0f;   // pixels of reprojection
@@ -70,7 +71,7 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
         all += out.weight[v];
         mean = madd(out.weight[v], value[v], mean);
     }
-    const float turn = 1.0f / total(all), m = total(mean) * turn;
+    const float turn = 1.0f / (total(all) + kTiny), m = total(mean) * turn;
     Floats square = {};
     for (int v = 0; v < job.samples / kLanes; v++) {
         out.weight[v] = out.weight[v] * turn;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -12,12 +13,23 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.evaluate.geometry.presets import PRESETS, PresetName
-from surfkit.evaluate.geometry.repetition import LEAST, Draw, Measurement, Side, cloud_side, mesh_side, refuse_few
+from surfkit.evaluate.geometry.registration import ROUNDS
+from surfkit.evaluate.geometry.repetition import (
+    LEAST,
+    Box,
+    Draw,
+    Measurement,
+    Side,
+    cloud_side,
+    mesh_side,
+    refuse_few,
+    warn_if_sparse,
+)
 from surfkit.evaluate.geometry.scores import spacing, tree
 from surfkit.evaluate.geometry.surface import Surface
-from surfkit.evaluate.geometry.transform import read_transform, scale_of
+from surfkit.evaluate.geometry.transform import apply, read_transform, scale_of
 from surfkit.evaluate.geometry.volume import CropSettings, extent_text, visible_crop
-from surfkit.scene.crop import Axis, Crop, read_crop
+from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
 AUTO_TAU = 1.5
@@ -185,10 +197,16 @@ def compare(
     settings = settings.for_scene(frame, matrix)
     refuse_sizes(settings, truth)
     theirs, tau = truth_side(truth, settings)
-    ours = make_side(reconstruction, None, settings.samples, tau / scale_of(matrix))
     first = theirs.points(np.random.default_rng(settings.seed))
     refuse_few(first, truth.path)
     crop, seen = volume(first, settings, views, frame, (matrix, tau))
+    box = None if crop is None else around(crop, tau)
+    own_box, own_tau = box and seen_from(np.linalg.inv(matrix), box), tau / scale_of(matrix)
+    ours = make_side(reconstruction, None, settings.samples, own_tau, own_box)
+    if theirs.sparse is not None:
+        theirs = make_side(truth, None, settings.samples, tau, box)
+    warn_if_sparse(ours, own_tau)
+    warn_if_sparse(theirs, tau)
     draws: list[Draw] = []
     others: dict[str, Draw | None] = {}
     for number in range(settings.draws):
@@ -238,9 +256,25 @@ def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
     return found, tau
 
 
-def make_side(surface: Surface, voxel: float | None, samples: int | None, tau: float) -> Side:
-    """What points are drawn from, whichever the file holds."""
-    return cloud_side(surface, voxel) if surface.faces is None else mesh_side(surface, samples, tau)
+def make_side(surface: Surface, voxel: float | None, samples: int | None, tau: float, box: Box | None = None) -> Side:
+    """What points are drawn from, whichever the file holds; see `mesh_side`."""
+    return cloud_side(surface, voxel) if surface.faces is None else mesh_side(surface, samples, tau, box)
+
+
+def around(crop: Crop, tau: float) -> Box:
+    """The box about a crop volume, with room for what alignment brings into it."""
+    plane, along = list(PLANES[crop.axis]), "xyz".index(crop.axis)
+    low, high = np.empty(3), np.empty(3)
+    low[plane], high[plane] = crop.polygon.min(0), crop.polygon.max(0)
+    low[along], high[along] = crop.low, crop.high
+    room = ROUNDS[0][1] * tau
+    return low - room, high + room
+
+
+def seen_from(matrix: np.ndarray, box: Box) -> Box:
+    """The box about the corners of a box in another frame."""
+    corners = apply(matrix, np.array(list(product(*zip(*box, strict=True)))))
+    return corners.min(0), corners.max(0)
 
 
 def volume(

@@ -14,7 +14,7 @@ from surfkit.core.memory import size
 from surfkit.evaluate.geometry.registration import Alignment, align
 from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
 from surfkit.evaluate.geometry.scores import Distances, nearest, tree
-from surfkit.evaluate.geometry.surface import Surface
+from surfkit.evaluate.geometry.surface import Surface, part_within
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
 from surfkit.evaluate.geometry.transform import apply
 from surfkit.evaluate.geometry.volume import extent_text
@@ -29,6 +29,8 @@ LEAST = 10
 """Points on either side without which shares mean nothing."""
 SAMPLE_BYTES = 200
 """Memory for a point that is drawn from a mesh; as much again for one of the other side."""
+Box = tuple[np.ndarray, np.ndarray]
+"""(3,) least and (3,) greatest coordinates."""
 SMALL = 0.1
 """Of the truth's extent: a reconstruction smaller than this has another unit."""
 
@@ -42,12 +44,14 @@ class Side:
         cloud: (n, 3) its points, thinned if there were too many; None for a mesh.
         count: Points that a draw from a mesh has.
         voxel: By which the cloud was thinned, or None.
+        sparse: Samples of a mesh that would be needed, where it gets fewer.
     """
 
     surface: Surface
     cloud: np.ndarray | None
     count: int
     voxel: float | None = None
+    sparse: int | None = None
 
     def points(self, draw: np.random.Generator) -> np.ndarray:
         """(n, 3) float64: of a mesh, new ones with every draw."""
@@ -82,28 +86,51 @@ def cloud_side(surface: Surface, voxel: float | None) -> Side:
     return Side(surface, cloud, len(cloud), voxel)
 
 
-def mesh_side(surface: Surface, count: int | None, tau: float) -> Side:
+def mesh_side(surface: Surface, count: int | None, tau: float, box: Box | None = None) -> Side:
     """A mesh, of which as many points are drawn as it has vertices and faces, as the paper does.
 
     A coarse mesh gets more, so that they lie no further apart than 0.7 tau: right surfaces would count as missing.
+    Where these are too many, they are drawn in the box alone: a few large triangles far away, such as a sky, would
+    take them all.
+
+    Args:
+        surface: The mesh.
+        count: Of points; None for the number above.
+        tau: Threshold, in units of the mesh.
+        box: Its part that is compared, in the frame of the mesh; None for all of it.
     """
+    sparse = None
     if count is None:
-        needed = int(2 * float(face_areas(surface).sum()) / tau**2) + 1
-        count = max(len(surface) + len(surface.faces), min(needed, MOST))
-        if count < needed:
-            emit(
-                Warned(
-                    f"{surface.path}: its {count} samples lie further apart than 0.7 times tau ({tau:.3g}), so right "
-                    f"surfaces count as missing; give a larger --tau, or --samples {needed}"
-                )
-            )
+        area, least = float(face_areas(surface).sum()), len(surface) + len(surface.faces)
+        needed = _needed(area, tau)
+        if needed > max(least, MOST) and box is not None and len((part := part_within(surface, *box)).faces):
+            inner = float(face_areas(part).sum())
+            surface, needed, least = part, _needed(inner, tau), max(LEAST, int(least * inner / area))
+        count = max(least, min(needed, MOST))
+        sparse = needed if count < needed else None
     free = free_bytes()
     if count * SAMPLE_BYTES > free:
         raise BadInput(
             f"{surface.path}: {count:,} samples take {size(count * SAMPLE_BYTES)}, and {size(free)} are free; give "
             f"--samples {max(LEAST, free // SAMPLE_BYTES // 2)} or less"
         )
-    return Side(surface, None, count)
+    return Side(surface, None, count, sparse=sparse)
+
+
+def _needed(area: float, tau: float) -> int:
+    """Samples of a surface with that area that lie 0.7 tau apart."""
+    return int(2 * area / tau**2) + 1
+
+
+def warn_if_sparse(side: Side, tau: float) -> None:
+    """Warn of samples of a mesh that lie too far apart."""
+    if side.sparse is not None:
+        emit(
+            Warned(
+                f"{side.surface.path}: its {side.count} samples lie further apart than 0.7 times tau ({tau:.3g}), so "
+                f"right surfaces count as missing; give a larger --tau, a smaller --crop, or --samples {side.sparse}"
+            )
+        )
 
 
 class Measurement:

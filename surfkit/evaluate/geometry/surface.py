@@ -18,6 +18,8 @@ BLOCK = 1 << 20
 """Points in memory at a time."""
 CORNERS = ("vertex_indices", "vertex_index")
 """Names that PLY files give to the corners of a face."""
+PIECES = 16
+"""Into which the diagonal of a box is cut by faces that reach out of it."""
 
 Blocks = Callable[[], Iterator[np.ndarray]]
 """Begins anew with every call: (n, 3) float64 positions, block by block."""
@@ -52,6 +54,30 @@ class Surface:
         for start in range(0, len(self), BLOCK):
             block = self.vertices(slice(start, start + BLOCK))
             yield block[np.isfinite(block).all(1)]
+
+
+def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
+    """The faces of a mesh that reach into a box; of those that reach far out of it, pieces.
+
+    Args:
+        mesh: With faces.
+        low: (3,) least coordinates of the box.
+        high: (3,) greatest.
+    """
+    found, piece = [], float(np.linalg.norm(high - low)) / PIECES
+    for start in range(0, len(mesh.faces), BLOCK):
+        corners = mesh.vertices(np.asarray(mesh.faces[start : start + BLOCK]).ravel()).reshape(-1, 3, 3)
+        while len(corners):
+            least, most = corners.min(1), corners.max(1)
+            touches = ((least <= high) & (most >= low)).all(1)
+            far = touches & ((least < low) | (most > high)).any(1) & (np.ptp(corners, axis=1).max(1) > piece)
+            found.append(corners[touches & ~far])
+            a, b, c = corners[far].transpose(1, 0, 2)
+            ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+            quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+            corners = np.concatenate([np.stack(each, axis=1) for each in quarters])
+    corners = np.concatenate(found) if found else np.empty((0, 3, 3))
+    return Surface(mesh.path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
 def read_surface(path: Path) -> Surface:

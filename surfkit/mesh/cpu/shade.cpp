@@ -10,6 +10,15 @@ namespace {
 
 constexpr int kBand = 32;  // rows of the picture in one piece of work
 
+// The first pixel whose centre lies at `at` or beyond, and one past the last whose centre lies before it, in [low, high].
+// A corner that is hardly in front of the camera falls far out of what an int can hold.
+int first_pixel(double at, int low, int high) {
+    return (int)std::max<double>(low, std::min<double>(high, std::ceil(at - 0.5)));
+}
+int end_pixel(double at, int low, int high) {
+    return (int)std::max<double>(low, std::min<double>(high, std::floor(at - 0.5) + 1));
+}
+
 // The rows [from, to) of one triangle; inverse depth is linear on the picture. Of equal depths the first face stays.
 void draw(const FaceJob& job, int32_t face, int from, int to) {
     const int32_t* f = job.faces + 3 * (int64_t)face;
@@ -22,11 +31,11 @@ void draw(const FaceJob& job, int32_t face, int from, int to) {
     const double low = std::min({y[0], y[1], y[2]}), high = std::max({y[0], y[1], y[2]});
     if (high < from || low > to) return;
     const double area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]);
-    if (area == 0) return;
-    const int y0 = std::max(from, (int)std::ceil(low - 0.5)), y1 = std::min(to, (int)std::floor(high - 0.5) + 1);
+    if (area == 0 || !std::isfinite(area)) return;
+    const int y0 = first_pixel(low, from, to), y1 = end_pixel(high, from, to);
     const double left = std::min({x[0], x[1], x[2]}), right = std::max({x[0], x[1], x[2]});
     if (right < 0 || left > job.width) return;
-    const int x0 = std::max(0, (int)std::ceil(left - 0.5)), x1 = std::min(job.width, (int)std::floor(right - 0.5) + 1);
+    const int x0 = first_pixel(left, 0, job.width), x1 = end_pixel(right, 0, job.width);
     for (int row = y0; row < y1; row++)
         for (int col = x0; col < x1; col++) {
             const double px = col + 0.5, py = row + 0.5;

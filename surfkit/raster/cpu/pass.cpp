@@ -17,6 +17,7 @@ int64_t chunks_of(int64_t count, int64_t size) { return (count + size - 1) / siz
 // Stable order of `keys` (non-negative floats), as positions; least significant digit first.
 std::vector<uint32_t> order_of(const std::vector<float>& keys) {
     const size_t n = keys.size();
+    if (!n) return {};
     std::vector<uint32_t> bits(n), order(n), bits2(n), order2(n);
     std::memcpy(bits.data(), keys.data(), n * sizeof(float));
     for (size_t i = 0; i < n; i++) order[i] = (uint32_t)i;
