@@ -50,6 +50,7 @@ from surfkit.run.shared import Shares
 from surfkit.run.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.run.start import InitialPoints, align_priors
 from surfkit.run.store import StageStore
+from surfkit.run.warn import warn_of_gaps, warn_of_no_edits
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
@@ -373,32 +374,7 @@ def load_run(out: Path) -> tuple[Run, StageState, Scene]:
     return run, state, scene
 
 
-def warn_of_no_edits(run: Run, scene: Scene) -> None:
-    """Say which stages cannot add a point, or never remove one by its worth, though they are to."""
-    for at in run.stages:
-        stage, views = at.stage, 1 if at.name == "tune" else len(scene.train)  # a block may have few of them
-        edits = stage.densify.edits(stage.steps) if stage.densify is not None else None
-        if edits is not None and len(edits) == 0:
-            emit(
-                Warned(
-                    f"{at.setting}: no point will be added, as no edit of densify falls within {stage.steps:,} "
-                    f"steps; more steps, or a lower {at.setting}.densify.start and every, change that"
-                )
-            )
-        for number, prune in enumerate(stage.prune):
-            if (edits := prune.edits(stage.steps, views)) is not None and len(edits) == 0:
-                epochs = f" of {views:,} photographs to an epoch" * (views > 1)
-                due = f"is never due within its {stage.steps:,} steps{epochs}; more steps, or another schedule of it,"
-                emit(Warned(f"{at.setting}.prune.{number}: {name_of(prune)} {due} change that"))
-
-
 def warn_of_idle(run: Run, compute: Compute) -> None:
     """Say that an executor was chosen for nothing."""
     if run.recipe.partition is None and not compute.workers.in_process:
         emit(Warned("the recipe cuts the scene into no blocks, so the executor has nothing to do; see partition"))
-
-
-def warn_of_gaps(scene: Scene, state: StageState | None) -> None:
-    """Say what the data does not allow."""
-    if state is None and not scene.held_out:
-        emit(Warned("no photograph is kept from training, so the quality cannot be measured; see --test-every"))

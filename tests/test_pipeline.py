@@ -26,7 +26,7 @@ from surfkit.primitives import Flat3D, Surfel2D
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.recipe import complete
-from surfkit.run import stage
+from surfkit.run import stage, warn
 from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.material import CacheSettings
@@ -238,20 +238,20 @@ def test_a_stage_that_can_add_no_point_is_told_before_it_begins(data, recipe, tm
 @pytest.mark.parametrize(("cut", "told"), [(None, []), (QuantileGrid((1, 1)), ["tune"])])
 def test_blocks_that_can_add_no_point_are_told_where_there_are_any(recipe, data, tmp_path, monkeypatch, cut, told):
     texts, whole = [], recipes()["2dgs"].pretrain
-    monkeypatch.setattr(pipeline, "emit", lambda event: texts.append(event.text))
+    monkeypatch.setattr(warn, "emit", lambda event: texts.append(event.text))
     tune = replace(whole, steps=600, densify=replace(whole.densify, start=600))
-    pipeline.warn_of_no_edits(Run(tmp_path, replace(recipe, partition=cut, tune=tune), data), read(data))
+    warn.warn_of_no_edits(Run(tmp_path, replace(recipe, partition=cut, tune=tune), data), read(data))
     assert [text.partition(":")[0] for text in texts] == told
 
 
 def test_a_prune_that_is_never_due_is_told_before_the_run(recipe, data, tmp_path, monkeypatch):
     """In 1,000 steps, trims end before the first; in 9,999 with epochs of 8,000, the second epoch ends too late."""
     texts, scene = [], read(data)
-    monkeypatch.setattr(pipeline, "emit", lambda event: texts.append(event.text))
+    monkeypatch.setattr(warn, "emit", lambda event: texts.append(event.text))
 
     def told(recipe, views=scene.train):
         texts.clear()
-        pipeline.warn_of_no_edits(Run(tmp_path, recipe, data), replace(scene, train=views))
+        warn.warn_of_no_edits(Run(tmp_path, recipe, data), replace(scene, train=views))
         return texts
 
     city = recipes()["citygs2"]
