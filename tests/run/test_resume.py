@@ -294,6 +294,7 @@ class Spoiling(Prune):
 
 def spoilt(recipe, at, above, monkeypatch):
     monkeypatch.setattr("surfkit.core.codec.name_of", lambda part: type(part).__name__.lower())
+    monkeypatch.setattr(pipeline, "refuse_unsaved", lambda recipe: None)  # a prune that no plugin registers
     return evolve(recipe, "pretrain.prune", (Spoiling(at, above),))
 
 
@@ -419,7 +420,8 @@ def test_commands_on_a_run_folder_take_its_lock(done, tmp_path, monkeypatch, cap
 def test_a_folder_that_cannot_be_made_is_one_line(data, tmp_path, capsys):
     (tmp_path / "file").touch()
     words = ["train", "recipe:2dgs", "--data", str(data.path), "--out", str(tmp_path / "file" / "run")]
-    assert main(words) == 2 and capsys.readouterr().err == f"surfkit: {tmp_path / 'file' / 'run'}: Not a directory\n"
+    told = f"surfkit: {tmp_path / 'file' / 'run'}: a file is in the place of a folder; name another\n"
+    assert main(words) == 2 and capsys.readouterr().err == told
 
 
 def test_checkpoints_can_be_read_by_whom_the_umask_lets(data, recipe, tmp_path):
