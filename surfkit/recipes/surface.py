@@ -22,9 +22,7 @@ from surfkit.train.stage import Stage
 SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
     primitive=Surfel2D(),
-    # On shibuya-synth, 1,500 steps: F1 at 0.5 m of 0.661 and 22.74 dB; with the estimator's own settings 0.639 and
-    # 22.47 dB, for four fifths of the time of stereo. What has no texture at all gets worse depth by more passes.
-    depth=PatchMatch(best=2, spread=0.06, smoothness=0.015, passes=5),
+    depth=PatchMatch(),
     start=StereoStart(),
     pretrain=Stage(
         losses={
