@@ -69,9 +69,23 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     try:
         with on_parse_error(refuse):
             words, rules = choices_first(command, argv), one_paragraph_each()
-            return _refuse_nan(tyro.cli(command, prog=prog, args=words, config=_CONFIG, registry=rules))
+            found = tyro.cli(command, prog=prog, args=words, config=_CONFIG, registry=rules)
+            _refuse_flags_without_values(found, argv)
+            return _refuse_nan(found)
     finally:
         ARGV.reset(token)
+
+
+def _refuse_flags_without_values(settings: Any, argv: Sequence[str], at: str = "") -> None:
+    """BadInput where a flag that takes any number of values has none, and so asks for nothing."""
+    for field in fields(settings):
+        value, flag = getattr(settings, field.name), field.name.replace("_", "-")
+        if is_dataclass(value):
+            _refuse_flags_without_values(value, argv, f"{at}{flag}.")
+        elif value == field.default == ():
+            for name in (f"--{flag}", f"--{at}{flag}"):
+                if name in argv:
+                    raise BadInput(f"{name}: a value must follow")
 
 
 def _refuse_nan(settings: T, at: str = "") -> T:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -31,16 +31,16 @@ from surfkit.scene.vectors import unit
 KEPT = 48
 """Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
 case."""
-KEPT_BYTES, PIXEL_BYTES = 2 << 30, 15
-"""Of a pixel: twice as many photographs, pictures as they are compared, and depth maps of either stage."""
+KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 7, 4
+"""Of a pixel: twice as many photographs, and pictures as they are compared; and the depth map of each round."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
 FEW, MANY = 16, 32
-"""Pixels of a window that are compared in small pictures, and at full size."""
+"""Pixels of a window that are compared at first, and from the last photometric pass at full size on."""
 MATCHED, COMPARED = "matching photographs", "comparing depth maps"
-"""What is done while the maps of either stage are made."""
+"""What is done while the maps of the first round are made, and those of the others."""
 RANGES = {
     "longest": (32, 20_000),
     "neighbours": (1, 16),
@@ -51,6 +51,7 @@ RANGES = {
     "smoothness": (0, 1000),
     "passes": (1, 8),
     "consistency": (0, 1000),
+    "rounds": (1, 8),
     "coarsest": (32, 1000),
     "tolerance_px": (1e-6, 1000),
     "agree": (1, 16),
@@ -70,7 +71,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -85,27 +86,30 @@ class PatchMatch(DepthEstimator):
 
     best: int = 3
     """Source photographs that a plane is scored by: those that match best, out of twice as many that match best at the
-    pixel and around it."""
+    pixel and around it. Of these, one that matches much worse than the best counts little."""
 
     window: int = 7
     """Side of the matching window, pixels; odd. Smaller windows keep edges sharp, larger ones are less sensitive to
     noise."""
 
-    spread: float = 0.12
+    spread: float = 0.06
     """Difference of grey values, in [0, 1], at which the weight of a pixel of the window falls to 1 / e: windows end at
     image edges."""
 
-    smoothness: float = 0.03
-    """Cost of a difference of one pixel of parallax between the planes of neighbouring pixels, where the image is
-    uniform; 1 is the cost of a wrong match."""
+    smoothness: float = 0.015
+    """Cost of a difference of one pixel of parallax between the planes of neighbouring pixels of one grey value; 1 is
+    the cost of a wrong match. It grows where a window shows little contrast."""
 
-    passes: int = 3
+    passes: int = 4
     """Passes over the pixels at the smallest image size, and one less at the larger sizes, where the last pass compares
     depth maps at full size."""
 
-    consistency: float = 0.1
+    consistency: float = 0.2
     """Cost of one pixel of reprojection error in the depth maps of the source photographs; 0 turns this comparison
     off."""
+
+    rounds: int = 2
+    """Comparisons of depth maps, each with those of the one before."""
 
     coarsest: int = 80
     """Longest side of the smallest images, where the planes are initialised, pixels."""
@@ -138,14 +142,14 @@ class PatchMatch(DepthEstimator):
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
         work = Work(self, given, pairs, wanted)
         for at in wanted:
-            found = work.consistent(at)
+            found = work.last.map(at)
             yield Estimate(at, None, None) if found is None else self.trusted(work, at, found)
             work.finish(at)
 
     def trusted(self, work: Work, at: int, found: Map) -> Estimate:
         """What the maps of other photographs agree with, and the mean of what they say."""
         camera = work.camera(at, 0)
-        depths = ((near, work.consistent_depth(near)) for near in work.pairs[at])
+        depths = ((near, work.last.depth(near)) for near in work.pairs[at])
         others = [(work.camera(near, 0), depth) for near, depth in depths if depth is not None]
         share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
         said = agreement(camera, found.inverse, others, share)
@@ -213,13 +217,28 @@ class InitialPoints(PlaneSweep):
         return f"give a lower coarsest, of {longest} or less"
 
 
+class Round(NamedTuple):
+    """Maps of a data set, made when they are asked for.
+
+    Attributes:
+        what: What is done while they are made.
+        map: Of the view at a position, or None where none can be made.
+        depth: (H, W) inverse depth alone, a seventh of the whole.
+        made: Positions of those that were made, or are not needed.
+    """
+
+    what: str
+    map: Callable[[int], Map | None]
+    depth: Callable[[int], Tensor | None]
+    made: set[int]
+
+
 class Work:
-    """Pictures and maps of a data set, made when they are asked for.
+    """Pictures and maps of a data set.
 
     Maps are kept in the folder for work as long as they are needed: they are ten times as large as what comes of them.
-
-    `photometric` and `consistent` give the map of the view at a position, or None where none can be made: by
-    photometric consistency alone, and by geometric consistency too.
+    Those of the first of the `rounds` are made by photometric consistency alone, the others by geometric consistency
+    with those of the round before too.
     """
 
     def __init__(self, settings: PatchMatch, given: DepthInput, pairs: list[list[int]], wanted: Sequence[int]) -> None:
@@ -233,22 +252,30 @@ class Work:
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * kept)(self.read)
         self.grey = lru_cache(kept)(self.halved)
-        # Of maps of other photographs, the depth alone is kept: a seventh of the whole.
-        self.photometric = lru_cache(1)(lambda at: self.kept(MATCHED, at, self.match))
-        self.depth = lru_cache(kept)(lambda at: inverse_of(self.photometric(at)))
-        reconciled = lru_cache(1)(lambda at: self.kept(COMPARED, at, self.reconcile))
-        self.consistent = reconciled if settings.consistency else self.photometric
-        self.consistent_depth = lru_cache(kept)(lambda at: inverse_of(self.consistent(at)))
-        self.stages = (COMPARED, MATCHED) if settings.consistency else (MATCHED,)
-        self.made: dict[str, set[int]] = {}  # or not needed
-        for what in self.stages:
+        self.rounds = [self.round(MATCHED, self.match, kept)]
+        for index in range(1, self.number_of_rounds):
+            again, before = f", round {index}" if index > 1 else "", self.rounds[-1]
+            self.rounds.append(self.round(COMPARED + again, lambda at, of=before: self.reconcile(at, of), kept))
+        self.last = self.rounds[-1]
+        for each in reversed(self.rounds):
             every = range(len(pairs))
-            self.made[what] = {at for at in every if self.path(what, at).exists() or not self.is_needed(what, at)}
+            each.made.update(at for at in every if self.path(each.what, at).exists() or not self.is_needed(each, at))
+
+    @property
+    def number_of_rounds(self) -> int:
+        """With the one by photometric consistency alone."""
+        return 1 + self.settings.rounds if self.settings.consistency else 1
+
+    def round(self, what: str, make: Callable[[int], Map | None], kept: int) -> Round:
+        """Of maps that `make` makes, if they are not in the folder for work yet."""
+        made: set[int] = set()
+        found = lru_cache(1)(lambda at: self.kept(what, at, make, made))
+        return Round(what, found, lru_cache(kept)(lambda at: inverse_of(found(at))), made)
 
     def room(self) -> int:
         """How many pictures and maps are kept in memory."""
         pixels = max((c.width * c.height for c in (self.camera(at, 0) for at in range(len(self.pairs)))), default=1)
-        most = min(KEPT, KEPT_BYTES // (PIXEL_BYTES * pixels))
+        most = min(KEPT, KEPT_BYTES // ((PIXEL_BYTES + DEPTH_BYTES * self.number_of_rounds) * pixels))
         return max(most, 2 + max(map(len, self.pairs), default=0))
 
     def camera(self, at: int, level: int) -> Camera:
@@ -275,34 +302,35 @@ class Work:
 
     def path(self, what: str, at: int) -> Path:
         """Where a map is kept."""
-        return self.given.work / what.replace(" ", "-") / f"{at:06d}.npy"
+        return self.given.work / what.replace(",", "").replace(" ", "-") / f"{at:06d}.npy"
 
-    def kept(self, what: str, at: int, make: Callable[[int], Map | None]) -> Map | None:
+    def kept(self, what: str, at: int, make: Callable[[int], Map | None], all_made: set[int]) -> Map | None:
         """A map from the folder for work, where it is put if it is not there."""
         path = self.path(what, at)
         if not path.exists():
             made = make(at)
             save_array(path, np.zeros(0, np.uint8) if made is None else made.packed())
-            self.made[what].add(at)
-            emit(Progress(what, len(self.made[what]), len(self.given.views)))
+            all_made.add(at)
+            emit(Progress(what, len(all_made), len(self.given.views)))
         numbers = np.load(path)
         return Map.unpacked(numbers) if len(numbers) else None
 
-    def is_needed(self, what: str, at: int) -> bool:
-        """Whether anything is still to be made from a map: an estimate from those of the last stage, and these from
-        those of the one before."""
-        if what == self.stages[0]:
+    def is_needed(self, of: Round, at: int) -> bool:
+        """Whether anything is still to be made from a map: estimates from those of the last round, and from those of
+        another one the maps of the next."""
+        if of is self.last:
             return any(user in self.wanted for user in self.users[at])
-        return any(user not in self.made[self.stages[0]] for user in self.users[at])
+        then = self.rounds[self.rounds.index(of) + 1]
+        return any(user not in then.made for user in self.users[at])
 
     def finish(self, at: int) -> None:
         """Delete the maps that nobody needs any more when the estimate of a photograph is kept."""
         self.wanted.discard(at)
         near = {at, *self.pairs[at]}
-        for what in self.stages:
+        for of in reversed(self.rounds):
             for each in near:
-                if not self.is_needed(what, each):
-                    self.path(what, each).unlink(missing_ok=True)
+                if not self.is_needed(of, each):
+                    self.path(of.what, each).unlink(missing_ok=True)
             near = near.union(*(self.pairs[each] for each in near))
 
     def match(self, at: int) -> Map | None:
@@ -326,7 +354,7 @@ class Work:
                 terms = replace(
                     self.terms(span, parallax),
                     jitter_px=JITTER_PX * 2 ** (passes - 1 - index),
-                    samples=MANY if level == 0 else FEW,
+                    samples=MANY if level == 0 and index == passes - 1 else FEW,
                     survey=index == 0 and level == self.levels(at),
                 )
                 improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
@@ -337,18 +365,18 @@ class Work:
         fewer = (level < self.levels(at)) + (level == 0 and self.settings.consistency > 0)
         return max(1, self.settings.passes - fewer)
 
-    def reconcile(self, at: int) -> Map | None:
+    def reconcile(self, at: int, before: Round) -> Map | None:
         """One more pass, which looks at the depth maps of the others too."""
-        found = self.photometric(at)
+        found = before.map(at)
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         if found is None or span is None:
             return None
-        known = [None if (depth := self.depth(near)) is None else depth.numpy() for near in self.pairs[at]]
+        known = [None if (depth := before.depth(near)) is None else depth.numpy() for near in self.pairs[at]]
         planes = Planes.at(found.value[..., 0], len(known))
         planes.value[:], planes.each[:] = found.value, found.each
         terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
         there = [self.grey(near, 0) for near in self.pairs[at]]
-        improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30, known=known)
+        improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30 - self.rounds.index(before), known=known)
         return Map(planes.value, planes.each, found.parallax)
 
     def terms(self, span: tuple[float, float], parallax: float) -> Terms:

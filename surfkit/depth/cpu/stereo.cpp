@@ -6,6 +6,7 @@
 #include "stereo.h"
 
 #include <algorithm>
+#include <cmath>
 
 #include "../../native/simd.h"
 
@@ -22,7 +23,9 @@ constexpr float kNothing = 2.0f;     // cost of a plane that a view does not sho
 constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
 constexpr float kMostError = 3.0f;   // pixels of reprojection
 constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
-constexpr float kSame = 0.06f;       // pixels of parallax by which planes must differ to be tried both
+constexpr float kSame = 0.15f;       // pixels of parallax by which planes must differ to be tried both
+constexpr float kHidden = 0.3f;      // cost above the best view's at which a view counts 1 / e of it
+constexpr float kFaint = 20.0f;      // variance of grey values at which a window doubles the smoothness
 constexpr float kNever = 1e9f;       // cost of a plane that is not tried
 constexpr int kTrials = 16;          // room for planes that are tried together
 constexpr int kLooked = 2;           // views that are looked at, for each one that counts
@@ -303,16 +306,19 @@ struct Pixel {
         trials.fill();
     }
 
-    // The mean of the least costs, of as many views as count; views that show nothing count only where all others do too.
-    float least_of(const float* match) const {
+    // The soft minimum of the least costs, of as many views as count: near their mean where all of them match, while a view
+    // that matches badly, as something hides the place from it, adds little. Views that show nothing count only where all
+    // others do too. Where the least of all is no less than `limit`, that is all that is said.
+    float least_of(const float* match, float limit) const {
         float sorted[kMostViews];
         std::copy(match, match + count, sorted);
         const int most = std::min(job.best, count);
         std::partial_sort(sorted, sorted + most, sorted + count);
-        float sum = sorted[0];
+        if (sorted[0] >= limit) return sorted[0];
+        float sum = 1;
         int used = 1;
-        for (; used < most && sorted[used] < kNothing; used++) sum += sorted[used];
-        return sum / (float)used;
+        for (; used < most && sorted[used] < kNothing; used++) sum += std::exp((sorted[0] - sorted[used]) / kHidden);
+        return sorted[0] - kHidden * std::log(sum / (float)used);
     }
 
     static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
@@ -325,11 +331,13 @@ struct Pixel {
     }
 
     // Costs of the trials before any view is looked at: how much they differ from what lies around, less where the picture
-    // changes and no more than at an edge. Planes are dropped that are out of range, oblique, or like one before them; and the
-    // first, which is the present one, if its cost is known.
+    // changes and no more than at an edge; more where the window is so faint that noise decides how it matches. Planes are
+    // dropped that are out of range, oblique, or like one before them; and the first, which is the present one, if its cost
+    // is known.
     void screen(bool known) {
         trials.fill();
         const float rx = ((float)x + 0.5f - job.cx) / job.fx, ry = ((float)y + 0.5f - job.cy) / job.fy;
+        const float smoothness = job.smoothness / 4 * (1.0f + kFaint / window.contrast);
         const float away = kOblique * kOblique * (rx * rx + ry * ry + 1.0f), same = kSame / job.parallax;
         for (int i = 0; i < trials.count; i += kLanes) {
             const Floats w = load(trials.w + i), gx = load(trials.gx + i), gy = load(trials.gy + i);
@@ -341,7 +349,7 @@ struct Pixel {
             }
             const Mask fits = less_equal(job.low, w) & less_equal(w, job.high) &
                               lesser((nx * nx + ny * ny + nz * nz) * away, w * w);
-            store(trials.cost + i, select(fits, rough * (job.smoothness / 4), kNever));
+            store(trials.cost + i, select(fits, rough * smoothness, kNever));
         }
         for (int i = 1; i < trials.count; i++)
             for (int j = 0; j < i; j++) {
@@ -370,7 +378,7 @@ struct Pixel {
         int best = -1;
         float least = known ? cost : kNever;
         for (int i = 0; i < trials.count; i++) {
-            const float c = trials.cost[i] + least_of(match[i]);
+            const float c = trials.cost[i] + least_of(match[i], least - trials.cost[i]);
             if (c < least) best = i, least = c;
         }
         if (best >= 0) {
