@@ -21,12 +21,12 @@ from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.plane_map import Map, inverse_of
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.readers.depth_files import save_array
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
-from surfkit.scene.vectors import unit
 
 KEPT = 48
 """Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
@@ -156,54 +156,6 @@ class PatchMatch(DepthEstimator):
         trust = said.trust(self.agree) * found.matched(self.best)
         trust[at_edge(found.inverse, self.window // 2, self.edge)] = 0
         return Estimate(at, said.fused, trust, found.normals(camera))
-
-
-@dataclass(frozen=True)
-class Map:
-    """The planes of one photograph.
-
-    Attributes:
-        value: (H, W, 3) float32, see `Planes`.
-        each: (H, W, V) uint8, see `Planes`; of all photographs that this one is compared with.
-        parallax: Pixels by which the photographs move that it is compared with, a unit of inverse depth.
-    """
-
-    value: np.ndarray
-    each: np.ndarray
-    parallax: float
-
-    def packed(self) -> np.ndarray:
-        """(H, W, 16 + V) uint8, for a file."""
-        flat = np.full(self.value.shape[:2], self.parallax, np.float32)
-        numbers = np.concatenate([self.value, flat[..., None]], 2)
-        return np.concatenate([numbers.view(np.uint8), self.each], 2)
-
-    @classmethod
-    def unpacked(cls, packed: np.ndarray) -> Map:
-        """From what is packed."""
-        numbers = np.ascontiguousarray(packed[..., :16]).view(np.float32)
-        return cls(np.ascontiguousarray(numbers[..., :3]), packed[..., 16:], float(numbers[0, 0, 3]))
-
-    def matched(self, best: int) -> Tensor:
-        """(H, W) float32 in [0, 1], how well the best views match."""
-        costs = np.sort(self.each, 2)[..., :best].mean(2, dtype=np.float32)
-        return torch.from_numpy(1 - costs / 255)
-
-    @property
-    def inverse(self) -> Tensor:
-        """(H, W) inverse depth."""
-        return torch.from_numpy(np.ascontiguousarray(self.value[..., 0]))
-
-    def normals(self, camera: Camera) -> Tensor:
-        """(3, H, W) unit normals in the camera's axes, towards it.
-
-        A plane is n . X = 1, so that n . ray is its inverse depth.
-        """
-        w, gx, gy = torch.from_numpy(self.value).unbind(-1)
-        rays = camera.rays()
-        nx, ny = gx * camera.fx, gy * camera.fy
-        away = torch.stack([nx, ny, w - nx * rays[0] - ny * rays[1]])
-        return -unit(away)
 
 
 @dataclass(frozen=True)
@@ -395,11 +347,6 @@ class Work:
             window=settings.window,
             survey=False,
         )
-
-
-def inverse_of(found: Map | None) -> Tensor | None:
-    """(H, W) inverse depth of a map."""
-    return None if found is None else found.inverse
 
 
 def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:

@@ -30,6 +30,7 @@ def die_at(array):
 
 
 SETTINGS = "recipe:surface mesh:none --steps 4 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
+SETTINGS += ["--depth.rounds", "1"]
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,65 @@
+"""What PatchMatch finds of one photograph, until it is an estimate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.scene.camera import Camera
+from surfkit.scene.vectors import unit
+
+
+@dataclass(frozen=True)
+class Map:
+    """The planes of one photograph.
+
+    Attributes:
+        value: (H, W, 3) float32, see `Planes`.
+        each: (H, W, V) uint8, see `Planes`; of all photographs that this one is compared with.
+        parallax: Pixels by which the photographs move that it is compared with, a unit of inverse depth.
+    """
+
+    value: np.ndarray
+    each: np.ndarray
+    parallax: float
+
+    def packed(self) -> np.ndarray:
+        """(H, W, 16 + V) uint8, for a file."""
+        flat = np.full(self.value.shape[:2], self.parallax, np.float32)
+        numbers = np.concatenate([self.value, flat[..., None]], 2)
+        return np.concatenate([numbers.view(np.uint8), self.each], 2)
+
+    @classmethod
+    def unpacked(cls, packed: np.ndarray) -> Map:
+        """From what is packed."""
+        numbers = np.ascontiguousarray(packed[..., :16]).view(np.float32)
+        return cls(np.ascontiguousarray(numbers[..., :3]), packed[..., 16:], float(numbers[0, 0, 3]))
+
+    def matched(self, best: int) -> Tensor:
+        """(H, W) float32 in [0, 1], how well the best views match."""
+        costs = np.sort(self.each, 2)[..., :best].mean(2, dtype=np.float32)
+        return torch.from_numpy(1 - costs / 255)
+
+    @property
+    def inverse(self) -> Tensor:
+        """(H, W) inverse depth."""
+        return torch.from_numpy(np.ascontiguousarray(self.value[..., 0]))
+
+    def normals(self, camera: Camera) -> Tensor:
+        """(3, H, W) unit normals in the camera's axes, towards it.
+
+        A plane is n . X = 1, so that n . ray is its inverse depth.
+        """
+        w, gx, gy = torch.from_numpy(self.value).unbind(-1)
+        rays = camera.rays()
+        nx, ny = gx * camera.fx, gy * camera.fy
+        away = torch.stack([nx, ny, w - nx * rays[0] - ny * rays[1]])
+        return -unit(away)
+
+
+def inverse_of(found: Map | None) -> Tensor | None:
+    """(H, W) inverse depth of a map."""
+    return None if found is None else found.inverse
