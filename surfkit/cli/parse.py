@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import tyro
@@ -78,13 +79,14 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
 def _refuse_flags_without_values(settings: Any, argv: Sequence[str], at: str = "") -> None:
     """BadInput where a flag that takes any number of values has none, and so asks for nothing."""
+    empty = [word for word, then in pairwise([*argv, "--"]) if then.startswith("--") or ":" in then]
     for field in fields(settings):
         value, flag = getattr(settings, field.name), field.name.replace("_", "-")
         if is_dataclass(value):
             _refuse_flags_without_values(value, argv, f"{at}{flag}.")
         elif value == field.default == ():
             for name in (f"--{flag}", f"--{at}{flag}"):
-                if name in argv:
+                if name in empty:
                     raise BadInput(f"{name}: a value must follow")
 
 

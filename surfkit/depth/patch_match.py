@@ -101,15 +101,15 @@ class PatchMatch(DepthEstimator):
     the cost of a wrong match. It grows where a window shows little contrast."""
 
     passes: int = 4
-    """Passes over the pixels at the smallest image size, and one less at the larger sizes, where the last pass compares
-    depth maps at full size."""
+    """Passes over the pixels at the smallest image size, and one less at the larger sizes; at full size, where depth
+    maps are compared too, two less, but at least one."""
 
     consistency: float = 0.2
     """Cost of one pixel of reprojection error in the depth maps of the source photographs; 0 turns this comparison
     off."""
 
     rounds: int = 2
-    """Comparisons of depth maps, each with those of the one before."""
+    """Comparisons of depth maps, each with those of the one before; none if `consistency` is 0."""
 
     coarsest: int = 80
     """Longest side of the smallest images, where the planes are initialised, pixels."""

@@ -139,6 +139,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ([*OK, "--pretrain.steps"], "--pretrain.steps: a value must follow"),
         (["evaluate", "RUN", "--seen"], "--seen: a value must follow"),
         (["mesh", "RUN", "--lods"], "--lods: a value must follow"),
+        (["mesh", "RUN", "--lods", "--formats", "ply"], "--lods: a value must follow"),
         ([*OK, "--device", "tpu"], "--device: expected one of 'auto', 'cpu', got 'tpu'"),
         ([*OK, "--pretrain.losses.depth.start", "-1"], "pretrain.losses.depth: start is -1; it must be 0 or more"),
         (["train", "recipe:no.json", "--data", "d"], "no.json: no such file"),

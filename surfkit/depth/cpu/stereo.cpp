@@ -24,6 +24,7 @@ constexpr float kOblique = 0.12f;    // least cosine between the normal of a pla
 constexpr float kMostError = 3.0f;   // pixels of reprojection
 constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
 constexpr float kSame = 0.12f;       // pixels of parallax by which planes must differ in a window to be tried both
+constexpr float kAcross = 5.0f;       // pixels over which a difference of slopes counts in that
 constexpr float kHidden = 0.3f;      // cost above the best view's at which a view counts 1 / e of it
 constexpr float kFaint = 20.0f;      // variance of grey values at which a window doubles the smoothness
 constexpr float kNever = 1e9f;       // cost of a plane that is not tried
@@ -354,7 +355,7 @@ struct Pixel {
         for (int i = 1; i < trials.count; i++)
             for (int j = 0; j < i; j++) {
                 const float by = std::fabs(trials.gx[i] - trials.gx[j]) + std::fabs(trials.gy[i] - trials.gy[j]);
-                if (std::fabs(trials.w[i] - trials.w[j]) + 5.0f * by < same) trials.cost[i] = kNever;
+                if (std::fabs(trials.w[i] - trials.w[j]) + kAcross * by < same) trials.cost[i] = kNever;
             }
         int left = known ? 0 : 1;
         for (int i = 1; i < trials.count; i++) {
