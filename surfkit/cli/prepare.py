@@ -11,13 +11,12 @@ from typing import Annotated
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.prepare_photos import Photos
 from surfkit.cli.prepare_points import Points
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.core.events import Warned, emit
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
@@ -80,32 +79,25 @@ class Depth:
                     given, wanted = preparation.begin(scene, given, self.again)
                 if there := len(views) - len(preparation.lacking(scene)):
                     print(f"{there} of {len(views)} photographs have depth maps already", file=sys.stderr)
-                done = with_progress_bar(preparation.run(scene, given, wanted), len(wanted))
+                done = with_progress(preparation.run(scene, given, wanted), len(wanted))
                 refuse_none(self.data, views, len(wanted))
                 write_overview(folder / "overview.png", self.data, views)
         show(done)
         print(f"depth maps in {folder}; look at {folder / 'overview.png'}")
 
 
-def with_progress_bar(steps: Iterable[Prepared], total: int) -> list[Prepared]:
-    """The results, with a bar on the terminal while they come; where there is no terminal, a line for each."""
+def with_progress(steps: Iterable[Prepared], total: int) -> list[Prepared]:
+    """The results, with bars on a terminal while they come; where there is no terminal, a line for each."""
     console, done = Console(stderr=True), []
-    columns = (
-        TextColumn("depth"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[name]}"),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("depth", total=total, name="")
+    with bars(console):
         for step in steps:
             done.append(step)
-            bar.update(task, advance=1, name=step.view.name)
-            if not console.is_terminal:
-                covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
-                line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
-                console.print(line, highlight=False, soft_wrap=True)
+            if console.is_terminal:
+                emit(Progress("depth maps", len(done), total))
+                continue
+            covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
+            line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
+            console.print(line, highlight=False, soft_wrap=True)
     return done
 
 

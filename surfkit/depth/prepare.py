@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -121,8 +121,9 @@ class Preparation:
         record, before = self.record(views), read_record(root)
         paths = [map_path(root, view.name) for view in views]
         if not again and before != record and (before or any(path.exists() for path in paths)):
-            made = "with other settings" if before else "by another program"
-            raise BadInput(f"{root / FOLDER} holds depth maps made {made}; --again replaces them")
+            raise BadInput(
+                f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
+            )
         damaged: set[str] = set()
         if again or self.lacking(scene):
             given, damaged = without_damaged(given)
@@ -192,6 +193,17 @@ class Preparation:
         normal = None if estimate.normal is None else estimate.normal.numpy()
         write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > TRUSTED).float().mean())
+
+
+def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """How maps were made whose record is another one, in a few words; it is empty if surfkit did not make them."""
+    if not before:
+        return "by another program"
+    if before.get("estimator") != now["estimator"]:
+        return "with other settings"
+    if before.get("surfkit") != now["surfkit"]:
+        return f"by surfkit {before.get('surfkit', 'of another version')}"
+    return "of other photographs, or of other sizes"
 
 
 def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str]]:

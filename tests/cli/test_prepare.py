@@ -146,6 +146,7 @@ def test_an_estimate_goes_on_though_a_photograph_was_damaged_meanwhile(farm, mon
         patch.setattr(PatchMatch, "estimate", interrupted)
         assert main(words) == 130
     first = maps(farm)
+    assert "matching photographs  6/6" in capsys.readouterr().err, "the first map comes after most of the work"
     assert len(first) == 3 and list((farm / "estimated_depths/.work").rglob("*.npy"))
     damage(farm, 3)
     assert main(words) == 0
@@ -163,6 +164,12 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     assert np.load(path).shape == (36, 48)
     assert main(["prepare", "depth", str(farm), *SMALL, "--estimator.window", "7"]) == 2
     assert "made with other settings" in capsys.readouterr().err
+    assert main(["prepare", "depth", str(farm), *SMALL, "--scale", "2"]) == 2
+    assert "made of other photographs, or of other sizes; --again" in capsys.readouterr().err
+    record = path.with_name("depth.json")
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"surfkit": "0.0.1"}))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 2
+    assert "made by surfkit 0.0.1; --again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
