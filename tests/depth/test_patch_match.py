@@ -12,6 +12,7 @@ from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.neighbours import neighbours
 from surfkit.depth.patch_match import PatchMatch, Work
+from surfkit.depth.plane_map import Map
 from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
@@ -333,6 +334,17 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
         grey, [grey, grey], planes, Terms(0.1, 2, 10, 1, 0.01, 0, 30, samples=16, best=1, window=7, survey=True), seed=1
     )
     assert np.isfinite(planes.value).all() and np.isfinite(planes.cost).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (3, 4)])
+def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape):
+    draw = np.random.default_rng(6)
+    made = Map(draw.random((*shape, 3), np.float32), draw.integers(0, 256, (*shape, 5)).astype(np.uint8), 7.5)
+    read = Map.unpacked(made.packed())
+    np.testing.assert_array_equal(read.inverse, made.value[..., 0])
+    np.testing.assert_array_equal(read.value, made.value)
+    np.testing.assert_array_equal(read.each, made.each)
+    assert read.parallax == 7.5 and read.normals(Camera(torch.eye(4), 1, 1, 0, 0, *shape[::-1])).shape == (3, *shape)
 
 
 def test_views_without_points_have_no_depth(farm, tmp_path):
