@@ -42,9 +42,9 @@ OVERVIEW_VIEWS = 4
 class Depth:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
-    An interrupted command continues when it is given again. Two methods are multi-view stereo and need no network
-    weights: `estimator:plane-sweep` and `estimator:patch-match`. The network `estimator:depth-anything-v2` looks at one
-    photograph at a time.
+    An interrupted command continues when it is given again. Damaged photographs are passed over. Two methods are
+    multi-view stereo and need no network weights: `estimator:plane-sweep` and `estimator:patch-match`. The network
+    `estimator:depth-anything-v2` looks at one photograph at a time.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
