@@ -39,7 +39,7 @@ from surfkit.scene.scene import Scene, View
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
 """What photographs do that are compared and give no depth."""
 MADE_FROM = "made_from"
-"""The file in the folder for work with a digest of what is in it was made from."""
+"""The file in the folder for work that says, as a digest, what the other files there were made from."""
 
 
 @dataclass(frozen=True)

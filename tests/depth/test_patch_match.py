@@ -13,6 +13,7 @@ from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.neighbours import neighbours
 from surfkit.depth.patch_match import PatchMatch, Work
 from surfkit.depth.plane_map import Map
+from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
@@ -345,6 +346,25 @@ def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape):
     np.testing.assert_array_equal(read.value, made.value)
     np.testing.assert_array_equal(read.each, made.each)
     assert read.parallax == 7.5 and read.normals(Camera(torch.eye(4), 1, 1, 0, 0, *shape[::-1])).shape == (3, *shape)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [PlaneSweep(longest=64, neighbours=3), PatchMatch(longest=64, coarsest=60, neighbours=4, rounds=1)],
+)
+def test_small_photographs_among_larger_ones_do_not_refuse_the_window(farm, tmp_path, estimator):
+    """They are smaller than the window, down to a single pixel; maps are made of all."""
+    scene, tracks, _ = farm
+    sizes = {0: (40, 4), 1: (1, 90), 2: (1, 1)}
+    views = [replace(v, camera=v.camera.resized(*sizes.get(at, (120, 90)))) for at, v in enumerate(scene.train)]
+    estimator.refuse_unfit(views)
+    for estimate in estimator.estimate(DepthInput(views, tracks, CPU, tmp_path), [0, 1, 2, 7]):
+        camera = views[estimate.at].camera.fitted(estimator.longest)
+        assert estimate.inverse.shape == estimate.confidence.shape == (camera.height, camera.width)
+        assert torch.isfinite(estimate.inverse).all() and torch.isfinite(estimate.confidence).all()
+        assert float((estimate.confidence > 0.5).float().mean()) > 0.03 or estimate.at in sizes
+    with pytest.raises(BadInput, match="the largest depth map, of view_000.png, is 40 x 4 pixels: .* 3 to 4"):
+        estimator.refuse_unfit(views[:3])
 
 
 def test_views_without_points_have_no_depth(farm, tmp_path):
