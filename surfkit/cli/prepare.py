@@ -11,12 +11,12 @@ from typing import Annotated
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from surfkit.cli.prepare_photos import Photos
 from surfkit.cli.prepare_points import Points
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
@@ -29,8 +29,10 @@ from surfkit.readers.data import Reading
 from surfkit.readers.depth_files import FOLDER, RECORD, DepthFile, map_path
 from surfkit.readers.depth_prior import trust_warning
 from surfkit.readers.read import read
+from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
+from surfkit.train.bars import bars
 
 OVERVIEW_VIEWS = 4
 """Views in the overview."""
@@ -40,9 +42,9 @@ OVERVIEW_VIEWS = 4
 class Depth:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
-    An interrupted command continues when it is given again. Two methods are multi-view stereo and need no network
-    weights: `estimator:plane-sweep` and `estimator:patch-match`. The network `estimator:depth-anything-v2` looks at one
-    photograph at a time.
+    An interrupted command continues when it is given again. Damaged photographs are passed over. Two methods are
+    multi-view stereo and need no network weights: `estimator:plane-sweep` and `estimator:patch-match`. The network
+    `estimator:depth-anything-v2` looks at one photograph at a time.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -65,42 +67,37 @@ class Depth:
         """Estimate, and print the results."""
         data = self.reading.of(self.data)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
-        scene = read(data)
-        if notice := self.estimator.notice():
-            print(f"note: {notice}", file=sys.stderr)
-        given = preparation.material(scene)
-        folder, views = self.data / FOLDER, given.views
-        with locked(folder):
-            sweep(folder)
-            wanted = preparation.begin(scene, self.again)
-            if there := len(views) - len(wanted):
-                print(f"{there} of {len(views)} photographs have depth maps already", file=sys.stderr)
-            done = with_progress_bar(preparation.run(scene, given, wanted), len(wanted))
-            refuse_none(self.data, views)
-            write_overview(folder / "overview.png", self.data, views)
+        with collect_notes():
+            scene = read(data)
+            if notice := self.estimator.notice():
+                emit(Warned(notice))
+            given = preparation.material(scene)
+            folder, views = self.data / FOLDER, given.views
+            with locked(folder):
+                sweep(folder)
+                with bars():
+                    given, wanted = preparation.begin(scene, given, self.again)
+                if there := len(views) - len(preparation.lacking(scene)):
+                    print(f"{there} of {len(views)} photographs have depth maps already", file=sys.stderr)
+                done = with_progress(preparation.run(scene, given, wanted), len(wanted))
+                refuse_none(self.data, views, len(wanted))
+                write_overview(folder / "overview.png", self.data, views)
         show(done)
         print(f"depth maps in {folder}; look at {folder / 'overview.png'}")
 
 
-def with_progress_bar(steps: Iterable[Prepared], total: int) -> list[Prepared]:
-    """The results, with a bar on the terminal while they come; where there is no terminal, a line for each."""
+def with_progress(steps: Iterable[Prepared], total: int) -> list[Prepared]:
+    """The results, with bars on a terminal while they come; where there is no terminal, a line for each."""
     console, done = Console(stderr=True), []
-    columns = (
-        TextColumn("depth"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[name]}"),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("depth", total=total, name="")
+    with bars(console):
         for step in steps:
             done.append(step)
-            bar.update(task, advance=1, name=step.view.name)
-            if not console.is_terminal:
-                covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
-                line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
-                console.print(line, highlight=False, soft_wrap=True)
+            if console.is_terminal:
+                emit(Progress("depth maps", len(done), total))
+                continue
+            covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
+            line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
+            console.print(line, highlight=False, soft_wrap=True)
     return done
 
 
@@ -117,11 +114,11 @@ def show(done: list[Prepared]) -> None:
         print(f"note: {text}", file=sys.stderr)
 
 
-def refuse_none(root: Path, views: Sequence[View]) -> None:
-    """BadInput if no view has a map; then nothing says that there are some."""
+def refuse_none(root: Path, views: Sequence[View], tried: int) -> None:
+    """BadInput if no view has a map, though so many were tried; then nothing says that there are some."""
     if not any(map_path(root, view.name).exists() for view in views):
         (root / FOLDER / RECORD).unlink(missing_ok=True)
-        raise BadInput(f"{root}: no depth can be estimated of any of {len(views)} photographs: they {WITHOUT_DEPTH}")
+        raise BadInput(f"{root}: no depth can be estimated of any of {tried} photographs: they {WITHOUT_DEPTH}")
 
 
 def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
@@ -133,7 +130,10 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
         inverse, confidence = torch.from_numpy(file.read()), file.read_confidence()
         height, width = inverse.shape
         trust = torch.zeros(height, width) if confidence is None else torch.from_numpy(confidence)
-        photo = read_photo(view.path, (width, height)).float() / 255
+        try:
+            photo = read_photo(view.path, (width, height)).float() / 255
+        except BadInput:  # damaged since its map was made
+            continue
         rows.append(torch.cat([photo, colour_depth(1 / inverse), trust.expand(3, -1, -1)], dim=2))
     if rows:
         width = max(row.shape[2] for row in rows)

@@ -38,7 +38,10 @@ def files_as_choices(argv: Sequence[str]) -> list[str]:
 
 def table_choice(argv: Sequence[str] = ()) -> Any:
     """The union of all tables as tyro subcommands `table:NAME`."""
-    members = tuple(_subcommand(name, table) for name, table in tables(argv).items())
+    known = tables(argv)
+    if not known:
+        raise BadInput("no plugin in use offers an ablation table; name a file instead: FILE.json or FILE.py")
+    members = tuple(_subcommand(name, table) for name, table in known.items())
     return Union[members]  # noqa: UP007 (made at run time)
 
 

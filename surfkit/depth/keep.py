@@ -5,24 +5,22 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
-from surfkit.core.events import Progress, Warned, emit, say
+from surfkit.core.events import Progress, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare import Preparation
+from surfkit.depth.prepare import Preparation, without_damaged
 from surfkit.readers.fingerprint import Fingerprint, digest
 from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
-from surfkit.scene.photos import view_photo
-from surfkit.scene.scene import Scene, View
+from surfkit.scene.scene import Scene
 
 POLL_S = 1.0
 """Between two looks whether another process is done."""
@@ -106,16 +104,14 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
     """Make the maps that are not there, one after the other; whether there were any, and what is known of all."""
     folder, names = preparation.place, [view.name for view in scene.train]
     made = read_made(folder)
-    lacking = [name for name in preparation.lacking(scene) if name not in made.without]
+    lacking = set(preparation.lacking(scene)) - set(made.without)
     if not lacking:
         return False, made
-    readable = tuple(readable_views(scene.train))
-    given = preparation.material(replace(scene, train=readable), tracks)
+    given, damaged = without_damaged(preparation.material(scene, tracks))
     preparation.open(given.views)
-    unread = set(lacking) - {view.name for view in readable}
-    wanted = [at for at, view in enumerate(readable) if view.name in lacking]
+    wanted = [at for at, name in enumerate(names) if name in lacking and name not in damaged]
     count = len(names) - len(lacking) - len(made.without)
-    made = replace(made, maps=count, without=(*made.without, *sorted(unread)))
+    made = replace(made, maps=count, without=(*made.without, *sorted(damaged & lacking)))
     write_made(folder, made)
     begun, before, total = time.process_time(), made.cpu_seconds, len(names) - len(made.without)
     emit(Progress("depth maps", count, total))
@@ -126,24 +122,6 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
         write_made(folder, made)
         emit(Progress("depth maps", count + done, total))
     return True, made
-
-
-def readable_views(views: Sequence[View]) -> Iterator[View]:
-    """The views whose photographs are whole; training passes over the others too."""
-
-    def fault(view: View) -> str | None:
-        try:
-            view_photo(view)
-        except BadInput as error:
-            return str(error)
-        return None
-
-    with ThreadPoolExecutor(4) as pool:
-        for view, error in zip(views, pool.map(fault, views), strict=True):
-            if error is None:
-                yield view
-            else:
-                emit(Warned(f"no depth map is made of a damaged photograph: {error}"))
 
 
 def make_room(mine: Path, budget_bytes: int) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -158,22 +160,30 @@ def require_native() -> None:
 def pattern(window: int) -> np.ndarray:
     """(3, S) float32: x and y of the S pixels of a window that are compared, and their weights; 0 for unused ones.
 
-    As many as there is room for: those of an even coarser grid first, then those next to the middle. The first half
-    alone is such a pattern too.
+    The first half are those of a grid that is spread over the window, and the others those of a finer one that are
+    nearest to the middle. Each has its opposite, but for one of these where an odd number of places is left for them.
     """
     room, half = module().STEREO_SAMPLES, window // 2
-    chosen: list[tuple[int, int]] = []
-    for some in (room // 2, room):
-        step = next(step for step in range(1, window) if len(range(-half, half + 1, step)) ** 2 <= some)
-        grid = [(x, y) for y in range(-half, half + 1, step) for x in range(-half, half + 1, step)]
-        every = [(x, y) for y in range(-half, half + 1) for x in range(-half, half + 1)]
-        wanted = grid + sorted(every, key=lambda at: at[0] ** 2 + at[1] ** 2)
-        chosen += [at for at in dict.fromkeys(wanted) if at not in chosen][: some - len(chosen)]
+    side = np.rint(np.linspace(-half, half, min(window, math.isqrt(room // 2)))).astype(int).tolist()
+    chosen = [(x, y) for y in side for x in side]
+    step = max(1, half // 3)
+    finer = range(-(half // step) * step, half + 1, step)
+    rest = [(x, y) for y in finer for x in finer if (x, y) not in chosen]
+    for _, ring in groupby(sorted(rest, key=from_middle), from_middle):
+        around = list(ring)  # row by row, so that each end is the opposite of the other
+        fits = min(len(around), room - len(chosen))
+        first = (len(around) - fits) // 2
+        chosen += around[first : first + fits]
     found = np.zeros((3, room), np.float32)
     at = np.array(chosen, np.float32).T
     found[:2, : at.shape[1]] = at
     found[2, : at.shape[1]] = np.exp(-np.square(at).sum(0) / (2 * half**2))
     return found
+
+
+def from_middle(at: tuple[int, int]) -> int:
+    """Squared distance of a pixel of a window from the middle."""
+    return at[0] ** 2 + at[1] ** 2
 
 
 def way(here: Camera, there: Camera) -> list[float]:

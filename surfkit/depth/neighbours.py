@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from surfkit.core.events import Progress, emit
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS
 from surfkit.scene.observations import Observations
 from surfkit.scene.scene import View
@@ -42,17 +43,21 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
     sees.sum_duplicates()
     shared = (sees @ sees.T).tocsr()
     centres = np.stack([view.camera.centre.numpy() for view in views])
+    seen = np.split(sees.indices, sees.indptr[1:-1])
     chosen = []
     for at in range(len(views)):
-        others, counts = shared[at].indices, shared[at].data
+        part = slice(*shared.indptr[at : at + 2])
+        others, counts = shared.indices[part], shared.data[part]
         order = np.lexsort((others, -counts))
         candidates = [int(other) for other in others[order] if other != at][:CANDIDATES]
-        own = sees[at].indices
         worth = {
-            other: _worth(observations.xyz[np.intersect1d(own, sees[other].indices)], centres[[at, other]], angle)
+            other: _worth(
+                observations.xyz[np.intersect1d(seen[at], seen[other], assume_unique=True)], centres[[at, other]], angle
+            )
             for other in candidates
         }
         chosen.append(_spread(worth, {other: centres[other] - centres[at] for other in worth}, count))
+        emit(Progress("choosing what to compare", at + 1, len(views)))
     return chosen
 
 

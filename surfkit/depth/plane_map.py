@@ -35,8 +35,8 @@ class Map:
     @classmethod
     def unpacked(cls, packed: np.ndarray) -> Map:
         """From what is packed."""
-        numbers = np.ascontiguousarray(packed[..., :16]).view(np.float32)
-        return cls(np.ascontiguousarray(numbers[..., :3]), packed[..., 16:], float(numbers[0, 0, 3]))
+        numbers = packed[..., :16].copy().view(np.float32)
+        return cls(numbers[..., :3].copy(), packed[..., 16:], float(numbers[0, 0, 3]))
 
     def matched(self, best: int) -> Tensor:
         """(H, W) float32 in [0, 1], how well the best views match."""

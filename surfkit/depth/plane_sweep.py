@@ -185,12 +185,15 @@ class PlaneSweep(DepthEstimator):
 
 
 def refuse_wide_window(window: int, longest: int, views: Sequence[View]) -> None:
-    """BadInput if a window is larger than the depth map of a view, whose longest side is at most `longest` pixels."""
-    for view in views:
-        camera = view.camera.fitted(longest)
-        most = min(camera.width, camera.height)
-        if 3 <= most < window:  # in smaller ones nothing is found, with any window
-            raise BadInput(
-                f"window is {window}, and the depth map of {view.name} is {camera.width} x {camera.height} pixels: "
-                f"give an odd number from 3 to {most}"
-            )
+    """BadInput if a window is larger than all depth maps, whose longest sides are at most `longest` pixels.
+
+    Where only some are smaller, such as a thumbnail among photographs, little is found in these.
+    """
+    cameras = {view.name: view.camera.fitted(longest) for view in views}
+    sides = {name: min(camera.width, camera.height) for name, camera in cameras.items()}
+    name = max(sides, key=lambda each: sides[each], default="")
+    if 3 <= sides.get(name, 0) < window:  # in smaller ones nothing is found, with any window
+        raise BadInput(
+            f"window is {window}, and the largest depth map, of {name}, is {cameras[name].width} x "
+            f"{cameras[name].height} pixels: give an odd number from 3 to {sides[name]}"
+        )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump
+from surfkit.core.events import Progress, Warned, emit
+from surfkit.core.files import replacing
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.readers.data import Data
@@ -27,12 +30,16 @@ from surfkit.readers.depth_files import (
     write_record,
 )
 from surfkit.readers.depth_prior import TRUSTED
+from surfkit.readers.fingerprint import digest
 from surfkit.readers.read import observations
 from surfkit.scene.observations import Observations
+from surfkit.scene.photos import view_photo
 from surfkit.scene.scene import Scene, View
 
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
 """What photographs do that are compared and give no depth."""
+MADE_FROM = "made_from"
+"""The file in the folder for work that says, as a digest, what the other files there were made from."""
 
 
 @dataclass(frozen=True)
@@ -99,31 +106,36 @@ class Preparation:
                 f"`surfkit prepare points {self.data.path}` makes a data set with such points"
             )
 
-    def begin(self, scene: Scene, again: bool) -> list[int]:
-        """Positions of the views that are still to be estimated.
+    def begin(self, scene: Scene, given: DepthInput, again: bool) -> tuple[DepthInput, list[int]]:
+        """What the estimator works from without damaged photographs, and the positions that are still to be estimated.
 
         Args:
             scene: Of the data set.
+            given: What the estimator would work from if all photographs were whole.
             again: Whether to delete the maps that are there.
 
         Raises:
-            BadInput: There are maps that something else made, or other settings.
+            BadInput: There are maps that something else made, or other settings; or no photograph can be read.
         """
-        root, views = self.place, self.views(scene)
+        root, views = self.place, given.views
         record, before = self.record(views), read_record(root)
         paths = [map_path(root, view.name) for view in views]
+        if not again and before != record and (before or any(path.exists() for path in paths)):
+            raise BadInput(
+                f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
+            )
+        damaged: set[str] = set()
+        if again or self.lacking(scene):
+            given, damaged = without_damaged(given)
         if again:
             for path in paths:
                 path.unlink(missing_ok=True)
                 confidence_path(path).unlink(missing_ok=True)
                 normal_path(path).unlink(missing_ok=True)
-        elif before != record and (before or any(path.exists() for path in paths)):
-            made = "with other settings" if before else "by another program"
-            raise BadInput(f"{root / FOLDER} holds depth maps made {made}; --again replaces them")
         if before != record or again:
             shutil.rmtree(self.work, ignore_errors=True)
         self.open(views)
-        return [at for at, path in enumerate(paths) if not path.exists()]
+        return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
 
     def open(self, views: Sequence[View]) -> None:
         """Make the folders, and say what the maps are."""
@@ -148,6 +160,7 @@ class Preparation:
 
     def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
         """Estimate and save the views at the positions `wanted`, one after the other."""
+        self.forget_other_work(given)
         begun = time.perf_counter()
         for estimate in self.estimator.estimate(given, wanted):
             view = given.views[estimate.at]
@@ -155,6 +168,22 @@ class Preparation:
             yield Prepared(view, coverage, time.perf_counter() - begun)
             begun = time.perf_counter()
         shutil.rmtree(self.work, ignore_errors=True)
+
+    def forget_other_work(self, given: DepthInput) -> None:
+        """Delete what an interrupted estimate left, if it was made from other photographs, cameras or sparse points.
+
+        Its files are named by the position of a photograph, and depend on those that it is compared with.
+        """
+        tracks = given.observations
+        parts = [digest(tracks.xyz), digest(tracks.error_px)]
+        for view in given.views:
+            seen = tracks.seen.get(view.name)
+            parts += [view.name, digest(view.camera), "" if seen is None else digest(seen)]
+        found, path = digest("\0".join(parts)), self.work / MADE_FROM
+        if not path.exists() or path.read_text() != found:
+            shutil.rmtree(self.work, ignore_errors=True)
+            with replacing(path) as file:
+                file.write(found.encode())
 
     def save(self, view: View, estimate: Estimate, scene: Scene) -> float | None:
         """Write a map, in the units of the input if it has any, and return its coverage."""
@@ -164,3 +193,43 @@ class Preparation:
         normal = None if estimate.normal is None else estimate.normal.numpy()
         write_map(self.place, view.name, inverse.numpy(), estimate.confidence.numpy(), normal)
         return float((estimate.confidence > TRUSTED).float().mean())
+
+
+def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """How maps were made whose record is another one, in a few words; it is empty if surfkit did not make them."""
+    if not before:
+        return "by another program"
+    if before.get("estimator") != now["estimator"]:
+        return "with other settings"
+    if before.get("surfkit") != now["surfkit"]:
+        return f"by surfkit {before.get('surfkit', 'of another version')}"
+    return "of other photographs, or of other sizes"
+
+
+def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str]]:
+    """The same input, but that nothing is compared with damaged photographs; and their names.
+
+    A note names each of them. All photographs keep their positions.
+
+    Raises:
+        BadInput: No photograph can be read.
+    """
+
+    def fault(view: View) -> str | None:
+        try:
+            view_photo(view)
+        except BadInput as error:
+            return str(error)
+        return None
+
+    views, damaged = given.views, set()
+    with ThreadPoolExecutor(4) as pool:
+        for at, (view, error) in enumerate(zip(views, pool.map(fault, views), strict=True)):
+            emit(Progress("looking at photographs", at + 1, len(views)))
+            if error is not None:
+                emit(Warned(f"no depth map is made of a damaged photograph: {error}"))
+                damaged.add(view.name)
+    if len(damaged) == len(views):
+        raise BadInput(f"none of the {len(views)} photographs can be read, {views[0].path} for one")
+    whole = {name: seen for name, seen in given.observations.seen.items() if name not in damaged}
+    return replace(given, observations=replace(given.observations, seen=whole)), damaged

@@ -10,6 +10,7 @@ import torch
 
 from surfkit import pipeline
 from surfkit.cli import main
+from surfkit.core import registry
 from surfkit.recipes.ablations import TABLES
 from surfkit.run import stage
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -57,6 +58,20 @@ def test_what_users_get_wrong_is_one_line(monkeypatch, tmp_path, capsys, words, 
     said = capsys.readouterr().err
     assert said.startswith(f"surfkit: {line}") and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [["--data", "d"], ["--data", "d", "table:model"], ["--help"]])
+def test_without_any_table_it_is_one_line(monkeypatch, capsys, words):
+    monkeypatch.setenv("SURFKIT_PLUGINS", "none")
+    monkeypatch.setattr(registry, "BUILTIN", tuple(name for name in registry.BUILTIN if name != "surfkit.recipes"))
+    registry.reload()
+    try:
+        assert main(["ablate", *words]) == 2
+    finally:
+        monkeypatch.undo()
+        registry.reload()
+    said = capsys.readouterr().err
+    assert said.startswith("surfkit: no plugin in use offers an ablation table; name a file") and said.count("\n") == 1
 
 
 def test_help(capsys):

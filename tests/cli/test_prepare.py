@@ -5,12 +5,14 @@ import json
 import numpy as np
 import pytest
 import torch
+from needs import needs_native
 from PIL import Image
 
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.core.lock import locked
 from surfkit.core.tree import evolve
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.losses import DepthRegression
 from surfkit.pipeline import run, with_steps
@@ -96,6 +98,61 @@ def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, monkeypatch, cap
     assert maps(farm) == whole
 
 
+def damage(farm, *numbers):
+    """Cut photographs short; what they were, by path."""
+    whole = {path: path.read_bytes() for path in (farm / f"images/view_{at:03d}.png" for at in numbers)}
+    for path, content in whole.items():
+        path.write_bytes(content[: len(content) // 2])
+    return whole
+
+
+def test_a_damaged_photograph_is_passed_over_until_it_is_whole(farm, capsys):
+    for path, content in damage(farm, 3).items():
+        assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+        said, before = capsys.readouterr(), maps(farm)
+        assert said.err.count("note: no depth map is made of a damaged photograph: ") == said.err.count(str(path)) == 1
+        assert said.out.split("\n")[1].split()[0] == "5" and len(before) == 10 and "view_003.png.npy" not in before
+        path.write_bytes(content)
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    assert "5 of 6 photographs have depth maps already" in capsys.readouterr().err
+    assert len(maps(farm)) == 12 and maps(farm).items() >= before.items()
+    damage(farm, *range(8))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0, "there is nothing left to do"
+
+
+def test_damaged_photographs_alone_are_one_line_and_no_map_is_lost(farm, capsys):
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    before = maps(farm)
+    capsys.readouterr()
+    damage(farm, *range(8))
+    assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 2
+    notes = capsys.readouterr().err.splitlines()
+    assert notes.pop().startswith("surfkit: none of the 6 photographs can be read, ")
+    assert len([line for line in notes if line.startswith("note: no depth map is made of a damaged")]) == 6
+    assert maps(farm) == before
+
+
+@needs_native
+def test_an_estimate_goes_on_though_a_photograph_was_damaged_meanwhile(farm, monkeypatch, capsys):
+    """Also the state of photographs that are not estimated yet was made with the damaged one."""
+    words = ["prepare", "depth", str(farm), "estimator:patch-match", "--test-every", "4", "--estimator.passes", "1"]
+    estimate = PatchMatch.estimate
+
+    def interrupted(self, given, wanted):
+        yield next(estimate(self, given, wanted))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PatchMatch, "estimate", interrupted)
+        assert main(words) == 130
+    first = maps(farm)
+    assert "matching photographs  6/6" in capsys.readouterr().err, "the first map comes after most of the work"
+    assert len(first) == 3 and list((farm / "estimated_depths/.work").rglob("*.npy"))
+    damage(farm, 3)
+    assert main(words) == 0
+    assert len(maps(farm)) == 3 * 5 and maps(farm).items() >= first.items()
+
+
 def test_maps_of_others_are_not_overwritten(farm, capsys):
     path = map_path(farm, "view_001.png")
     path.parent.mkdir()
@@ -107,6 +164,12 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     assert np.load(path).shape == (36, 48)
     assert main(["prepare", "depth", str(farm), *SMALL, "--estimator.window", "7"]) == 2
     assert "made with other settings" in capsys.readouterr().err
+    assert main(["prepare", "depth", str(farm), *SMALL, "--scale", "2"]) == 2
+    assert "made of other photographs, or of other sizes; --again" in capsys.readouterr().err
+    record = path.with_name("depth.json")
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"surfkit": "0.0.1"}))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 2
+    assert "made by surfkit 0.0.1; --again" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

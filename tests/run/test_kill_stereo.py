@@ -10,6 +10,7 @@ from forks import started
 from needs import needs_native
 
 from surfkit.cli import main
+from surfkit.cli.recipes import recipes
 from surfkit.readers.made_maps import read_made
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
@@ -29,8 +30,8 @@ def die_at(array):
     os.replace = replaced
 
 
+MATCHED, COMPARED, AGAIN = "matching-photographs", "comparing-depth-maps", "comparing-depth-maps-round-2"
 SETTINGS = "recipe:surface mesh:none --steps 4 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
-SETTINGS += ["--depth.rounds", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -61,22 +62,32 @@ def arrays(folder):
     return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in paths}
 
 
+def unfinished(cache):
+    """How many maps of each round are in the folder for work."""
+    folders = [path for path in cache.rglob(".work/*") if path.is_dir()]
+    return {path.name: count for path in folders if (count := len(list(path.glob("[!.]*.npy"))))}
+
+
 def test_maps_that_are_there_are_not_made_again(farm, tmp_path, own_cache):
+    """It dies in every round: while photographs are matched, and in both comparisons of depth maps."""
     assert main(words(farm, tmp_path / "whole")) == 0
+    assert recipes()["surface"].depth.rounds == 2
     (made,) = (own_cache / "depth").iterdir()
     here = tmp_path / "killed"
     out, cache = here / "run", here / "cache/depth" / made.name
     killed(farm, here, at=5)
-    matched = arrays(cache)
-    assert len(matched) == 4 and all("matching-photographs" in name for name in matched)
+    assert unfinished(cache) == {MATCHED: 4}
     assert list(cache.rglob(".*.part")), "it died while it wrote"
-    killed(farm, here, at=8 + 1)  # eight more before the first map, each of which is three files
-    assert arrays(cache).items() >= matched.items() and len(arrays(cache)) == 12
-    killed(farm, here, at=2 + 3 * 3 + 2)
+    before = arrays(cache)
+    killed(farm, here, at=3 + 3)  # the others are matched, and two are compared
+    assert unfinished(cache) == {MATCHED: 7, COMPARED: 2} and arrays(cache).items() >= before.items()
+    before = arrays(cache)
+    killed(farm, here, at=5 + 4)
+    assert unfinished(cache) == {MATCHED: 7, COMPARED: 7, AGAIN: 3} and arrays(cache).items() >= before.items()
+    killed(farm, here, at=4 + 3 * 3 + 2)  # four more before the first map, each of which is three files
     there, before = arrays(cache), read_made(cache)
     assert before.maps == 3 and not (out / "recipe.json").exists()
-    work = [name for name in there if ".work" in name]
-    assert len(work) == 7 and all("comparing-depth-maps" in name for name in work), "of the others, none is needed"
+    assert unfinished(cache) == {AGAIN: 7}, "of the others, none is needed"
     killed(farm, here, at=-1)
     found, wanted, after = arrays(cache), arrays(made), read_made(cache)
     assert {name: content for name, (_, content) in found.items()} == {n: content for n, (_, content) in wanted.items()}

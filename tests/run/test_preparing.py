@@ -263,6 +263,14 @@ def test_a_damaged_photograph_gets_no_map(farm, recipe, tmp_path, own_cache):
     assert record(tmp_path / "run")["skipped"] == ["view_003.png"]
 
 
+def test_photographs_that_are_all_damaged_are_one_line(farm, recipe, tmp_path, own_cache):
+    for photo in (farm.path / "images").iterdir():
+        photo.write_bytes(photo.read_bytes()[:400])
+    with pytest.raises(BadInput, match="none of the 7 photographs can be read, .*png for one"):
+        run(recipe, farm, tmp_path / "run")
+    assert not maps(own_cache)
+
+
 def test_a_data_set_that_cannot_be_written_to_is_no_matter(farm, recipe, tmp_path, own_cache):
     folders = [farm.path, *(path for path in farm.path.rglob("*") if path.is_dir())]
     for folder in folders:
