@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -163,6 +164,42 @@ def test_files_that_the_page_writes(browser, page):
     browser.press("write path file")
     browser.wait_for(lambda b: any("surfkit render" in t for t in b.texts()))
     assert len(json.loads((out / "path.json").read_text())["camera_path"]) == 300
+
+
+@needs_native
+def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys):
+    needs("cv2")
+    begun = threading.Event()
+
+    def slow(view):
+        begun.set()
+        time.sleep(0.05)
+        return page[1].draw(view)
+
+    with served(Address(), "test") as found:
+        show(replace(page[1], draw=slow), found, tmp_path)
+        browser = Browser(found.url)
+        browser.wait_for(lambda b: any(row.get("label") == "make the video" for row in b.gui.values()))
+        for label, value in (("seconds", 1.0), ("size", "640x360")):
+            browser.set(label, value)
+        for z in (1.0, 2.0):
+            browser.stand(z)
+            browser.press("add this view")
+            browser.wait_for(lambda b, n=int(z): any(f"{n} key views" in t for t in b.texts()))
+        browser.press("make the video")
+        browser.wait_for(lambda b: begun.is_set() and any(row.get("label") == "stop" for row in b.gui.values()))
+        browser.press("stop")
+        text = browser.wait_for(lambda b: next((t for t in b.texts() if "Stopped." in t), None))
+        browser.close()
+    drawn = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
+    assert 0 < len(drawn) < 30
+    words = shlex.split(re.search("`surfkit (.*)`", text)[1])
+    assert main([*words, "--keep-frames", "--device", "cpu"]) == 0
+    assert "30, 1.0 s at 30 per second" in capsys.readouterr().out
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in drawn.items()), (
+        "what is there is not drawn again"
+    )
+    assert (tmp_path / "path-color-640x360.mp4").stat().st_size > 0
 
 
 @needs_native
