@@ -262,7 +262,7 @@ def test_a_mesh_is_shown_in_its_coordinates(tmp_path, name):
     assert "/mesh" in names and "/splats" not in names
     back = subject.frame.to_input(subject.mesh.vertices)
     assert np.allclose(back, SURVEY.to_input(TRIANGLE.vertices), atol=1e-3)
-    assert subject.frame.crs == (None if name.endswith("obj") else "EPSG:32632")
+    assert subject.frame.crs == "EPSG:32632" and subject.frame.metres == 1.0
     assert np.allclose(subject.mesh.colors, 200, atol=1)
 
 
