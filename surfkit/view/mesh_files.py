@@ -67,7 +67,7 @@ def place_of(path: Path, root: dict[str, Any]) -> Place:
         told = read_json(beside, dict[str, Any])
         turn = FROM_Y_UP if str(told.get("up", "")).startswith("y") else np.eye(3)
         return _place(beside, turn, Z_UP, told)
-    if told := _own(root):
+    if told := own_notes(root):
         turn = _rotation(path, root).T
         return _place(path, turn, turn @ Y_UP, told)
     if kind == ".obj":
@@ -102,8 +102,8 @@ def notes_in(text: str) -> dict[str, str]:
     return {key.replace("_", " "): value.strip() for key, value in NOTE.findall(text.replace("\r", ""))}
 
 
-def _own(root: dict[str, Any]) -> dict[str, Any] | None:
-    """What a GLB file of `surfkit texture` says of its coordinates; None for files of others."""
+def own_notes(root: dict[str, Any]) -> dict[str, Any] | None:
+    """What a GLB file of surfkit says of its coordinates; None for files of others."""
     told: Any = root
     for name in ("asset", "extras", "surfkit"):
         told = told.get(name) if isinstance(told, dict) else None

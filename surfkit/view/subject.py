@@ -15,6 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.export.files import read_splat_file
+from surfkit.export.gltf_reader import UPS
 from surfkit.export.models import refuse_unsound
 from surfkit.export.table import SplatTable
 from surfkit.lod.tree import LodTree
@@ -34,7 +35,7 @@ from surfkit.run.method import with_drawing
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.texture.deliver import NAME
 from surfkit.texture.make import RECORD
-from surfkit.view.mesh_files import MESHES, Z_UP, Textured, notes_in, other_mesh, root_of, textured
+from surfkit.view.mesh_files import MESHES, Y_UP, Z_UP, Textured, notes_in, other_mesh, own_notes, root_of, textured
 
 EXTENT = 0.9
 """Share of the positions in a file that lies within the extent of its local frame."""
@@ -175,12 +176,29 @@ def of_splats(path: Path, device: Device) -> Subject:
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
-    frame = frame_of(table.means.double().numpy(), coordinates_of(path))
+    notes, up = splats_place(path)
+    frame = frame_of(table.means.double().numpy(), notes)
     local = table.on_cpu().in_local_frame(frame)
     primitive = primitive_of(local)
     model = SplatModel(primitive, primitive.from_table(local, torch.Generator()), local.sh_degree)
     made = with_drawing(Reconstruction(splats=model), select_rasterizer(device)[0])
-    return Subject(path, frame, Z_UP, splats=local, draw=made.draw)
+    return Subject(path, frame, up, splats=local, draw=made.draw)
+
+
+def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
+    """What a file of splats says of its coordinates, and its (3,) up: z on a map, y in glTF, else -y.
+
+    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it.
+    """
+    notes = coordinates_of(path)
+    if "crs" in notes:
+        return notes, Z_UP
+    root = root_of(path)
+    if not root:
+        return notes, -Y_UP
+    told = own_notes(root) or {}
+    unit = {"metres per unit": told.get("metres_per_unit"), "crs": told.get("crs")}
+    return {name: str(value) for name, value in unit.items() if value}, UPS[told.get("up", "y")].T @ Y_UP
 
 
 def holds_splats(path: Path) -> bool:

@@ -299,6 +299,33 @@ def test_the_offset_of_a_file_of_splats(tmp_path):
         assert np.allclose(subject.frame.to_input(subject.splats.means.numpy()), means.numpy(), atol=1e-3)
 
 
+@pytest.mark.parametrize("on_map", [True, False])
+@pytest.mark.parametrize("name", ["s.ply", "s.glb", "s.spz"])
+def test_what_is_up_in_a_file_of_splats(tmp_path, monkeypatch, name, on_map):
+    """z on a map, as far as the file tells; -y elsewhere, which a user can change."""
+    needs("viser")
+    draw = torch.Generator().manual_seed(0)
+    parts = [torch.randn(9, n, generator=draw) for n in (3, 4, 2, 1, 3)]
+    splats = SplatTable("surfel", parts[0], parts[1], parts[2] - 3, parts[3][:, 0], parts[4], torch.zeros(9, 0, 3))
+    frame = SURVEY if on_map else replace(SURVEY, crs=None, metres=None)
+    path, found = tmp_path / name, []
+    format_for(path).write(path, splats, frame)
+
+    def look(subject, *_):
+        found.append(subject)
+        raise BadInput("enough")
+
+    monkeypatch.setattr("surfkit.cli.view.show", look)
+    told = on_map and not name.endswith("spz")
+    for words, up in (
+        ([], (0, 0, 1) if told else (0, -1, 0)),
+        (["--up", "-x"], (-1, 0, 0)),
+        (["--up", "y"], (0, 1, 0)),
+    ):
+        assert main(["view", str(path), *words, "--no-open", "--device", "cpu"]) == 2
+        assert found[-1].up.tolist() == list(up) and found[-1].frame.crs == ("EPSG:32632" if told else None)
+
+
 def test_what_cannot_be_shown_is_refused(tmp_path, capsys):
     needs("viser")
     (tmp_path / "empty").mkdir()
