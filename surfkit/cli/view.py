@@ -32,7 +32,8 @@ class View:
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
-    """Folder that `surfkit train` made; or a file of splats of any program, a mesh (PLY, GLB, OBJ), or points (PLY)."""
+    """Folder that `surfkit train` made; or a file of splats of any program, a mesh (PLY, GLB, OBJ), or points (PLY,
+    LAS, LAZ)."""
 
     out: Path | None = None
     """Folder for crop boxes and paths. Default: RUN/view, or FILE-view beside the file."""

@@ -35,6 +35,7 @@ from surfkit.run.method import with_drawing
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.texture.deliver import NAME
 from surfkit.texture.make import RECORD
+from surfkit.view.las import CLOUDS, read_las
 from surfkit.view.mesh_files import MESHES, Y_UP, Z_UP, Textured, notes_in, other_mesh, own_notes, root_of, textured
 
 EXTENT = 0.9
@@ -150,6 +151,10 @@ def textured_mesh(out: Path) -> Textured | None:
 
 def of_file(path: Path, device: Device) -> Subject:
     """What a file holds."""
+    if path.suffix.lower() in CLOUDS:
+        xyz, rgb, notes = read_las(path)
+        frame = frame_of(xyz, notes)
+        return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):
         return of_splats(path, device)
     pictures, up = None, Z_UP

@@ -275,6 +275,43 @@ def test_points_are_shown(tmp_path):
     assert np.allclose(subject.frame.to_input(subject.points.xyz)[1], [1, 0, 0], atol=1e-5)
 
 
+def cloud(path, point_format, **colors):
+    """250 points on the map, as another program may write them."""
+    laspy, crs = needs("laspy"), needs("rasterio.crs")
+    needs("lazrs")
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.offsets, header.scales = np.array(ORIGIN), np.full(3, 0.01)
+    known = needs("laspy.vlrs.known")
+    header.vlrs.append(known.WktCoordinateSystemVlr(crs.CRS.from_epsg(32632).to_wkt()))
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = (np.array(ORIGIN) + np.random.default_rng(0).uniform(0, 9, (250, 3))).T
+    for name, values in colors.items():
+        made[name] = np.asarray(values, np.uint16)
+    made.write(path)
+    return np.stack([made.x, made.y, made.z], 1)
+
+
+def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
+    many = cloud(tmp_path / "a.laz", 7, red=np.arange(250) * 257, green=np.full(250, 65535))
+    subject, names = shown_file(tmp_path / "a.laz")
+    assert "/points" in names and (subject.frame.crs, subject.frame.metres) == ("EPSG:32632", 1.0)
+    assert np.allclose(subject.frame.to_input(subject.points.xyz), many, atol=1e-3)
+    assert subject.points.rgb[:, 0].tolist() == list(range(250)) and (subject.points.rgb[:, 1:] == [255, 0]).all()
+    monkeypatch.setattr("surfkit.view.las.MOST", 100)
+    monkeypatch.setattr("surfkit.view.las.AT_ONCE", 64)
+    places = cloud(tmp_path / "b.las", 6)
+    with opened_subject(tmp_path / "b.las", "cpu") as subject:
+        assert np.allclose(subject.frame.to_input(subject.points.xyz), places[::3], atol=1e-3)
+        brightness = subject.points.rgb.astype(int).sum(1)[np.argsort(places[::3, 2])]
+        assert brightness[-5:].mean() > brightness[:5].mean() + 100, "colours of heights"
+    (tmp_path / "short.laz").write_bytes((tmp_path / "a.laz").read_bytes()[:1200])
+    (tmp_path / "other.las").write_text("hello")
+    for name in ("short.laz", "other.las"):
+        assert main(["view", str(tmp_path / name), "--no-open"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"{name}: cannot be read" in error
+
+
 @needs_native
 @pytest.mark.parametrize("name", ["s.ply", "s.compressed.ply", "s.spz", "s.splat", "s.sog", "s.glb", "s.surfkit"])
 def test_splats_of_any_format_are_shown(tmp_path, run, name):
