@@ -53,7 +53,7 @@ class FilmTool:
             closing: Set when the server ends.
         """
         self.shelf, self.save, self.closing = shelf, save, closing
-        self.stopping, self.thread, self.told_at = threading.Event(), None, 0.0
+        self.stopping, self.running, self.told_at = threading.Event(), False, 0.0
         gui = client.gui
         with folder:
             self.size = gui.add_dropdown("size", SIZES)
@@ -65,37 +65,46 @@ class FilmTool:
 
     def _clicked(self) -> None:
         """Begin, or stop."""
-        if self.thread is not None and self.thread.is_alive():
+        if self.running:
             self.stopping.set()
             return
         require_video()
         path = self.save()
         show: Show = self.show.value
         self.stopping.clear()
+        self.running = True
         self.told.content, self.bar.value = "begins", 0.0
         self.button.label, self.bar.visible, self.told.visible = "stop", True, True
-        self.thread = threading.Thread(target=self._run, args=(path, self.size.value, show), name="video")
-        self.thread.start()
+        threading.Thread(target=self._run, args=(path, self.size.value, show), name="video").start()
 
     def _run(self, path: Path, size: str, show: Show) -> None:
         """Make the video beside the file of its path; whatever fails is said on the page."""
-        video, source = path.with_name(f"{path.stem}-{show}-{size}.mp4"), self.shelf.subject.path
+        video, said = path.with_name(f"{path.stem}-{show}-{size}.mp4"), ""
         try:
             self._make(path, video, size, show)
             said = f"`{video}` is written."
             say(f"{video} is written")  # its browser may have gone
         except Stopped:
-            again = "*make the video* goes on"
-            if source.is_dir():
-                words = [str(source), "--path", str(path), "--size", size, "--show", show, "--out", str(video)]
-                again += f", and so does\n\n`surfkit render {shlex.join(words)}`"
-            said = f"Stopped. The pictures so far are kept in `{frames_of(video)}`; {again}"
+            kept, command = (
+                f"the pictures so far are kept in {frames_of(video)}",
+                self._command(path, video, size, show),
+            )
+            said = f"Stopped; {kept}. *make the video* goes on" + (f", and so does\n\n`{command}`" if command else ".")
+            if self.closing.is_set():
+                say(f"{video} is not finished; {kept}" + (f"; it goes on with {command}" if command else ""))
         except BadInput as error:
             said = str(error)
         except Exception as error:
             said = " ".join(f"{type(error).__name__}: {error}".split())
+        self.running = False
         if not self.closing.is_set():
             self.button.label, self.bar.visible, self.told.content = "make the video", False, said
+
+    def _command(self, path: Path, video: Path, size: str, show: Show) -> str:
+        """That makes the same video, of a run; nothing for a file."""
+        source = self.shelf.subject.path
+        words = ["surfkit", "render", str(source), "--path", str(path), "--size", size, "--show", show]
+        return shlex.join([*words, "--out", str(video)]) if source.is_dir() else ""
 
     def _make(self, path: Path, video: Path, size: str, show: Show) -> None:
         """Make it; `surfkit render` with the same path, size and file goes on where this was stopped."""

@@ -90,14 +90,15 @@ def test_it_stops_and_goes_on(tmp_path):
         browser.press("stop")
         time.sleep(0.3)  # for the click to come; the frame that is drawn comes to its end
         drawing.go_on.set()
-        browser.wait_for(lambda b: any("Stopped." in t and "goes on" in t and "surfkit" not in t for t in b.texts()))
+        browser.wait_for(lambda b: any("Stopped;" in t and "goes on." in t and "surfkit" not in t for t in b.texts()))
         out = tmp_path / "out"
         assert len(list((out / "path-color-640x360.mp4.frames").glob("*.png"))) == 4
         browser.press("make the video")
         browser.wait_for(lambda b: any("is written" in t for t in b.texts()), 60)
         assert len(drawing.heights) == FRAMES, "each frame is drawn once"
         assert len(frames_of(out / "path-color-640x360.mp4")) == FRAMES
-        browser.press("remove last")
+        browser.set("key views", "remove last")
+        browser.wait_for(lambda b: "1 key views" in b.texts())
         browser.press("make the video")
         browser.wait_for(lambda b: any("two key views" in str(row) for row in b.told))
         assert sorted(path.suffix for path in out.iterdir()) == [".json", ".mp4"]
@@ -115,7 +116,8 @@ def test_the_server_ends_meanwhile(tmp_path, capsys):
         assert time.monotonic() < until
         time.sleep(0.05)
     assert len(drawing.heights) == 3 and not list((tmp_path / "out").glob("*.mp4"))
-    assert not capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "mp4 is not finished; the pictures so far are kept in" in said
 
 
 def test_what_goes_wrong_is_said_on_the_page(tmp_path):

@@ -189,7 +189,7 @@ def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys)
         browser.press("make the video")
         browser.wait_for(lambda b: begun.is_set() and any(row.get("label") == "stop" for row in b.gui.values()))
         browser.press("stop")
-        text = browser.wait_for(lambda b: next((t for t in b.texts() if "Stopped." in t), None))
+        text = browser.wait_for(lambda b: next((t for t in b.texts() if "Stopped;" in t), None))
         browser.close()
     drawn = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
     assert 0 < len(drawn) < 30
