@@ -143,10 +143,16 @@ def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
 
 
 def textured_mesh(out: Path) -> Textured | None:
-    """What `surfkit texture` has made of the mesh of the run in a folder; None where it has not."""
+    """What `surfkit texture` has made of the mesh of the run in a folder; None where it has not, or it is damaged."""
     folder = out / "texture"
     path = folder / f"{NAME}.glb"
-    return textured(path, root_of(path)) if path.exists() and (folder / RECORD).exists() else None
+    if not (path.exists() and (folder / RECORD).exists()):
+        return None
+    try:
+        return textured(path, root_of(path))
+    except BadInput as error:  # the rest of the run can be looked at
+        emit(Warned(f"the mesh is shown without its pictures: {error}"))
+        return None
 
 
 def of_file(path: Path, device: Device) -> Subject:

@@ -70,6 +70,10 @@ def test_the_offset_of_an_obj_file(tmp_path):
         places = subject.frame.to_input(subject.mesh.vertices)
         assert subject.frame.crs == "EPSG:32632" and subject.frame.metres == 1.0 and subject.textured is None
     assert np.allclose(np.sort(places, axis=0), np.sort(UTM.to_input(CORNERS), axis=0), atol=1e-4)
+    text = path.read_text()
+    path.write_text(f"# offset: none\n{text}")
+    with opened_subject(path, "cpu") as subject:
+        assert subject.frame.crs is None, "comments of others say nothing"
 
 
 def test_y_is_up_in_files_of_others(tmp_path):
@@ -88,6 +92,8 @@ def test_the_texture_of_a_run(tmp_path):
     (tmp_path / "texture" / "texture.json").write_text("{}")
     found = textured_mesh(tmp_path)
     assert found.path.name == "textured.glb" and found.place.offset.tolist() == [492_000, 5_260_000, 0]
+    found.path.write_bytes(found.path.read_bytes()[:300])
+    assert textured_mesh(tmp_path) is None, "the run can be looked at"
 
 
 @pytest.mark.parametrize("shift", [("a", 0, 0), (0, 0), (float("inf"), 0, 0)])
