@@ -142,7 +142,7 @@ def test_a_click_on_the_surface_measures(browser, page):
     table = browser.wait_for(lambda b: next((t for t in b.texts() if "area from above" in t), None))
     values = [float(v.replace(",", "")) for v in re.findall(r"\| (-?[\d,.]+) ", table)]
     assert np.allclose(values, [0.7 * unit, 0.7 * unit, 0.0, 0.06 * unit**2, 0.06 * unit**2], rtol=1e-2, atol=1e-2)
-    assert sum(name.startswith("/measure/label") for name in browser.names()) == 2
+    browser.wait_for(lambda b: sum(name.startswith("/measure/label") for name in b.names()) == 2)  # after the table
     browser.set("measure", False)
     browser.wait_for(lambda b: not any(name.startswith("/measure/") for name in b.names()))
 
