@@ -46,6 +46,10 @@ class Browser:
     def part(self, label):
         return next(uuid for uuid, row in self.gui.items() if row.get("label") == label)
 
+    def is_whole(self):
+        """Whether the page of `surfkit view` is built: it asks for clicks at last."""
+        return any(row["type"] == "ScenePointerEnableMessage" for row in self.told)
+
     def texts(self):
         """Of all parts of the panel."""
         return [row["_markdown"] for row in self.gui.values() if row.get("_markdown")]

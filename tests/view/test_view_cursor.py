@@ -54,7 +54,7 @@ def page(tmp_path_factory):
 @contextmanager
 def connected(page):
     found = Browser(page.url)
-    found.wait_for(lambda b: any(row["type"] == "ScenePointerEnableMessage" for row in b.told))
+    found.wait_for(Browser.is_whole)
     if not page.script.missing:  # the page is there as soon as its client is known
         found.wait_for(lambda b: ask(page, client=tag(b)[0])[0] != 404)
     yield found

@@ -46,7 +46,7 @@ def path_on_page(drawing, folder):
     with served(Address(), "test") as page:
         show(subject, page, folder / "out")
         browser = Browser(page.url)
-        browser.wait_for(lambda b: any(row.get("label") == "make the video" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         browser.set("frames a second", 10)
         browser.set("seconds", FRAMES / 10)
         browser.set("size", "640x360")

@@ -70,7 +70,7 @@ def page(run, tmp_path_factory):
 def browser(page):
     found = Browser(page[0].url)
     found.wait_for(lambda b: any("first" in t or "Click on the surface" in t for t in b.texts()))
-    found.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    found.wait_for(Browser.is_whole)
     yield found
     found.close()
 
@@ -179,7 +179,7 @@ def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys)
     with served(Address(), "test") as found:
         show(replace(page[1], draw=slow), found, tmp_path)
         browser = Browser(found.url)
-        browser.wait_for(lambda b: any(row.get("label") == "make the video" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         for label, value in (("seconds", 1.0), ("size", "640x360")):
             browser.set(label, value)
         for z in (1.0, 2.0):
@@ -206,7 +206,7 @@ def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys)
 def test_two_browsers_at_once(page, browser):
     other = Browser(page[0].url)
     other.wait_for(lambda b: "/splats" in b.names())
-    other.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    other.wait_for(Browser.is_whole)
     other.set("measure", True)
     other.set("mesh", True)
     other.wait_for(lambda b: {"/mesh", "/measure"} <= set(b.names()))
@@ -232,7 +232,7 @@ def test_blocks(page, tmp_path):
     with served(Address(), "test") as found:
         show(with_plan, found, tmp_path)
         browser = Browser(found.url)
-        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         browser.set("blocks", True)
         browser.wait_for(lambda b: {"/blocks/lines", "/blocks/1"} <= set(b.names()))
         assert browser.names()["/blocks/0"]["text"] == "block 0: 2 views"
@@ -247,7 +247,7 @@ def shown_file(path):
     with opened_subject(path, "cpu") as subject, served(Address(), "test") as found:
         show(subject, found, path.parent / "out")
         browser = Browser(found.url)
-        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         browser.wait_for(lambda b: {"/splats", "/mesh", "/points"} & set(b.names()))
         names = set(browser.names())
         browser.close()
@@ -414,7 +414,7 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     url = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", "".join(lines))[0]
     browser = Browser(url)
     browser.wait_for(lambda b: "/mesh" in b.names())
-    browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    browser.wait_for(Browser.is_whole)
     browser.set("seconds", 1000.0)
     for label in ("add this view", "add this view", "preview"):
         browser.press(label)
