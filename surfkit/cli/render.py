@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +15,9 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
-from surfkit.render.frames import Show, draw_frames
+from surfkit.render.frames import Show, draw_frames, identity
 from surfkit.render.path import LONGEST, MOST_FRAMES, Flight, flyover, from_file, lens_of, orbit
-from surfkit.render.video import is_video, require_video, write_video
+from surfkit.render.video import Film, is_video, make_video, require_video
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene
@@ -104,27 +102,25 @@ class Render:
         out = self.out or self.run_folder / f"{name}.mp4"
         film = is_video(out)
         if film:
-            require_video()  # before hours are spent
-        folder = out.with_name(f"{out.name}.frames") if film else out
+            require_video()  # before anything is read
         with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
             draw = (made.draw_color if self.show == "color" else None) or made.draw
             if draw is None:
                 raise BadInput(f"{ctx.run.out}: what its method has made draws no pictures")
             flight = self.flight(ctx.scene)
             fps = self.fps or flight.fps or FPS
-            with locked(folder), full_disk_in_one_line(folder):
-                model = identity(self.run_folder, self.compressed)
-                frames = draw_frames(folder, flight.cameras, draw, self.show, model, replace=film)
-                if film:
-                    write_video(out, frames, fps)
-                    if not self.keep_frames:
-                        shutil.rmtree(folder)
-        lens = flight.cameras[0]
+            model = identity(self.run_folder, self.compressed)
+            if film:
+                make_video(out, Film(flight.cameras, draw, self.show, model, fps), self.keep_frames)
+            else:
+                with locked(out), full_disk_in_one_line(out):
+                    draw_frames(out, flight.cameras, draw, self.show, model)
+        lens, count = flight.cameras[0], len(flight.cameras)
         print_table(
             ("render", "value"),
             [
                 ("path", self.path),
-                ("frames", f"{len(frames)}, {len(frames) / fps:.1f} s at {fps:g} per second"),
+                ("frames", f"{count}, {count / fps:.1f} s at {fps:g} per second"),
                 ("size", f"{lens.width} x {lens.height}"),
                 ("video" if film else "pictures", str(out)),
             ],
@@ -135,19 +131,7 @@ class Render:
         lens = lens_of(scene, self.sides())
         if self.path in MADE:
             return MADE[self.path](scene, lens, self.frames)
-        return from_file(Path(self.path), scene, lens, self.frames)
-
-
-def identity(run: Path, compressed: bool) -> str:
-    """A text that differs between models of run folders: of the files that describe them, and of what they hold."""
-    model = "compressed/model.surfkit" if compressed else "point_cloud.ply"
-    found = hashlib.sha256()
-    for name in ("recipe.json", "run.json", "result/result.json", model):
-        path = run / name
-        if path.exists():
-            facts = path.stat()
-            found.update(f"{name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
-    return found.hexdigest()
+        return from_file(Path(self.path), scene.frame, lens, self.frames)
 
 
 COMMAND = Render

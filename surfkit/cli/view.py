@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from surfkit.core.check import BadInput
@@ -16,6 +17,7 @@ from surfkit.view.server import LOCAL, Address, refuse_wrong_port, require_viser
 from surfkit.view.shelf import MOST, Form
 from surfkit.view.subject import opened_subject
 
+Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 AWAKE_S = 0.2
 """The main thread looks this often for a Ctrl-C that the system handed to another thread, which does not wake it."""
 
@@ -30,7 +32,8 @@ class View:
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|FILE")]
-    """Folder that `surfkit train` made; or a file of splats of any program, a mesh (PLY, GLB, OBJ), or points (PLY)."""
+    """Folder that `surfkit train` made; or a file of splats of any program, a mesh (PLY, GLB, OBJ), or points (PLY,
+    LAS, LAZ)."""
 
     out: Path | None = None
     """Folder for crop boxes and paths. Default: RUN/view, or FILE-view beside the file."""
@@ -41,6 +44,10 @@ class View:
     draw: Form = "splats"
     """How splats are drawn at first. Points are for machines without a graphics card; with points-while-moving, splats
     come back when the camera rests."""
+
+    up: Up | None = None
+    """Axis of the data set that points up. Default: what a run or a file tells; -y in a file of splats that tells
+    nothing."""
 
     host: str = LOCAL
     """Address to serve at. 0.0.0.0 lets other machines connect, if they have the token; nothing is encrypted."""
@@ -73,6 +80,9 @@ class View:
         require_viser()
         address = Address(self.host, self.port)
         with collect_notes(), opened_subject(self.source, self.device) as subject:
+            if self.up is not None:
+                direction = np.eye(3)["xyz".index(self.up[-1])]
+                subject = replace(subject, up=-direction if self.up.startswith("-") else direction)
             with served(address, f"surfkit: {self.source.resolve().name}") as page:
                 show(subject, page, self.folder, self.most, self.draw)
                 print(f"{self.source} is shown at\n\n    {page.url}\n\nCtrl-C ends it.", flush=True)

@@ -107,7 +107,9 @@ def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, floa
                 values = read_heights(file, window)
                 yield values[np.isfinite(values)]
 
-        most = max(float(np.abs(values).max(initial=0)) for values in differences()) or 1.0
+        most = max(float(np.abs(values).max(initial=0)) for values in differences())
+        if not most:
+            return 0.0, 0.0, 0.0
         signed, absolute = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
         for values in differences():
             signed += np.histogram(values, BINS, (-most, most))[0]

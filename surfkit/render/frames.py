@@ -27,9 +27,23 @@ RECORD = "frames.json"
 WRITTEN_AHEAD = 4
 """Pictures that are compressed while the next ones are drawn."""
 
+Tell = Callable[[str, int, int], None]
+"""Told what is done, how much of it, and of how much; what it raises ends the work."""
+
+
+def tell_all(what: str, done: int, total: int) -> None:
+    """Tell whoever listens to events."""
+    emit(Progress(what, done, total))
+
 
 def draw_frames(
-    folder: Path, cameras: Sequence[Camera], draw: Callable[[View], Maps], show: Show, of: str, replace: bool = False
+    folder: Path,
+    cameras: Sequence[Camera],
+    draw: Callable[[View], Maps],
+    show: Show,
+    of: str,
+    replace: bool = False,
+    tell: Tell = tell_all,
 ) -> list[Path]:
     """Draw every frame into a folder, and return their paths in order.
 
@@ -42,6 +56,7 @@ def draw_frames(
         show: Which of them; depths have the colours of the middle frame in all frames.
         of: What is drawn: a different text means different pictures.
         replace: Delete frames of anything else that the folder has; else they are an error.
+        tell: Who is told after each frame.
 
     Raises:
         BadInput: The folder has other files.
@@ -59,7 +74,7 @@ def draw_frames(
             waiting.append(writers.submit(write_picture, paths[at], picture))
             while len(waiting) >= WRITTEN_AHEAD:
                 waiting.popleft().result()
-            emit(Progress("drawing frames", done, len(paths)))
+            tell("drawing frames", done, len(paths))
         for each in waiting:
             each.result()
     return paths
@@ -82,6 +97,18 @@ def claim(folder: Path, shows: str, replace: bool) -> None:
     elif any(path.name != LOCK for path in folder.iterdir()):
         raise BadInput(f"{folder}: it has files but no {RECORD}, so frames are not written into it; give another --out")
     write_json(record, {"shows": shows})
+
+
+def identity(path: Path, compressed: bool = False) -> str:
+    """A text that differs between models: of the files that describe a run, and of what they hold; or of one file."""
+    model = "compressed/model.surfkit" if compressed else "point_cloud.ply"
+    found = hashlib.sha256()
+    for name in ("recipe.json", "run.json", "result/result.json", model) if path.is_dir() else ("",):
+        file = path / name
+        if file.exists():
+            facts = file.stat()
+            found.update(f"{name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    return found.hexdigest()
 
 
 def digest(cameras: Sequence[Camera], show: Show, of: str) -> str:

@@ -111,7 +111,7 @@ def through(keys: Sequence[Camera], lens: Camera, count: int) -> Flight:
     return Flight([posed(lens, place, turn.T) for place, turn in zip(positions, directions, strict=True)])
 
 
-def from_file(path: Path, scene: Scene, lens: Camera, count: int) -> Flight:
+def from_file(path: Path, frame: Frame, lens: Camera, count: int) -> Flight:
     """The cameras of a JSON file, in the frame of the data set.
 
     That of 3DGS viewers, as RUN/cameras.json, has cameras to fly through; a camera path of nerfstudio has one camera
@@ -127,10 +127,10 @@ def from_file(path: Path, scene: Scene, lens: Camera, count: int) -> Flight:
             raise BadInput(f"{path}: it has {len(frames)} cameras; at most {MOST_FRAMES} frames are rendered")
         rate = data.get("fps")
         known = isinstance(rate, (int, float)) and 0 < rate <= 1000
-        found = [_of_nerfstudio(each, f"{path}: camera {at}", lens, scene.frame) for at, each in enumerate(frames)]
+        found = [_of_nerfstudio(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(frames)]
         return Flight(found, float(rate) if known else None)
     if isinstance(data, list) and data:
-        keys = [_of_viewer(each, f"{path}: camera {at}", lens, scene.frame) for at, each in enumerate(data)]
+        keys = [_of_viewer(each, f"{path}: camera {at}", lens, frame) for at, each in enumerate(data)]
         return through(keys, lens, count)
     raise BadInput(
         f"{path}: no cameras in it; give a list of cameras as in RUN/cameras.json, or a camera path of nerfstudio "

@@ -9,9 +9,10 @@ import numpy as np
 from surfkit.mesh.base import Mesh
 from surfkit.view.display import PALETTE, some
 from surfkit.view.glb import unlit_glb
+from surfkit.view.mesh_files import Textured
 from surfkit.view.outlines import block_outlines
 from surfkit.view.picking import corners_of
-from surfkit.view.screen import WORLD, Latest, telling
+from surfkit.view.screen import WORLD, Latest, quaternion_of, telling
 from surfkit.view.shelf import Shelf
 from surfkit.view.splat_layer import SplatLayer, add_budget, add_points
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
+SENT = 64_000_000
+"""Bytes of pictures and triangles up to which a browser is sent them without being asked."""
 MOST_LABELS = 400
 """Blocks that get a label."""
 
@@ -58,36 +61,54 @@ class Layers:
         count = len(mesh.faces)
         shown = gui.add_checkbox("mesh", self.shows_mesh)
         budget = add_budget(gui, "most triangles", count, self.shelf.most)
-        plain = gui.add_checkbox("mesh in grey", mesh.colors is None, disabled=mesh.colors is None)
+        textured, bare = self.subject.textured, mesh.colors is None and self.subject.textured is None
+        sent = textured is not None and textured.path.stat().st_size <= SENT
+        pictures = gui.add_checkbox("mesh with pictures", sent)
+        plain = gui.add_checkbox("mesh in grey", bare, disabled=bare)
         note = gui.add_markdown("")
 
         def draw() -> None:
             self.shows_mesh = shown.value
-            for part in (budget, plain, note):
-                part.visible = shown.value
+            whole = textured is not None and pictures.value and not plain.value
+            for part, sensible in ((budget, not whole), (pictures, textured is not None), (plain, True), (note, True)):
+                part.visible = shown.value and sensible
             if not shown.value:
                 self.client.scene.remove_by_name("/mesh")
-                return
-            found = self.shelf.mesh(budget.value)
-            self._add_mesh(found, plain.value)
-            note.content = (
-                f"all {count:,} triangles are shown"
-                if len(found.faces) == count
-                else f"{len(found.faces):,} triangles stand for {count:,}; clicks meet all"
-            )
+            elif whole:
+                note.content = self._add_textured(textured)
+            else:
+                note.content = self._add_mesh(self.shelf.mesh(budget.value), count, plain.value)
 
         draw()
-        for switch in (shown, plain):
+        for switch in (shown, pictures, plain):
             switch.on_update(telling(self.client, lambda _: draw()))
         budget.on_update(telling(self.client, Latest(draw)))
 
-    def _add_mesh(self, mesh: Mesh, plain: bool) -> None:
+    def _add_mesh(self, mesh: Mesh, count: int, plain: bool) -> str:
+        """Triangles that stand for `count`; which they are, in words."""
         if plain or mesh.colors is None:
             self.client.scene.add_mesh_simple(
                 "/mesh", mesh.vertices, mesh.faces, color=(190, 190, 190), side="double", scale=WORLD
             )
-            return
-        self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
+        else:
+            self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
+        if len(mesh.faces) == count:
+            return f"all {count:,} triangles are shown"
+        return f"{len(mesh.faces):,} triangles stand for {count:,}; clicks meet all"
+
+    def _add_textured(self, textured: Textured) -> str:
+        """A file as it is, in its place; which it is, in words."""
+        frame, place, data = self.subject.frame, textured.place, textured.path.read_bytes()
+        self.client.scene.add_glb(
+            "/mesh",
+            data,
+            scale=WORLD * frame.scale,
+            wxyz=quaternion_of(place.turn.T),
+            position=WORLD * frame.to_local(place.offset),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        return f"{textured.path.name} is shown, {len(data) / 1e6:.1f} MB"
 
     def _point_switches(self, gui: viser.GuiApi) -> None:
         points = self.subject.points

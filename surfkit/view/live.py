@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.train.watch import Watched, watched_by
 from surfkit.view.control import Control
-from surfkit.view.live_page import LivePage, Surroundings
+from surfkit.view.cursor import Cursor, serve_cursors
+from surfkit.view.live_page import WITHOUT, LivePage, Surroundings
 from surfkit.view.live_panel import LivePanel
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, Served, served
@@ -56,6 +58,7 @@ class Live:
         self.wake = threading.Event()
         self.failed: set[str] = set()
         self.panel = LivePanel(page.viser.gui, self.control)
+        serve_cursors(page.script, self._cursor_of, WITHOUT)
         page.viser.on_client_connect(self._connected)
         page.viser.on_client_disconnect(lambda client: self.pages.pop(client.client_id, None))
         actions = {"pictures": self._draw_pictures, "panel": self._tell}
@@ -77,8 +80,11 @@ class Live:
         for thread in self.threads:
             thread.join(CLOSE_S)
 
+    def _cursor_of(self, client_id: int) -> Cursor | None:
+        return page.cursor if (page := self.pages.get(client_id)) is not None else None
+
     def _connected(self, client: viser.ClientHandle) -> None:
-        page = LivePage(self.control, client, self.wake)
+        page = LivePage(self.control, client, self.wake, script=not self.page.script.missing)
         if self.around is not None:
             page.enter(self.around)
         self.pages[client.client_id] = page
@@ -90,11 +96,11 @@ class Live:
         while not self.page.closing.is_set():
             now, stage, pages = time.monotonic(), self.control.stage, list(self.pages.values())
             if pages and stage is not None:
-                self._carefully("pictures", lambda stage=stage: self._enter(stage))
+                self._carefully("cameras", partial(self._enter, stage), partial(self.panel.tell_failed, "cameras"))
             due = [page for page in pages if page.wants(now)] if stage is not None else []
             if due and (now >= free or self.control.paused):
                 page, spent = min(due, key=lambda page: page.drawn), self.control.spent
-                self._carefully("pictures", page.draw)
+                self._carefully("pictures", page.draw, page.tell_failed)
                 took = self.control.spent - spent + time.perf_counter() - page.received  # not the wait for the step
                 free = time.monotonic() + rest(took, self.share)
                 continue
@@ -118,19 +124,21 @@ class Live:
     def _tell(self) -> None:
         while not self.page.closing.wait(TELL_S):
             if self.pages:
-                self._carefully("panel", lambda: self.panel.show(self.out))
+                self._carefully("panel", partial(self.panel.show, self.out), partial(self.panel.tell_failed, "panel"))
 
-    def _carefully(self, what: str, action: Callable[[], None]) -> None:
-        """Do it; what fails is told once, and costs no more than this part of the page."""
+    def _carefully(self, what: str, action: Callable[[], None], tell: Callable[[str], None]) -> None:
+        """Do it, and tell the page what has failed, or nothing; the terminal is told once, and the training goes on."""
+        said = ""
         try:
             action()
-        except BadInput:  # the page says it
-            pass
+        except BadInput as error:
+            said = str(error)
         except Exception as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())
             if what not in self.failed:
                 self.failed.add(what)
-                said = " ".join(f"{type(error).__name__}: {error}".split())
                 say(f"surfkit: {WHAT}: {what}: {said}; the training goes on")
+        tell(said)
 
 
 def rest(seconds: float, share: float) -> float:

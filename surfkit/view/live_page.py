@@ -18,9 +18,12 @@ from surfkit.render.path import beside, middle_of, up_of
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Scene, View
 from surfkit.view.control import Control
+from surfkit.view.cursor import Cursor
 from surfkit.view.layers import TRAINED, frustum_lines, typical_size
+from surfkit.view.measure import coordinates
+from surfkit.view.on_page import OnPage, framed, window_of
 from surfkit.view.photographs import TURNING
-from surfkit.view.picking import corners_of, hit_camera
+from surfkit.view.picking import corners_of, hit_camera, surface_depth
 from surfkit.view.pictures import picture
 from surfkit.view.screen import WORLD, pose_of, ray_of, stand_at, telling, whole_view
 
@@ -35,8 +38,7 @@ LEAST, MOST, USUAL, STEP = 160, 1600, 640, 80
 REFRESH_S = 2.0
 """Between two pictures from the same place: only the training has changed them."""
 JPEG_QUALITY = 85
-GREY = 128
-"""Beside pictures that are not as wide as the window."""
+WITHOUT = "no coordinates are shown"
 
 
 @dataclass(frozen=True)
@@ -81,16 +83,26 @@ class LivePage:
         around: The scene; None before it is known.
         drawn: When the last picture was done, seconds of `time.monotonic`.
         received: When the training had drawn it, or had been asked in vain, seconds of `time.perf_counter`.
+        shown: The picture, if its depths are known.
     """
 
-    def __init__(self, control: Control, client: viser.ClientHandle, wake: threading.Event) -> None:
-        """Build the panel; `wake` is set when a picture is wanted."""
+    def __init__(self, control: Control, client: viser.ClientHandle, wake: threading.Event, script: bool) -> None:
+        """Build the panel.
+
+        Args:
+            control: Draws.
+            client: The browser.
+            wake: Set when a picture is wanted.
+            script: Whether the page can tell where the pointer is.
+        """
         self.control, self.client, self.wake = control, client, wake
+        self.shown: OnPage | None = None
         self.around: Surroundings | None = None
         self.dirty, self.index, self.drawn, self.received = True, -1, 0.0, 0.0
         self.photo: tuple[tuple[str, int], np.ndarray] | None = None
         gui = client.gui
-        with gui.add_folder("Live picture", order=2):
+        folder = gui.add_folder("Live picture", order=2)
+        with folder:
             self.kind = gui.add_dropdown("show", get_args(Kind))
             self.place = gui.add_dropdown("from", get_args(Place))
             self.number = gui.add_number("camera", 1, min=1, max=1, step=1)
@@ -98,6 +110,9 @@ class LivePage:
             self.cameras = gui.add_checkbox("cameras", False, hint="Click on one to see it beside its photograph.")
             self.longest = gui.add_slider("pixels", LEAST, MOST, STEP, USUAL)
             self.told = gui.add_markdown("")
+        self.cursor = Cursor(client, folder, self._under) if script else None
+        if self.cursor is not None:
+            self.cursor.on.on_update(telling(client, lambda _: self._ask()))
         for switch in (self.kind, self.place, self.longest):
             switch.on_update(telling(client, lambda _: self._changed()))
         self.number.on_update(telling(client, self._numbered))
@@ -108,7 +123,7 @@ class LivePage:
 
     def enter(self, around: Surroundings) -> None:
         """Show another scene; the first one is looked at from where all of it is seen."""
-        first, self.around, self.photo = self.around is None, around, None
+        first, self.around, self.photo, self.shown = self.around is None, around, None, None
         self.number.max = len(around.views)
         self.number.value = min(int(self.number.value), len(around.views))
         if first:
@@ -133,30 +148,44 @@ class LivePage:
         self.dirty, self.index, self.received = False, self.control.index, time.perf_counter()
         try:
             self._draw()
-        except BadInput as error:
-            self.told.content = str(error)
-            raise
-        except Exception as error:
-            self.told.content = f"no picture: {' '.join(f'{type(error).__name__}: {error}'.split())}"
-            raise
         finally:
             self.drawn = time.monotonic()
+
+    def tell_failed(self, said: str) -> None:
+        """Show why there is no picture; nothing when there is one."""
+        if said:
+            self.told.content = f"no picture: {said}"
 
     def _draw(self) -> None:
         around, kind = self.around, self.kind.value
         chosen = self._chosen if self.place.value == THERE else None
         camera = self._camera() if chosen is None else chosen.camera.fitted(int(self.longest.value))
         view = replace(chosen, camera=camera) if chosen is not None else view_of(camera)
+        following = self.cursor is not None and self.cursor.on.value
         try:
-            drawing = self.control.draw(view, kind != "render")
+            drawing = self.control.draw(view, kind != "render" or following)
         finally:
             self.received = time.perf_counter()
         image, told = picture(view, kind, lambda _: drawing.maps, around.scene.frame)
+        images, window = [image], image.shape[:2]
         if chosen is not None:
-            image, told = self._beside_photograph(view, image, told)
-        self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
+            images, told = self._beside_photograph(view, image, told)
+            window = window_of((image.shape[0], len(images) * image.shape[1]), self.client.camera.aspect)
+        self.client.scene.set_background_image(framed(images, window), format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.index = drawing.index
         self.told.content = f"After step {drawing.index:,}: {told}"
+        depth = surface_depth(drawing.maps) if following else None
+        self.shown = None if depth is None else OnPage(view.camera, depth.numpy(), len(images), window)
+        if self.cursor is not None:
+            self.cursor.changed()
+
+    def _under(self, x: float, y: float) -> str:
+        """Coordinates of what the picture shows under the pointer; see `cursor.Say`."""
+        shown, around = self.shown, self.around
+        if shown is None or around is None:
+            return ""
+        place = shown.place(0.5 + x / (2 * self.client.camera.aspect), 0.5 + y / 2)
+        return "" if place is None else coordinates(place, around.scene.frame, around.first[0])
 
     @property
     def _chosen(self) -> View:
@@ -170,16 +199,16 @@ class LivePage:
         focal = height / 2 / math.tan(at.fov / 2)
         return Camera(torch.from_numpy(pose_of(at)), focal, focal, width / 2, height / 2, width, height)
 
-    def _beside_photograph(self, view: View, image: np.ndarray, told: str) -> tuple[np.ndarray, str]:
-        """The photograph at the left of a picture of its camera, in the shape of the window."""
-        key, aspect = (view.name, view.camera.width), self.client.camera.aspect
+    def _beside_photograph(self, view: View, image: np.ndarray, told: str) -> tuple[list[np.ndarray], str]:
+        """The photograph, and a picture of its camera."""
+        key = view.name, view.camera.width
         if self.photo is None or self.photo[0] != key:
             try:
                 self.photo = key, picture(view, "photograph", None, self.around.scene.frame)[0]
             except BadInput as error:
-                return framed([image], aspect), f"{error}. {told}"
+                return [image], f"{error}. {told}"
         held = " (held out)" if view.name in self.around.held_out else ""
-        return framed([self.photo[1], image], aspect), f"**{view.name}**{held} beside the picture; {told}"
+        return [self.photo[1], image], f"**{view.name}**{held} beside the picture; {told}"
 
     def _changed(self) -> None:
         self._draw_cameras()
@@ -229,14 +258,3 @@ class LivePage:
             return
         lines = frustum_lines(*corners_of([view.camera for view in self.around.views], self.around.size))
         self.client.scene.add_line_segments("/cameras", lines * WORLD, TRAINED, thickness=1.5, thickness_units="screen")
-
-
-def framed(images: list[np.ndarray], aspect: float) -> np.ndarray:
-    """(H, W, 3) uint8: pictures of one height side by side, with grey about them so that W / H is the `aspect`."""
-    row = np.concatenate(images, axis=1)
-    height, width = row.shape[:2]
-    tall, wide = max(height, round(width / aspect)), max(width, round(height * aspect))
-    whole = np.full((tall, wide, 3), GREY, np.uint8)
-    top, left = (tall - height) // 2, (wide - width) // 2
-    whole[top : top + height, left : left + width] = row
-    return whole

@@ -44,7 +44,9 @@ class LivePanel:
         self.picture_path: Path | None = None
         gui.configure_theme(show_share_button=False, show_logo=False)
         gui.main_panel.dock_right()
+        self.failed: dict[str, str] = {}
         self.status = gui.add_markdown("The run begins.", order=0)
+        self.failures = gui.add_markdown("", visible=False, order=0.5)
         self.button = gui.add_button("pause", visible=False, order=1)
         self.button.on_click(lambda _: self._toggle())
         self.of = gui.add_dropdown("curves of", (NEWEST,), order=3)  # 2: the live picture, of each browser
@@ -73,6 +75,13 @@ class LivePanel:
             self._draw_curves(chosen)
         set_if_other(self.status, "content", in_words(self.followers[now].history, stage, running, self.control))
         self._show_written(out)
+
+    def tell_failed(self, what: str, said: str) -> None:
+        """Show why a part of the page fails; nothing when it does not any more."""
+        self.failed[what] = f"{what}: {said}" if said else ""
+        text = "\n\n".join(filter(None, list(self.failed.values())))
+        set_if_other(self.failures, "content", text)
+        set_if_other(self.failures, "visible", bool(text))
 
     def _draw_curves(self, folder: Path) -> None:
         history, self.drawn = self.followers[folder].history, folder

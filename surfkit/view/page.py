@@ -11,8 +11,9 @@ import numpy as np
 from surfkit.render.path import beside
 from surfkit.view.cursor import Cursor, serve_cursors
 from surfkit.view.layers import Layers
+from surfkit.view.measure import coordinates
 from surfkit.view.photographs import Photographs
-from surfkit.view.screen import WORLD, ray_of, telling
+from surfkit.view.screen import WORLD, ray_of, ray_through, telling
 from surfkit.view.server import Served
 from surfkit.view.shelf import MOST, Form, Shelf
 from surfkit.view.subject import Subject
@@ -21,6 +22,7 @@ from surfkit.view.tools import CropTool, Measure, PathTool
 if TYPE_CHECKING:
     import viser
 
+WITHOUT = "coordinates are shown after a click, not under a pointer that moves"
 HELP = """
 **Mouse.** Left: turn. Right, or with shift: move. Wheel: nearer, farther. Double click: turn about that place.
 
@@ -55,7 +57,7 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     def cursor_of(client_id: int) -> Cursor | None:
         return page.cursor if (page := pages.get(client_id)) is not None else None
 
-    serve_cursors(served.script, cursor_of)
+    serve_cursors(served.script, cursor_of, WITHOUT)
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
@@ -82,13 +84,25 @@ class Page:
         client.gui.add_button("show all").on_click(lambda _: self._show_all())
         self.layers = Layers(shelf, client)
         self.measure = Measure(shelf, client)
-        self.cursor = None if served.script.missing else Cursor(shelf, client, self.measure.folder, self._pick)
+        self.cursor = None if served.script.missing else self._follow_pointer()
         self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None
         CropTool(shelf, client, folder)
         self.path = PathTool(shelf, client, folder, served.closing)
         with client.gui.add_folder("Help", expand_by_default=False):
             client.gui.add_markdown(HELP)
         client.scene.on_click()(telling(client, self._click))
+
+    def _follow_pointer(self) -> Cursor:
+        """Coordinates of what the pointer is on, as a click shows them."""
+        client, subject = self.client, self.shelf.subject
+
+        def say(x: float, y: float) -> str:
+            place = self._pick(*ray_through(client.camera, x, y))
+            return "" if place is None else coordinates(place, subject.frame, subject.up)
+
+        cursor = Cursor(client, self.measure.folder, say)
+        client.camera.on_update(lambda _: cursor.changed())
+        return cursor
 
     def _show_all(self) -> None:
         """Back to the first view."""

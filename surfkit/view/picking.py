@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -122,13 +123,21 @@ def hit_splats(draw: Callable[[View], Maps], origin: np.ndarray, direction: np.n
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
     pose[:3, 3] = -pose[:3, :3] @ torch.from_numpy(np.asarray(origin, np.float64))
     maps = draw(View("", Camera(pose, FOCAL, FOCAL, 0.5, 0.5, 1, 1), Path()))
-    if maps.median is not None:
-        depth = float(maps.median[0, 0])
-    elif maps.depth is not None and maps.alpha is not None and float(maps.alpha[0, 0]) > SEEN:
-        depth = float(maps.expected_depth()[0, 0])
-    else:
-        return None
+    found = surface_depth(maps)
+    depth = 0.0 if found is None else float(found[0, 0])
     return depth if depth > 0 else None
+
+
+def surface_depth(maps: Maps) -> Tensor | None:
+    """(H, W) z at which half of the light is lost, the mean depth where no median is drawn; 0 where less is lost.
+
+    None if no depth is drawn.
+    """
+    if maps.median is not None:
+        return maps.median
+    if maps.depth is None or maps.alpha is None:
+        return None
+    return torch.where(maps.alpha > SEEN, maps.expected_depth(), 0.0)
 
 
 def hit_points(xyz: np.ndarray, origin: np.ndarray, direction: np.ndarray, spread: float) -> float | None:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from surfkit.blocks.block import plan_file, read_plan
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.export.files import read_splat_file
+from surfkit.export.gltf_reader import UPS
 from surfkit.export.models import refuse_unsound
 from surfkit.export.table import SplatTable
 from surfkit.lod.tree import LodTree
@@ -36,15 +33,14 @@ from surfkit.run.context import RunContext
 from surfkit.run.lod import load_levels
 from surfkit.run.method import with_drawing
 from surfkit.scene.scene import Frame, Scene, View
+from surfkit.texture.deliver import NAME
+from surfkit.texture.make import RECORD
+from surfkit.view.las import CLOUDS, read_las
+from surfkit.view.mesh_files import MESHES, Y_UP, Z_UP, Textured, notes_in, other_mesh, own_notes, root_of, textured
 
 EXTENT = 0.9
 """Share of the positions in a file that lies within the extent of its local frame."""
-MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 SPLATS_IN_GLTF = b"KHR_gaussian_splatting"
-Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""From the y up of glTF to z up."""
-NOTE = re.compile(r"^comment (crs|metres[ _]per[ _]unit|offset):? (.+)$", re.MULTILINE)
-"""What files of surfkit say of their coordinates."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +66,7 @@ class Subject:
         draw: Maps of a view, by the rasterizer that the model was trained with.
         plan: How a run was cut into blocks.
         levels: Levels of detail of a run; the first is `splats` in another order.
+        textured: The mesh with pictures on its triangles.
     """
 
     path: Path
@@ -82,6 +79,7 @@ class Subject:
     draw: Callable[[View], Maps] | None = field(default=None, repr=False)
     plan: Plan | None = None
     levels: LodTree | None = None
+    textured: Textured | None = None
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -139,23 +137,42 @@ def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
         scene=ctx.scene,
         draw=made.draw,
         plan=read_plan(run).plan if plan_file(run).exists() else None,
+        textured=textured_mesh(run.out) if mesh is not None else None,
         levels=load_levels(run, made.splats) if table is not None and run.lod_record.exists() else None,
     )
 
 
+def textured_mesh(out: Path) -> Textured | None:
+    """What `surfkit texture` has made of the mesh of the run in a folder; None where it has not, or it is damaged."""
+    folder = out / "texture"
+    path = folder / f"{NAME}.glb"
+    if not (path.exists() and (folder / RECORD).exists()):
+        return None
+    try:
+        return textured(path, root_of(path))
+    except BadInput as error:  # the rest of the run can be looked at
+        emit(Warned(f"the mesh is shown without its pictures: {error}"))
+        return None
+
+
 def of_file(path: Path, device: Device) -> Subject:
     """What a file holds."""
+    if path.suffix.lower() in CLOUDS:
+        xyz, rgb, notes = read_las(path)
+        frame = frame_of(xyz, notes)
+        return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):
         return of_splats(path, device)
+    pictures, up = None, Z_UP
     if path.suffix.lower() in MESHES:
-        surface, colors, notes = other_mesh(path)
+        surface, colors, place, pictures = other_mesh(path)
+        notes, up = place.notes, place.up
     else:
         surface, notes = read_surface(path), coordinates_of(path)
         colors = colors_of(surface)
-    up = np.array([0.0, 0.0, 1.0])
     if surface.faces is not None:
         frame = frame_of(surface.vertices(), notes)
-        return Subject(path, frame, up, mesh=local_mesh(surface, frame, colors))
+        return Subject(path, frame, up, mesh=local_mesh(surface, frame, colors), textured=pictures)
     if path.suffix.lower() in MESHES:
         xyz, rgb = surface.vertices(), np.full((len(surface), 3), 128, np.uint8) if colors is None else colors
     else:
@@ -170,12 +187,29 @@ def of_splats(path: Path, device: Device) -> Subject:
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
-    frame = frame_of(table.means.double().numpy(), coordinates_of(path))
+    notes, up = splats_place(path)
+    frame = frame_of(table.means.double().numpy(), notes)
     local = table.on_cpu().in_local_frame(frame)
     primitive = primitive_of(local)
     model = SplatModel(primitive, primitive.from_table(local, torch.Generator()), local.sh_degree)
     made = with_drawing(Reconstruction(splats=model), select_rasterizer(device)[0])
-    return Subject(path, frame, np.array([0.0, 0.0, 1.0]), splats=local, draw=made.draw)
+    return Subject(path, frame, up, splats=local, draw=made.draw)
+
+
+def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
+    """What a file of splats says of its coordinates, and its (3,) up: z on a map, y in glTF, else -y.
+
+    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it.
+    """
+    notes = coordinates_of(path)
+    if "crs" in notes:
+        return notes, Z_UP
+    root = root_of(path)
+    if not root:
+        return notes, -Y_UP
+    told = own_notes(root) or {}
+    unit = {"metres per unit": told.get("metres_per_unit"), "crs": told.get("crs")}
+    return {name: str(value) for name, value in unit.items() if value}, UPS[told.get("up", "y")].T @ Y_UP
 
 
 def holds_splats(path: Path) -> bool:
@@ -201,8 +235,8 @@ def coordinates_of(path: Path) -> dict[str, str]:
     """What the header of a PLY file says of its coordinates, by name."""
     if path.is_dir():
         return {}
-    text = head_of(path).decode("ascii", "replace").replace("\r", "")
-    return {key.replace("_", " "): value.strip() for key, value in NOTE.findall(text)} if text[:3] == "ply" else {}
+    text = head_of(path).decode("ascii", "replace")
+    return notes_in(text) if text[:3] == "ply" else {}
 
 
 def frame_of(xyz: np.ndarray, notes: Mapping[str, str]) -> Frame:
@@ -234,46 +268,3 @@ def colors_of(surface: Surface) -> np.ndarray | None:
         return None
     found = np.stack([surface.rows[name] for name in names], axis=1)
     return found if found.dtype == np.uint8 else (found * (255 if found.dtype.kind == "f" else 1)).astype(np.uint8)
-
-
-def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, dict[str, str]]:
-    """A mesh that is no PLY file, with the colours of its vertices, in the frame of the input.
-
-    A GLB of surfkit has its offset, unit and coordinate reference system in NAME.glb.json.
-    """
-    surface, notes = read_surface(path), {}
-    colors = vertex_colors(path)
-    colors = colors if colors is not None and len(colors) == len(surface) else None
-    beside = Path(f"{path}.json")
-    if path.suffix.lower() == ".glb" and beside.exists():
-        told = read_json(beside, dict[str, Any])
-        vertices = surface.vertices()
-        if str(told.get("up", "")).startswith("y"):
-            vertices = vertices @ Z_UP.T
-        surface = Surface(path, vertices + np.asarray(told.get("offset", (0, 0, 0)), np.float64), surface.faces)
-        notes = {"crs": told.get("crs"), "metres per unit": told.get("metres_per_unit")}
-        notes = {name: str(value) for name, value in notes.items() if value is not None}
-    return surface, colors, notes
-
-
-def vertex_colors(path: Path) -> np.ndarray | None:
-    """(V, 3) uint8 of a file with one mesh that trimesh reads; None where it has none, or several parts."""
-    with needed("trimesh", f"{path}: a file that is not binary PLY"):
-        import trimesh
-    found: Any = trimesh.load(path, process=False)
-    if isinstance(found, trimesh.Scene):
-        if len(found.geometry) != 1:
-            return None
-        found = next(iter(found.geometry.values()))
-    visual = getattr(found, "visual", None)
-    if visual is None or not visual.defined:
-        return None
-    if visual.kind == "vertex":
-        return np.asarray(visual.vertex_colors)[:, :3]
-    if visual.kind != "texture":
-        return None
-    if "color" in visual.vertex_attributes:  # of a GLB with a material
-        colors = np.asarray(visual.vertex_attributes["color"])[:, :3]
-        whole = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
-        return np.round(colors / whole * 255).astype(np.uint8)
-    return None if visual.uv is None else np.asarray(visual.to_color().vertex_colors)[:, :3]

@@ -14,6 +14,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.scene.crop import Crop, write_crop
 from surfkit.view.crop_box import edges, sizes, turned_box, upright_axis
+from surfkit.view.film import FilmTool
 from surfkit.view.keyframes import KeyPath, write_path
 from surfkit.view.layers import frustum_lines
 from surfkit.view.measure import coordinates, in_words, measured, path_lines, shown
@@ -172,8 +173,10 @@ class PathTool:
         self.shelf, self.client, self.folder, self.closing = shelf, client, folder, closing
         self.poses: list[np.ndarray] = []
         self.playing = threading.Event()
+        self.saved: tuple[Any, Path, int] | None = None
         gui = client.gui
-        with gui.add_folder("Camera path", expand_by_default=False):
+        panel = gui.add_folder("Camera path", expand_by_default=False)
+        with panel:
             add = gui.add_button("add this view")
             fewer = gui.add_button_group("key views", ("remove last", "clear"))
             self.seconds = gui.add_number("seconds", 10.0, min=0.1, max=3600.0, step=0.1)
@@ -186,6 +189,8 @@ class PathTool:
         fewer.on_click(telling(client, lambda event: self._fewer(event.target.value)))
         play.on_click(telling(client, lambda _: self._play()))
         write.on_click(telling(client, lambda _: self._write()))
+        if shelf.subject.draw is not None:
+            FilmTool(shelf, client, panel, lambda: self._save()[0], closing)
 
     @property
     def keys(self) -> KeyPath:
@@ -236,11 +241,19 @@ class PathTool:
         """End the preview."""
         self.playing.clear()
 
+    def _save(self) -> tuple[Path, int]:
+        """The file of the path, written unless it is the same as before, and how many frames it has."""
+        keys = self.keys
+        same = [pose.tolist() for pose in keys.poses], keys.seconds, keys.fps, keys.fov_degrees
+        if self.saved is None or self.saved[0] != same or not self.saved[1].exists():
+            with WRITING:
+                path = free_name(self.folder, "path")
+                self.saved = same, path, write_path(path, keys, self.shelf.subject.frame)
+        return self.saved[1:]
+
     def _write(self) -> None:
+        path, frames = self._save()
         subject = self.shelf.subject
-        with WRITING:
-            path = free_name(self.folder, "path")
-            frames = write_path(path, self.keys, subject.frame)
         run = shlex.quote(str(subject.path)) if subject.path.is_dir() else "RUN"
         video = shlex.quote(str(path.with_suffix(".mp4")))
         command = f"surfkit render {run} --path {shlex.quote(str(path))} --size 1920x1080 --out {video}"

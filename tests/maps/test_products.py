@@ -149,6 +149,12 @@ def test_volumes_of_cut_and_fill(tmp_path):
     assert ((colors[:, 0] - colors[:, 2]) > 100).sum() > 1000 < ((colors[:, 2] - colors[:, 0]) > 100).sum()
 
 
+def test_a_surface_does_not_differ_from_itself(tmp_path):
+    here = heightfield(rising(0.3), UTM, (UTM[0] + 5, UTM[1] + 5))
+    found = make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path, here)["difference"]
+    assert [found[name] for name in ("fill", "cut", "median", "median_absolute", "percentile_90")] == [0] * 5
+
+
 def test_surfaces_apart_cannot_be_subtracted(tmp_path):
     west, east = UTM, (UTM[0] + 30, UTM[1])
     here, there = (heightfield(rising(0), at, (at[0] + 20, at[1] + 20)) for at in (west, east))

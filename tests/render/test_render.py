@@ -14,13 +14,12 @@ from needs import needs
 from PIL import Image
 
 from surfkit.cli import main
-from surfkit.cli.render import identity
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.export.cameras import write_cameras
 from surfkit.raster.api import Maps
-from surfkit.render.frames import RECORD, draw_frames, shown
+from surfkit.render.frames import RECORD, draw_frames, identity, shown
 from surfkit.render.path import flyover, from_file, lens_of, middle_of, orbit, posed, through
 from surfkit.render.video import write_video
 from surfkit.scene.camera import Camera
@@ -119,7 +118,7 @@ def test_cameras_json_is_a_path_in_the_frame_of_the_data_set(tmp_path):
     frame = Frame(np.array([500_000.0, 5_000_000.0, 100.0]), 0.01, shift=(500_000.0, 5_000_000.0, 0.0))
     scene = survey(frame=frame)
     write_cameras(tmp_path / "cameras.json", scene)
-    found = from_file(tmp_path / "cameras.json", scene, LENS, 2).cameras
+    found = from_file(tmp_path / "cameras.json", scene.frame, LENS, 2).cameras
     for at, view in ((0, scene.train[0]), (-1, scene.train[-1])):
         assert torch.allclose(found[at].world_to_camera, view.camera.world_to_camera, atol=1e-6)
 
@@ -131,7 +130,7 @@ def test_a_camera_path_of_nerfstudio(tmp_path):
     row = {"camera_to_world": pose.flatten().tolist(), "fov": 90.0, "aspect": 1.3}
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"camera_path": [row, row, row], "fps": 12, "render_width": 1}))
-    flight = from_file(path, survey(frame=frame), LENS, 99)
+    flight = from_file(path, frame, LENS, 99)
     assert len(flight.cameras) == 3 and flight.fps == 12
     camera = flight.cameras[1]
     assert (
@@ -160,14 +159,14 @@ def test_a_camera_path_of_nerfstudio(tmp_path):
 def test_damaged_paths_are_one_line(tmp_path, data, said):
     (tmp_path / "path.json").write_text(data)
     with pytest.raises(BadInput, match=said):
-        from_file(tmp_path / "path.json", survey(), LENS, 3)
+        from_file(tmp_path / "path.json", survey().frame, LENS, 3)
 
 
 def test_a_field_of_view_that_cannot_be(tmp_path):
     row = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 180}
     (tmp_path / "path.json").write_text(json.dumps({"camera_path": [row]}))
     with pytest.raises(BadInput, match="fov is 180; give degrees between 0 and 180"):
-        from_file(tmp_path / "path.json", survey(), LENS, 3)
+        from_file(tmp_path / "path.json", survey().frame, LENS, 3)
 
 
 def test_the_lens_is_that_of_training():
@@ -320,6 +319,10 @@ def test_models_are_told_apart(tmp_path):
     assert identity(tmp_path, False) == whole and identity(tmp_path, True) != packed
     (tmp_path / "run.json").write_text("another")
     assert identity(tmp_path, False) != whole, "trained again"
+    file = tmp_path / "point_cloud.ply"
+    before = identity(file)
+    file.write_text("another")
+    assert identity(file) != before
 
 
 def test_no_run(tmp_path, capsys):

@@ -1,8 +1,9 @@
 """A browser without a screen, which speaks viser's protocol: it has a camera, clicks, and keeps what it is told."""
 
 import http.client
+import re
 import time
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
 from needs import needs
 
@@ -44,6 +45,10 @@ class Browser:
 
     def part(self, label):
         return next(uuid for uuid, row in self.gui.items() if row.get("label") == label)
+
+    def is_whole(self):
+        """Whether the page of `surfkit view` is built: it asks for clicks at last."""
+        return any(row["type"] == "ScenePointerEnableMessage" for row in self.told)
 
     def texts(self):
         """Of all parts of the panel."""
@@ -92,3 +97,21 @@ def get(page, target, **headers):
     connection.request("GET", target, headers=headers)
     answer = connection.getresponse()
     return answer.status, answer.read(), answer.headers
+
+
+def cookie(page):
+    """That a browser has of a served page after its first visit."""
+    at = urlsplit(page.url)
+    return {"Cookie": f"surfkit-view-{at.port}={at.query.partition('=')[2]}"}
+
+
+def ask(page, **asked):
+    """Status and text of the answer to the script that follows the pointer."""
+    status, body, _ = get(page, f"/surfkit/ask?{urlencode(asked)}", **cookie(page))
+    return status, body.decode()
+
+
+def tag(browser):
+    """What that script finds in the panel: client and turn."""
+    content = next(row["content"] for row in browser.gui.values() if "surfkit-cursor" in str(row.get("content")))
+    return re.search(r'data-client="(\d*)" data-turn="(\d+)"', content).groups()

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from browser import Browser
+from browser import Browser, ask, tag
 from models import data_set
 from needs import needs, needs_native
 
@@ -38,7 +38,9 @@ from surfkit.train.watch import Stopwatch, Watched, watched, watched_by
 from surfkit.view import live
 from surfkit.view.control import Control
 from surfkit.view.live import live_view, rest
-from surfkit.view.live_page import Surroundings, framed
+from surfkit.view.live_page import Surroundings
+from surfkit.view.measure import coordinates
+from surfkit.view.on_page import GREY, OnPage, framed, window_of
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, listen
 
@@ -303,7 +305,9 @@ def test_a_page_of_a_training(scene, tmp_path):
         browser.wait_for(lambda b: any("After step" in text and "drawn by surfkit" in text for text in b.texts()))
         camera = training.drawn[-1][1].camera
         assert (camera.width, camera.height) == (640, 480) and camera.fy == pytest.approx(240 / np.tan(0.5))
-        assert not training.drawn[-1][2]
+        assert training.drawn[-1][2], "depths, for the coordinates under the pointer"
+        browser.set("follow the pointer", False)
+        browser.wait_for(lambda b: not training.drawn[-1][2])
         browser.set("pixels", 160)
         browser.set("show", "normal")
         browser.wait_for(lambda b: any("green up" in text for text in b.texts()))
@@ -342,10 +346,92 @@ def test_a_page_of_a_training(scene, tmp_path):
 
 def test_photographs_beside_pictures():
     left, right = np.zeros((30, 40, 3), np.uint8), np.full((30, 40, 3), 255, np.uint8)
-    wide = framed([left, right], 4.0)
+    wide = framed([left, right], window_of((30, 80), 4.0))
     assert wide.shape == (30, 120, 3) and (wide[:, 20:60] == 0).all() and (wide[:, 60:100] == 255).all()
-    tall = framed([left, right], 1.0)
+    tall = framed([left, right], window_of((30, 80), 1.0))
     assert tall.shape == (80, 80, 3) and (tall[25:55, :40] == 0).all() and (tall[:25] == 128).all()
+
+
+@pytest.mark.parametrize(("count", "aspect"), [(1, 4 / 3), (1, 3.1), (2, 1.0), (2, 5.3)])
+def test_pixels_of_a_window_show_the_places_that_are_drawn_there(scene, count, aspect):
+    camera = scene.train[1].camera.fitted(40)
+    draw = np.random.default_rng(1)
+    depth = draw.uniform(0.5, 3.0, (camera.height, camera.width)).astype(np.float32)
+    depth[2, :7], depth[3, 5] = 0, np.nan
+    rows, columns = np.indices(depth.shape)
+    image = np.stack([rows, columns, np.full_like(rows, 200)], 2).astype(np.uint8)
+    window = window_of((camera.height, count * camera.width), aspect)
+    whole, page = framed([image] * count, window), OnPage(camera, depth, count, window)
+    hits = 0
+    for row, column in np.stack([draw.integers(0, size, 400) for size in window], 1):
+        place = page.place((column + draw.uniform(0, 1)) / window[1], (row + draw.uniform(0, 1)) / window[0])
+        at, across, kind = whole[row, column].tolist()
+        if kind == GREY or not depth[at, across] > 0:
+            assert place is None
+            continue
+        hits += 1
+        seen = camera.world_to_camera.numpy() @ [*place, 1.0]
+        pixel = camera.fx * seen[0] / seen[2] + camera.cx, camera.fy * seen[1] / seen[2] + camera.cy
+        assert np.allclose(pixel, (across + 0.5, at + 0.5)) and seen[2] == pytest.approx(depth[at, across])
+    assert hits > 60
+    assert page.place(1.0, 0.5) is None and page.place(0.5, -0.01) is None
+
+
+def test_coordinates_under_the_pointer(scene, tmp_path):
+    needs("viser")
+    up = Surroundings(scene).first[0]
+    with live_view(Address(), 1.0) as page, Training(page.control, scene, tmp_path) as training:
+        browser = Browser(page.url)
+        browser.wait_for(backgrounds)
+        client, turn = tag(browser)
+        browser.stand(3.0)  # looks along z, x to the right, y down; the picture is a plane in front of it
+        browser.set("pixels", 800)
+        browser.wait_for(lambda _: training.drawn[-1][1].camera.width == 800)
+        browser.wait_for(lambda b: len(backgrounds(b)) > 1)
+        column, row = 610, 77  # of 800 x 600
+        x, y = (column + 0.5 - 400) / 300, (row + 0.5) / 300 - 1
+        exact = np.array([2 * x * np.tan(0.5), 2 * y * np.tan(0.5), 3.0 / WORLD + 2])
+        said = coordinates(exact, scene.frame, up)
+        browser.wait_for(lambda _: ask(page.page, client=client, x=x, y=y) == (200, said))
+        browser.wait_for(lambda b: tag(b)[1] != turn)  # another picture: the script asks again
+        browser.set("from", "a training camera")
+        name = scene.train[0].name
+        browser.wait_for(lambda b: any(name in text and "beside the picture" in text for text in b.texts()))
+        camera = training.drawn[-1][1].camera
+        (high, wide), column, row = window_of((camera.height, 2 * camera.width), 4 / 3), 7, camera.height - 3
+        ray = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0
+        pose = camera.world_to_camera.numpy()
+        said = coordinates(pose[:3, :3].T @ (2 * np.array(ray) - pose[:3, 3]), scene.frame, up)
+        for left in (0, camera.width):  # in the photograph, and in the picture
+            x = ((wide - 2 * camera.width) // 2 + left + column + 0.5) / (high / 2) - 4 / 3
+            y = ((high - camera.height) // 2 + row + 0.5) / (high / 2) - 1
+            assert ask(page.page, client=client, x=x, y=y) == (200, said)
+        assert ask(page.page, client=client, x=0.0, y=-0.99) == (200, ""), "grey"
+        browser.set("follow the pointer", False)
+        browser.wait_for(lambda b: tag(b)[0] == "")
+        assert ask(page.page, client=client, x=0, y=0)[0] == 409
+        browser.close()
+
+
+def test_the_page_says_what_fails(scene, tmp_path, capsys, monkeypatch):
+    needs("viser")
+    with live_view(Address(), 1.0) as page, Training(page.control, scene, tmp_path) as training:
+        browser = Browser(page.url)
+        browser.wait_for(backgrounds)
+        show = page.panel.show
+
+        def refuse(out):
+            raise BadInput("runs/x/recipe.json: damaged; copy it again")
+
+        monkeypatch.setattr(page.panel, "show", refuse)
+        browser.wait_for(lambda b: "panel: runs/x/recipe.json: damaged; copy it again" in b.texts())
+        training.error = BadInput("what this run has made draws no normals")
+        browser.set("show", "normal")
+        browser.wait_for(lambda b: "no picture: what this run has made draws no normals" in b.texts())
+        monkeypatch.setattr(page.panel, "show", show)
+        browser.wait_for(lambda b: not any("damaged" in text for text in b.texts()))
+        browser.close()
+    assert "goes on" not in capsys.readouterr().err, "what a user can change is no matter of the terminal"
 
 
 def test_the_first_view_shows_the_scene(scene):

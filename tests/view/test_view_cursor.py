@@ -6,12 +6,11 @@ import re
 import threading
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import urlencode, urlsplit
 
 import numpy as np
 import pytest
 import torch
-from browser import Browser, get
+from browser import Browser, ask, cookie, get, tag
 from needs import needs
 from scipy.spatial.transform import Rotation
 
@@ -55,7 +54,7 @@ def page(tmp_path_factory):
 @contextmanager
 def connected(page):
     found = Browser(page.url)
-    found.wait_for(lambda b: any(row["type"] == "ScenePointerEnableMessage" for row in b.told))
+    found.wait_for(Browser.is_whole)
     if not page.script.missing:  # the page is there as soon as its client is known
         found.wait_for(lambda b: ask(page, client=tag(b)[0])[0] != 404)
     yield found
@@ -66,22 +65,6 @@ def connected(page):
 def browser(page):
     with connected(page) as found:
         yield found
-
-
-def cookie(page):
-    at = urlsplit(page.url)
-    return {"Cookie": f"surfkit-view-{at.port}={at.query.partition('=')[2]}"}
-
-
-def ask(page, **asked):
-    status, body, _ = get(page, f"/surfkit/ask?{urlencode(asked)}", **cookie(page))
-    return status, body.decode()
-
-
-def tag(browser):
-    """What the script finds in the panel: client and turn."""
-    content = next(row["content"] for row in browser.gui.values() if "surfkit-cursor" in str(row.get("content")))
-    return re.search(r'data-client="(\d*)" data-turn="(\d+)"', content).groups()
 
 
 def ray_of_three(turn, at, px, py):

@@ -225,7 +225,7 @@ def test_a_path_is_read_back_by_render(tmp_path):
     path = KeyPath([camera.world_to_camera.numpy() for camera in keys], 2.0, 25.0, 50.0)
     assert write_path(tmp_path / "deep" / "path.json", path, FRAME) == 50
     scene = Scene("s", (View("a", LENS, tmp_path),), (), Cloud(torch.zeros(0, 3), torch.zeros(0, 3)), FRAME)
-    flight = from_file(tmp_path / "deep" / "path.json", scene, LENS, 7)
+    flight = from_file(tmp_path / "deep" / "path.json", scene.frame, LENS, 7)
     assert len(flight.cameras) == 50 and flight.fps == 25
     for at, key in ((0, keys[0]), (-1, keys[-1])):
         assert np.allclose(flight.cameras[at].world_to_camera, key.world_to_camera, atol=1e-6)

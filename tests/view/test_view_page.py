@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -69,7 +70,7 @@ def page(run, tmp_path_factory):
 def browser(page):
     found = Browser(page[0].url)
     found.wait_for(lambda b: any("first" in t or "Click on the surface" in t for t in b.texts()))
-    found.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    found.wait_for(Browser.is_whole)
     yield found
     found.close()
 
@@ -141,7 +142,7 @@ def test_a_click_on_the_surface_measures(browser, page):
     table = browser.wait_for(lambda b: next((t for t in b.texts() if "area from above" in t), None))
     values = [float(v.replace(",", "")) for v in re.findall(r"\| (-?[\d,.]+) ", table)]
     assert np.allclose(values, [0.7 * unit, 0.7 * unit, 0.0, 0.06 * unit**2, 0.06 * unit**2], rtol=1e-2, atol=1e-2)
-    assert sum(name.startswith("/measure/label") for name in browser.names()) == 2
+    browser.wait_for(lambda b: sum(name.startswith("/measure/label") for name in b.names()) == 2)  # after the table
     browser.set("measure", False)
     browser.wait_for(lambda b: not any(name.startswith("/measure/") for name in b.names()))
 
@@ -166,10 +167,46 @@ def test_files_that_the_page_writes(browser, page):
 
 
 @needs_native
+def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys):
+    needs("cv2")
+    begun = threading.Event()
+
+    def slow(view):
+        begun.set()
+        time.sleep(0.05)
+        return page[1].draw(view)
+
+    with served(Address(), "test") as found:
+        show(replace(page[1], draw=slow), found, tmp_path)
+        browser = Browser(found.url)
+        browser.wait_for(Browser.is_whole)
+        for label, value in (("seconds", 1.0), ("size", "640x360")):
+            browser.set(label, value)
+        for z in (1.0, 2.0):
+            browser.stand(z)
+            browser.press("add this view")
+            browser.wait_for(lambda b, n=int(z): any(f"{n} key views" in t for t in b.texts()))
+        browser.press("make the video")
+        browser.wait_for(lambda b: begun.is_set() and any(row.get("label") == "stop" for row in b.gui.values()))
+        browser.press("stop")
+        text = browser.wait_for(lambda b: next((t for t in b.texts() if "Stopped;" in t), None))
+        browser.close()
+    drawn = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
+    assert 0 < len(drawn) < 30
+    words = shlex.split(re.search("`surfkit (.*)`", text)[1])
+    assert main([*words, "--keep-frames", "--device", "cpu"]) == 0
+    assert "30, 1.0 s at 30 per second" in capsys.readouterr().out
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in drawn.items()), (
+        "what is there is not drawn again"
+    )
+    assert (tmp_path / "path-color-640x360.mp4").stat().st_size > 0
+
+
+@needs_native
 def test_two_browsers_at_once(page, browser):
     other = Browser(page[0].url)
     other.wait_for(lambda b: "/splats" in b.names())
-    other.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    other.wait_for(Browser.is_whole)
     other.set("measure", True)
     other.set("mesh", True)
     other.wait_for(lambda b: {"/mesh", "/measure"} <= set(b.names()))
@@ -195,7 +232,7 @@ def test_blocks(page, tmp_path):
     with served(Address(), "test") as found:
         show(with_plan, found, tmp_path)
         browser = Browser(found.url)
-        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         browser.set("blocks", True)
         browser.wait_for(lambda b: {"/blocks/lines", "/blocks/1"} <= set(b.names()))
         assert browser.names()["/blocks/0"]["text"] == "block 0: 2 views"
@@ -210,7 +247,7 @@ def shown_file(path):
     with opened_subject(path, "cpu") as subject, served(Address(), "test") as found:
         show(subject, found, path.parent / "out")
         browser = Browser(found.url)
-        browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+        browser.wait_for(Browser.is_whole)
         browser.wait_for(lambda b: {"/splats", "/mesh", "/points"} & set(b.names()))
         names = set(browser.names())
         browser.close()
@@ -225,7 +262,7 @@ def test_a_mesh_is_shown_in_its_coordinates(tmp_path, name):
     assert "/mesh" in names and "/splats" not in names
     back = subject.frame.to_input(subject.mesh.vertices)
     assert np.allclose(back, SURVEY.to_input(TRIANGLE.vertices), atol=1e-3)
-    assert subject.frame.crs == (None if name.endswith("obj") else "EPSG:32632")
+    assert subject.frame.crs == "EPSG:32632" and subject.frame.metres == 1.0
     assert np.allclose(subject.mesh.colors, 200, atol=1)
 
 
@@ -236,6 +273,43 @@ def test_points_are_shown(tmp_path):
     subject, names = shown_file(tmp_path / "a.ply")
     assert "/points" in names and subject.points.rgb[0].tolist() == [9, 8, 7]
     assert np.allclose(subject.frame.to_input(subject.points.xyz)[1], [1, 0, 0], atol=1e-5)
+
+
+def cloud(path, point_format, **colors):
+    """250 points on the map, as another program may write them."""
+    laspy, crs = needs("laspy"), needs("rasterio.crs")
+    needs("lazrs")
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.offsets, header.scales = np.array(ORIGIN), np.full(3, 0.01)
+    known = needs("laspy.vlrs.known")
+    header.vlrs.append(known.WktCoordinateSystemVlr(crs.CRS.from_epsg(32632).to_wkt()))
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = (np.array(ORIGIN) + np.random.default_rng(0).uniform(0, 9, (250, 3))).T
+    for name, values in colors.items():
+        made[name] = np.asarray(values, np.uint16)
+    made.write(path)
+    return np.stack([made.x, made.y, made.z], 1)
+
+
+def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
+    many = cloud(tmp_path / "a.laz", 7, red=np.arange(250) * 257, green=np.full(250, 65535))
+    subject, names = shown_file(tmp_path / "a.laz")
+    assert "/points" in names and (subject.frame.crs, subject.frame.metres) == ("EPSG:32632", 1.0)
+    assert np.allclose(subject.frame.to_input(subject.points.xyz), many, atol=1e-3)
+    assert subject.points.rgb[:, 0].tolist() == list(range(250)) and (subject.points.rgb[:, 1:] == [255, 0]).all()
+    monkeypatch.setattr("surfkit.view.las.MOST", 100)
+    monkeypatch.setattr("surfkit.view.las.AT_ONCE", 64)
+    places = cloud(tmp_path / "b.las", 6)
+    with opened_subject(tmp_path / "b.las", "cpu") as subject:
+        assert np.allclose(subject.frame.to_input(subject.points.xyz), places[::3], atol=1e-3)
+        brightness = subject.points.rgb.astype(int).sum(1)[np.argsort(places[::3, 2])]
+        assert brightness[-5:].mean() > brightness[:5].mean() + 100, "colours of heights"
+    (tmp_path / "short.laz").write_bytes((tmp_path / "a.laz").read_bytes()[:1200])
+    (tmp_path / "other.las").write_text("hello")
+    for name in ("short.laz", "other.las"):
+        assert main(["view", str(tmp_path / name), "--no-open"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"{name}: cannot be read" in error
 
 
 @needs_native
@@ -260,6 +334,33 @@ def test_the_offset_of_a_file_of_splats(tmp_path):
     with opened_subject(tmp_path / "s.ply", "cpu") as subject:
         assert subject.frame.crs == "EPSG:32632" and subject.frame.metres == 1.0
         assert np.allclose(subject.frame.to_input(subject.splats.means.numpy()), means.numpy(), atol=1e-3)
+
+
+@pytest.mark.parametrize("on_map", [True, False])
+@pytest.mark.parametrize("name", ["s.ply", "s.glb", "s.spz"])
+def test_what_is_up_in_a_file_of_splats(tmp_path, monkeypatch, name, on_map):
+    """z on a map, as far as the file tells; -y elsewhere, which a user can change."""
+    needs("viser")
+    draw = torch.Generator().manual_seed(0)
+    parts = [torch.randn(9, n, generator=draw) for n in (3, 4, 2, 1, 3)]
+    splats = SplatTable("surfel", parts[0], parts[1], parts[2] - 3, parts[3][:, 0], parts[4], torch.zeros(9, 0, 3))
+    frame = SURVEY if on_map else replace(SURVEY, crs=None, metres=None)
+    path, found = tmp_path / name, []
+    format_for(path).write(path, splats, frame)
+
+    def look(subject, *_):
+        found.append(subject)
+        raise BadInput("enough")
+
+    monkeypatch.setattr("surfkit.cli.view.show", look)
+    told = on_map and not name.endswith("spz")
+    for words, up in (
+        ([], (0, 0, 1) if told else (0, -1, 0)),
+        (["--up", "-x"], (-1, 0, 0)),
+        (["--up", "y"], (0, 1, 0)),
+    ):
+        assert main(["view", str(path), *words, "--no-open", "--device", "cpu"]) == 2
+        assert found[-1].up.tolist() == list(up) and found[-1].frame.crs == ("EPSG:32632" if told else None)
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path, capsys):
@@ -313,7 +414,7 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     url = re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", "".join(lines))[0]
     browser = Browser(url)
     browser.wait_for(lambda b: "/mesh" in b.names())
-    browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
+    browser.wait_for(Browser.is_whole)
     browser.set("seconds", 1000.0)
     for label in ("add this view", "add this view", "preview"):
         browser.press(label)
