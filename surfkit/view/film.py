@@ -85,10 +85,8 @@ class FilmTool:
             said = f"`{video}` is written."
             say(f"{video} is written")  # its browser may have gone
         except Stopped:
-            kept, command = (
-                f"the pictures so far are kept in {frames_of(video)}",
-                self._command(path, video, size, show),
-            )
+            kept = f"the pictures so far are kept in {frames_of(video)}"
+            command = self._command(path, video, size, show)
             said = f"Stopped; {kept}. *make the video* goes on" + (f", and so does\n\n`{command}`" if command else ".")
             if self.closing.is_set():
                 say(f"{video} is not finished; {kept}" + (f"; it goes on with {command}" if command else ""))

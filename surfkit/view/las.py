@@ -37,7 +37,7 @@ def read_las(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
     try:
         with laspy.open(path) as file:
             xyz, rgb = _points(file)
-            notes = _notes(file.header)
+            notes = _notes(path, file.header)
     except Exception as error:  # laspy and lazrs have errors of many kinds
         if is_out_of_memory(error):
             raise
@@ -66,14 +66,17 @@ def _points(file: Any) -> tuple[np.ndarray, np.ndarray | None]:
     return xyz, (rgb >> 8 if rgb.max() > 255 else rgb).astype(np.uint8)  # some programs write 8 bits
 
 
-def _notes(header: Any) -> dict[str, str]:
+def _notes(path: Path, header: Any) -> dict[str, str]:
     """Reference system and unit, where the header has well-known text of a projected system."""
     text = next((vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"), "")
+    if not text.strip("\0"):
+        return {}
     try:
         from rasterio.crs import CRS
 
         found = CRS.from_wkt(text.rstrip("\0"))
         number, unit = found.to_epsg(), found.linear_units_factor[1]
-    except Exception:  # no rasterio, or what it does not know: coordinates without a name
+    except Exception as error:  # no rasterio, or what it does not know
+        emit(Warned(f"{path}: coordinates are shown without their reference system: {' '.join(str(error).split())}"))
         return {}
     return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and found.is_projected else {}

@@ -29,6 +29,7 @@ from surfkit.partition.base import Cells, Ground
 from surfkit.partition.plan import Block, Plan
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
+from surfkit.run.notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
 from surfkit.view.page import show
@@ -275,14 +276,14 @@ def test_points_are_shown(tmp_path):
     assert np.allclose(subject.frame.to_input(subject.points.xyz)[1], [1, 0, 0], atol=1e-5)
 
 
-def cloud(path, point_format, **colors):
+def cloud(path, point_format, wkt=None, **colors):
     """250 points on the map, as another program may write them."""
     laspy, crs = needs("laspy"), needs("rasterio.crs")
     needs("lazrs")
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.offsets, header.scales = np.array(ORIGIN), np.full(3, 0.01)
     known = needs("laspy.vlrs.known")
-    header.vlrs.append(known.WktCoordinateSystemVlr(crs.CRS.from_epsg(32632).to_wkt()))
+    header.vlrs.append(known.WktCoordinateSystemVlr(wkt or crs.CRS.from_epsg(32632).to_wkt()))
     made = laspy.LasData(header)
     made.x, made.y, made.z = (np.array(ORIGIN) + np.random.default_rng(0).uniform(0, 9, (250, 3))).T
     for name, values in colors.items():
@@ -304,8 +305,13 @@ def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
         assert np.allclose(subject.frame.to_input(subject.points.xyz), places[::3], atol=1e-3)
         brightness = subject.points.rgb.astype(int).sum(1)[np.argsort(places[::3, 2])]
         assert brightness[-5:].mean() > brightness[:5].mean() + 100, "colours of heights"
+    cloud(tmp_path / "c.las", 6, wkt="somewhere")
+    with collect_notes() as notes, opened_subject(tmp_path / "c.las", "cpu") as subject:
+        assert subject.frame.crs is None
+        assert any("c.las: coordinates are shown without their reference system" in each for each in notes.texts)
     (tmp_path / "short.laz").write_bytes((tmp_path / "a.laz").read_bytes()[:1200])
     (tmp_path / "other.las").write_text("hello")
+    capsys.readouterr()
     for name in ("short.laz", "other.las"):
         assert main(["view", str(tmp_path / name), "--no-open"]) == 2
         error = capsys.readouterr().err
