@@ -184,8 +184,9 @@ def test_what_slurm_is_told(cluster, capsys):
     running = workers.run(jobs)
 
     def later():
-        wait_for(lambda: (cluster / "asked").exists() and "squeue" in (cluster / "asked").read_text())
-        (cluster / "queue").write_text("17_0 RUNNING None\n17_1 OUT_OF_MEMORY OutOfMemory\n3_0 FAILED None\n")
+        wait_for(lambda: (cluster / "asked").exists() and (cluster / "asked").read_text().count("squeue") > 1)
+        (cluster / "new").write_text("17_0 RUNNING None\n17_1 OUT_OF_MEMORY OutOfMemory\n3_0 FAILED None\n")
+        (cluster / "new").replace(cluster / "queue")
 
     thread = threading.Thread(target=later)
     thread.start()
