@@ -180,24 +180,47 @@ static inline Floats log_positive(Floats x) {
 
 static inline Floats magnitude(Floats a) { return (Floats)((Ints)a & 0x7fffffff); }
 
-// Sum of the lanes of `count` vectors into out[0 .. count), count a multiple of 4. The order of the sum is fixed.
+#if defined(__AVX2__) || defined(__AVX512F__)
+// Sums of the lanes of four vectors. The order of each sum is fixed.
+SURFKIT_INLINE __m128 sum_four(const Floats* v) {
+    __m128 q[4];
+    for (int j = 0; j < 4; j++) {
+#if defined(__AVX512F__)
+        const __m256 h = _mm256_add_ps(_mm512_castps512_ps256((__m512)v[j]), _mm512_extractf32x8_ps((__m512)v[j], 1));
+#else
+        const __m256 h = (__m256)v[j];
+#endif
+        q[j] = _mm_add_ps(_mm256_castps256_ps128(h), _mm256_extractf128_ps(h, 1));
+    }
+    return _mm_hadd_ps(_mm_hadd_ps(q[0], q[1]), _mm_hadd_ps(q[2], q[3]));
+}
+#endif
+
+// Sum of the lanes of `count` vectors into out[0 .. count), count a multiple of 4.
 SURFKIT_INLINE void sum_lanes(const Floats* v, int count, float* out) {
 #if defined(__AVX2__) || defined(__AVX512F__)
-    for (int i = 0; i < count; i += 4) {
-        __m128 q[4];
-        for (int j = 0; j < 4; j++) {
-#if defined(__AVX512F__)
-            const __m256 h =
-                _mm256_add_ps(_mm512_castps512_ps256((__m512)v[i + j]), _mm512_extractf32x8_ps((__m512)v[i + j], 1));
-#else
-            const __m256 h = (__m256)v[i + j];
-#endif
-            q[j] = _mm_add_ps(_mm256_castps256_ps128(h), _mm256_extractf128_ps(h, 1));
-        }
-        _mm_storeu_ps(out + i, _mm_hadd_ps(_mm_hadd_ps(q[0], q[1]), _mm_hadd_ps(q[2], q[3])));
-    }
+    for (int i = 0; i < count; i += 4) _mm_storeu_ps(out + i, sum_four(v + i));
 #else
     for (int i = 0; i < count; i++) out[i] = (v[i][0] + v[i][1]) + (v[i][2] + v[i][3]);
+#endif
+}
+
+// Sums of the lanes of `count` vectors, kLanes at most, which are followed by zeros up to a multiple of 4, in one register:
+// what is stored in parts and loaded as a whole waits for the stores.
+SURFKIT_INLINE Floats sum_each(const Floats* v, int count) {
+#if defined(__AVX512F__)
+    __m512 out = _mm512_castps128_ps512(sum_four(v));
+    out = _mm512_insertf32x4(out, count > 4 ? sum_four(v + 4) : _mm_setzero_ps(), 1);
+    if (count > 8) out = _mm512_insertf32x4(out, sum_four(v + 8), 2);
+    if (count > 12) out = _mm512_insertf32x4(out, sum_four(v + 12), 3);
+    return (Floats)out;
+#elif defined(__AVX2__)
+    return (Floats)_mm256_insertf128_ps(
+        _mm256_castps128_ps256(sum_four(v)), count > 4 ? sum_four(v + 4) : _mm_setzero_ps(), 1);
+#else
+    Floats out{};
+    for (int i = 0; i < kLanes; i++) out[i] = (v[i][0] + v[i][1]) + (v[i][2] + v[i][3]);
+    return out;
 #endif
 }
 

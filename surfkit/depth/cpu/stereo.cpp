@@ -54,6 +54,9 @@ static inline Ints gather(const uint32_t* base, Ints at) {
 #endif
 }
 
+// Of the first `count` lanes, those that are set, as bits.
+static inline uint32_t first(Mask m, int count) { return bits(m) & (count < kLanes ? (1u << count) - 1 : ~0u); }
+
 static inline float total(Floats v) {
     alignas(64) float out[4];
     const Floats four[4] = {v, Floats{}, Floats{}, Floats{}};
@@ -109,7 +112,7 @@ struct Trials {
     alignas(64) float w[kTrials], gx[kTrials], gy[kTrials];
     alignas(64) float cost[kTrials];  // of all views so far
     alignas(64) float u[kTrials], v[kTrials], ux[kTrials], uy[kTrials], vx[kTrials], vy[kTrials];  // in one view
-    alignas(64) float sum[kTrials], square[kTrials], both[kTrials], match[kTrials];
+    alignas(64) float match[kTrials];
     int count = 0;
 
     void add(const Plane& p) { w[count] = p.w, gx[count] = p.gx, gy[count] = p.gy, count++; }
@@ -168,16 +171,13 @@ SURFKIT_INLINE void compare(const StereoJob& job, const Window& window, const St
         sums[0][i] = sum, sums[1][i] = square, sums[2][i] = both;
     }
     for (int i = trials.count; i % 4; i++) sums[0][i] = sums[1][i] = sums[2][i] = Floats{};
-    for (int i = 0; i < trials.count; i += 4) {
-        sum_lanes(sums[0] + i, 4, trials.sum + i);
-        sum_lanes(sums[1] + i, 4, trials.square + i);
-        sum_lanes(sums[2] + i, 4, trials.both + i);
-    }
     constexpr float kUnit = 1.0f / (kOne * kOne);
     for (int i = 0; i < trials.count; i += kLanes) {
-        const Floats mean = load(trials.sum + i) * kUnit, square = load(trials.square + i) * (kUnit * kUnit), zero{};
+        const int count = trials.count - i;
+        const Floats mean = sum_each(sums[0] + i, count) * kUnit, square = sum_each(sums[1] + i, count) * (kUnit * kUnit);
+        const Floats both = sum_each(sums[2] + i, count) * kUnit, zero{};
         const Floats contrast = higher(zero, square - mean * mean) + kNoise;
-        const Floats off = 1.0f - load(trials.both + i) * kUnit / root(contrast * window.contrast);
+        const Floats off = 1.0f - both / root(contrast * window.contrast);
         store(trials.match + i, higher(load(trials.match + i), lower(broadcast(1.0f), higher(zero, off))));
     }
 }
@@ -287,39 +287,52 @@ struct Pixel {
     }
 
     // Keep the planes that cost least in the views looked at so far.
-    void drop_worst(float (*match)[kMostViews], int seen) {
+    void drop_worst(float (*match)[kTrials], int seen) {
         if (trials.count <= kKept) return;
-        float so_far[kTrials], sorted[kTrials];
-        for (int i = 0; i < trials.count; i++) {
-            float sum = 0;
-            for (int j = 0; j < seen; j++) sum += std::min(match[i][j], 1.0f);
-            so_far[i] = sorted[i] = trials.cost[i] + sum / (float)seen;
+        alignas(64) float so_far[kTrials];
+        const float share = 1.0f / (float)seen;
+        for (int i = 0; i < trials.count; i += kLanes) {
+            Floats sum{};
+            for (int at = 0; at < seen; at++) sum += lower(load(match[at] + i), broadcast(1.0f));
+            store(so_far + i, madd(sum, share, load(trials.cost + i)));
         }
-        std::nth_element(sorted, sorted + kKept - 1, sorted + trials.count);
         int left = 0;
         for (int i = 0; i < trials.count && left < kKept; i++) {
-            if (so_far[i] > sorted[kKept - 1]) continue;
+            int better = 0;
+            for (int j = 0; j < trials.count; j += kLanes)
+                better += __builtin_popcount(first(lesser(load(so_far + j), so_far[i]), trials.count - j));
+            if (better >= kKept) continue;
             trials.move(i, left);
-            for (int j = 0; j < seen; j++) match[left][j] = match[i][j];
+            for (int at = 0; at < seen; at++) match[at][left] = match[at][i];
             left++;
         }
         trials.count = left;
         trials.fill();
     }
 
-    // The soft minimum of the least costs, of as many views as count: near their mean where all of them match, while a view
-    // that matches badly, as something hides the place from it, adds little. Views that show nothing count only where all
-    // others do too. Where the least of all is no less than `limit`, that is all that is said.
-    float least_of(const float* match, float limit) const {
-        float sorted[kMostViews];
-        std::copy(match, match + count, sorted);
+    // Add the soft minimum of the least matches of each plane, of as many views as count: near their mean where all of them
+    // match, while a view that matches badly, as something hides the place from it, adds little. Views that show nothing
+    // count only where all others do too.
+    void add_least(const float (*match)[kTrials]) {
         const int most = std::min(job.best, count);
-        std::partial_sort(sorted, sorted + most, sorted + count);
-        if (sorted[0] >= limit) return sorted[0];
-        float sum = 1;
-        int used = 1;
-        for (; used < most && sorted[used] < kNothing; used++) sum += std::exp((sorted[0] - sorted[used]) / kHidden);
-        return sorted[0] - kHidden * std::log(sum / (float)used);
+        for (int i = 0; i < trials.count; i += kLanes) {
+            Floats sorted[kMostViews];
+            for (int k = 0; k < most; k++) sorted[k] = broadcast(kNever);
+            for (int at = 0; at < count; at++) {
+                Floats more = load(match[at] + i);
+                for (int k = 0; k < most; k++) {
+                    const Floats less = lower(sorted[k], more);
+                    more = higher(sorted[k], more), sorted[k] = less;
+                }
+            }
+            Floats sum = broadcast(1.0f), used = broadcast(1.0f);
+            for (int k = 1; k < most; k++) {
+                const Mask shown = lesser(sorted[k], kNothing);
+                sum += keep(shown, exp_negative((sorted[0] - sorted[k]) * (1.0f / kHidden)));
+                used += keep(shown, broadcast(1.0f));
+            }
+            store(trials.cost + i, load(trials.cost + i) + sorted[0] - log_positive(sum / used) * kHidden);
+        }
     }
 
     static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
@@ -352,11 +365,14 @@ struct Pixel {
                               lesser((nx * nx + ny * ny + nz * nz) * away, w * w);
             store(trials.cost + i, select(fits, rough * smoothness, kNever));
         }
-        for (int i = 1; i < trials.count; i++)
-            for (int j = 0; j < i; j++) {
-                const float by = std::fabs(trials.gx[i] - trials.gx[j]) + std::fabs(trials.gy[i] - trials.gy[j]);
-                if (std::fabs(trials.w[i] - trials.w[j]) + kAcross * by < same) trials.cost[i] = kNever;
+        for (int i = 1; i < trials.count; i++) {
+            const float w = trials.w[i], gx = trials.gx[i], gy = trials.gy[i];
+            for (int j = 0; j < i; j += kLanes) {
+                const Floats by = magnitude(load(trials.gx + j) - gx) + magnitude(load(trials.gy + j) - gy);
+                const Mask near = lesser(madd(by, kAcross, magnitude(load(trials.w + j) - w)), same);
+                if (first(near, i - j)) trials.cost[i] = kNever;
             }
+        }
         int left = known ? 0 : 1;
         for (int i = 1; i < trials.count; i++) {
             trials.move(i, left);
@@ -370,21 +386,20 @@ struct Pixel {
     // views that match it best: a plane that lies far behind another is seen by other views.
     void attempt(bool known) {
         screen(known);
-        float match[kTrials][kMostViews];
+        alignas(64) float match[kMostViews][kTrials];
         for (int at = 0; at < count; at++) {
             if (at == job.best) drop_worst(match, at);
             see(chosen[at]);
-            for (int i = 0; i < trials.count; i++) match[i][at] = trials.match[i];
+            std::copy(trials.match, trials.match + kTrials, match[at]);
         }
+        add_least(match);
         int best = -1;
         float least = known ? cost : kNever;
-        for (int i = 0; i < trials.count; i++) {
-            const float c = trials.cost[i] + least_of(match[i], least - trials.cost[i]);
-            if (c < least) best = i, least = c;
-        }
+        for (int i = 0; i < trials.count; i++)
+            if (trials.cost[i] < least) best = i, least = trials.cost[i];
         if (best >= 0) {
             uint8_t* here = job.each + ((int64_t)y * job.width + x) * job.views;
-            for (int at = 0; at < count; at++) here[chosen[at]] = told(match[best][at]);
+            for (int at = 0; at < count; at++) here[chosen[at]] = told(match[at][best]);
             plane = trials.at(best);
         }
         cost = least;
