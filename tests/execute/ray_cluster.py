@@ -105,6 +105,7 @@ def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
     def began():
         if (tmp_path / "000" / "began").exists():
             raise Stop
+        time.sleep(0.05)
         return [], []
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
