@@ -170,7 +170,7 @@ def test_files_that_the_page_writes(browser, page):
 @needs_native
 def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys, monkeypatch):
     needs("cv2")
-    drawn, stopped, clicked = [], threading.Event(), FilmTool._clicked
+    drawn, clicks, stopped, clicked = [], [], threading.Event(), FilmTool._clicked
 
     def held(view):
         drawn.append(view)
@@ -178,8 +178,8 @@ def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys,
         return page[1].draw(view)
 
     def stop(tool):
-        clicked(tool)
-        if drawn:
+        clicks.append(clicked(tool))
+        if len(clicks) == 2:
             stopped.set()
 
     monkeypatch.setattr(FilmTool, "_clicked", stop)
