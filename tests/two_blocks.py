@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from surfkit.blocks.schedule import Compute
+from surfkit.core.files import replacing
 from surfkit.partition import PictureShare, QuantileGrid
 from surfkit.pipeline import run
 from surfkit.readers.data import Data
@@ -55,6 +57,25 @@ def same(a: Path, b: Path) -> bool:
     one, other = params(a), params(b)
     cloud = (a / "point_cloud.ply").read_bytes() == (b / "point_cloud.ply").read_bytes()
     return cloud and all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+def await_sigterm(reached: Path) -> None:
+    """Write the number of the parent process into a file, and wait until SIGTERM has come and was handled.
+
+    At most a minute.
+    """
+    came, handler = [], signal.getsignal(signal.SIGTERM)
+
+    def note(*given):
+        came.append(1)
+        handler(*given)
+
+    signal.signal(signal.SIGTERM, note)
+    with replacing(reached) as file:
+        file.write(str(os.getppid()).encode())
+    until = time.monotonic() + 60
+    while not came and time.monotonic() < until:
+        time.sleep(0.02)
 
 
 def stop_after(optimise, step):

@@ -175,11 +175,13 @@ def await_workers(run: Run) -> None:
     Raises:
         BadInput: One does not end.
     """
-    began = time.monotonic()
-    while busy := [folder for folder in started_folders(run) if find_worker(folder)]:
-        patience = LEAVE_S + (STALE_S if any(map(find_remote_worker, busy)) else 0)
+    began, patience = time.monotonic(), LEAVE_S
+    while busy := {folder: worker for folder in started_folders(run) if (worker := find_worker(folder))}:
+        if any(map(find_remote_worker, busy)):
+            patience = LEAVE_S + STALE_S
         if time.monotonic() - began > patience:
-            raise BadInput(f"{busy[0]}: {find_worker(busy[0])} works on the block; wait for its end, or stop it")
+            folder, worker = next(iter(busy.items()))
+            raise BadInput(f"{folder}: {worker} works on the block; wait for its end, or stop it")
         time.sleep(POLL_S)
 
 

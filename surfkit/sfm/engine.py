@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
@@ -54,9 +55,9 @@ def run(what: str, work: Callable[[Any], T]) -> T:
         while not ended.wait(POLL_S):  # Thread.join, interrupted, takes a running thread for one that has ended
             pass
     except BaseException:
-        token.cancel()
-        while thread.ident is not None and not ended.is_set():  # a process that ends before its thread is aborted
-            with suppress(KeyboardInterrupt):
+        with _undisturbed():
+            token.cancel()
+            if thread.ident is not None:  # a process that ends before its thread is aborted
                 ended.wait()
         raise
     if not failed:
@@ -66,3 +67,20 @@ def run(what: str, work: Callable[[Any], T]) -> T:
         said = " ".join(str(error).split())[:300]
         raise BadInput(f"{what} failed in pycolmap: {said}; delete the scene's prepare/ and try again") from error
     raise error
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Within, a signal that would raise an error does nothing: an impatient user sends several."""
+    if threading.current_thread() is not threading.main_thread():  # no other one gets any
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    raising = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in raising:
+        signal.signal(number, lambda *_: None)
+    try:
+        yield
+    finally:
+        for number, handler in raising.items():
+            signal.signal(number, handler)

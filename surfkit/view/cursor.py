@@ -32,11 +32,12 @@ class Cursor:
     def __init__(self, client: viser.ClientHandle, folder: Any, say: Say) -> None:
         """Put the switch into a folder of the panel; `say` is called in other threads, once at a time."""
         self.client, self.say = client, say
-        self.answering, self.shown, self.turn = threading.Lock(), False, 0
+        self.answering, self.telling = threading.Lock(), threading.Lock()
+        self.shown, self.turn = False, 0
         with folder:
             self.on = client.gui.add_checkbox("follow the pointer", True, hint="Shows the coordinates under it.")
         self.tag = client.gui.add_html(self._tag())
-        self.on.on_update(lambda _: self._tell())
+        self.on.on_update(lambda _: self._switched())
 
     def answer(self, x: float, y: float) -> tuple[http.HTTPStatus, str]:
         """What `say` says of a place, one at a time."""
@@ -52,8 +53,13 @@ class Cursor:
 
     def changed(self) -> None:
         """Something else may lie under the pointer; the script is told once, and again after it has asked."""
-        if self.shown:
-            self.shown = False
+        with self.telling:  # several threads may know of it
+            if self.shown:
+                self.shown = False
+                self._tell()
+
+    def _switched(self) -> None:
+        with self.telling:
             self._tell()
 
     def _tag(self) -> str:

@@ -171,11 +171,11 @@ class LivePage:
         if chosen is not None:
             images, told = self._beside_photograph(view, image, told)
             window = window_of((image.shape[0], len(images) * image.shape[1]), self.client.camera.aspect)
+        depth = surface_depth(drawing.maps) if following else None
         self.client.scene.set_background_image(framed(images, window), format="jpeg", jpeg_quality=JPEG_QUALITY)
         self.index = drawing.index
-        self.told.content = f"After step {drawing.index:,}: {told}"
-        depth = surface_depth(drawing.maps) if following else None
         self.shown = None if depth is None else OnPage(view.camera, depth.numpy(), len(images), window)
+        self.told.content = f"After step {drawing.index:,}: {told}"
         if self.cursor is not None:
             self.cursor.changed()
 

@@ -3,6 +3,7 @@
 import io
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -20,6 +21,13 @@ FAILED = BlockState("failed", step=70, steps=300, error="numbers", began=1000.0,
 STATES = {0: RUNNING, 1: DONE, 2: BlockState(), 3: FAILED}
 
 
+def wait_until(what):
+    until = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.01)
+
+
 def test_time_left_of_a_block():
     assert (seconds_elapsed(RUNNING), steps_per_second(RUNNING), seconds_left(RUNNING)) == (20.0, 5.0, 34.0)
     assert describe_progress(RUNNING) == "step 130/300, 0:20, 0:34 left"
@@ -28,9 +36,11 @@ def test_time_left_of_a_block():
     assert seconds_elapsed(FAILED) is None and seconds_left(DONE) is None
 
 
-def test_a_block_that_is_worked_on_no_more():
+def test_a_block_that_is_worked_on_no_more(monkeypatch):
+    now = time.time()
+    monkeypatch.setattr("surfkit.cli.status.time", SimpleNamespace(time=lambda: now))
     state = {name: getattr(RUNNING, name) for name in KNOWN}
-    there = [Block(0, 9, **state | {"heard": time.time() - ago, "began": time.time() - 200}) for ago in (100, 0)]
+    there = [Block(0, 9, **state | {"heard": now - ago, "began": now - 200}) for ago in (100, 0)]
     (_, silent), (_, heard) = [row for row in rows(Status("stopped", blocks=tuple(there))) if row[0] == "block 0"]
     assert "running, but silent for 1:40, step 130 of 300" in silent and "left" not in silent
     assert "silent" not in heard and "5:40 left" in heard
@@ -50,12 +60,12 @@ def test_time_left_of_all_blocks():
 
 def test_lines_where_there_is_no_terminal(monkeypatch):
     monkeypatch.setattr("surfkit.blocks.display.PLAIN_EVERY_S", 0.02)
-    text = io.StringIO()
+    text, began = io.StringIO(), time.monotonic()
     with BlockDisplay(lambda: BlockProgress(STATES, 300, 2), Console(file=text)):
-        time.sleep(0.3)
+        wait_until(lambda: text.getvalue().count("\n") > 4)
     lines = text.getvalue().splitlines()
     assert set(lines) == {"1 of 4 blocks done, about 1:10 left; block 0: step 130/300, 0:20, 0:34 left"}
-    assert 1 < len(lines) < 16
+    assert len(lines) <= (time.monotonic() - began) / 0.02
 
 
 def test_a_table_on_a_terminal():
@@ -71,7 +81,7 @@ def test_a_larger_display_gets_the_sum(monkeypatch):
     monkeypatch.setattr("surfkit.blocks.display.DRAW_EVERY_S", 0.01)
     seen = []
     with progress.outer(lambda *line: seen.append(line)), BlockDisplay(lambda: BlockProgress(STATES, 300)):
-        time.sleep(0.2)
+        wait_until(lambda: seen)
     assert seen[0] == ("blocks", 130 + 300 + 70, 1200, "1 of 4 blocks done, about 2:20 left")
 
 

@@ -6,6 +6,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from two_blocks import EVERY, same
@@ -32,22 +33,22 @@ def block(undisturbed, tmp_path) -> Block:
 def test_heartbeats_while_no_step_is_made(block, monkeypatch):
     monkeypatch.setattr(worker, "HEARTBEAT_S", 0.0)
     block.write(status="running", step=3, heard=0.0)
+    began = time.time()
     with heartbeats(block):
-        until = time.monotonic() + 20
+        until = time.monotonic() + 60
         while not read_state(block.folder).heard and time.monotonic() < until:
             time.sleep(0.02)
         state = read_state(block.folder)
-    assert time.time() - state.heard < 20 and (state.status, state.step) == ("running", 3)
+    assert state.heard >= began and (state.status, state.step) == ("running", 3)
 
 
 def test_a_driver_that_goes_while_no_step_is_made(block, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setenv(DRIVER, str(os.getppid()))
-    began = time.monotonic()
     with pytest.raises(KeyboardInterrupt), heartbeats(block):
         monkeypatch.setattr(os, "getppid", lambda: 1)
-        time.sleep(20)
-    assert time.monotonic() - began < 15 and signal.getsignal(signal.SIGTERM) == before
+        time.sleep(60)
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.fixture
@@ -89,6 +90,23 @@ def test_a_worker_that_is_cut_off_is_not_declared_dead(elsewhere):
         loaded = opened(folder)
         assert schedule.record_failure(Block(loaded, read_plan(loaded).plan, 0), lost) == "failed: its machine is gone"
         assert read_state(folder / "blocks" / "000").status == status
+
+
+def test_a_worker_elsewhere_that_falls_silent_is_waited_for_no_more(elsewhere, monkeypatch):
+    """Also where that shows between two looks at it, after longer than a process of this machine is waited for."""
+    loaded, find, looks, now = opened(elsewhere(10)), schedule.find_remote_worker, [], [0.0]
+
+    def heard_until_now(place):
+        looks.append(place)
+        if len(looks) == 2:
+            elsewhere(STALE_S + 1)
+            now[0] += 2 * schedule.LEAVE_S
+        return find(place)
+
+    monkeypatch.setattr(schedule, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=lambda seconds: None))
+    monkeypatch.setattr(schedule, "find_remote_worker", heard_until_now)
+    schedule.await_workers(loaded)
+    assert len(looks) == 2
 
 
 def test_a_driver_waits_until_it_is_sure(elsewhere, undisturbed, data, recipe, monkeypatch):

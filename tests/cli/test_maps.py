@@ -69,7 +69,7 @@ def test_maps_go_on_after_the_process_was_killed(run, tmp_path):
     assert main([*words, str(tmp_path / "whole")]) == 0
     for what, done in (("drawing dsm", 3), ("shading", 2)):
         process = started([*words, str(tmp_path / "out")], tmp_path / "log", before=partial(kill_at, what, done))
-        process.join(60)
+        process.join(240)
         assert process.exitcode == -signal.SIGKILL, (tmp_path / "log").read_text()
         assert not (tmp_path / "out" / "maps.json").exists()
     assert main([*words, str(tmp_path / "out")]) == 0

@@ -55,7 +55,7 @@ def test_a_texture_goes_on_after_the_process_was_killed(run, tmp_path):
     assert main([*words, str(tmp_path / "whole")]) == 0
     for what in ("looking at photographs", "painting pages"):
         process = started([*words, str(tmp_path / "out")], tmp_path / "log", before=partial(kill_at, what, 1))
-        process.join(60)
+        process.join(240)
         assert process.exitcode == -signal.SIGKILL, (tmp_path / "log").read_text()
         assert not (tmp_path / "out").exists() and (tmp_path / "out.unfinished").is_dir()
     assert main([*words, str(tmp_path / "out")]) == 0

@@ -38,7 +38,7 @@ def test_agrees_with_plain_torch(load, size, kind):
     exact = x.double().requires_grad_()
     expected = ssim_reference(exact, y.double())
     (expected_gradient,) = torch.autograd.grad(0.3 * expected, exact)
-    assert value.dtype == torch.float32 and abs(float(value) - float(expected)) <= 1e-5
+    assert value.dtype == torch.float32 and abs(float(value) - expected.item()) <= 1e-5
     # Of equal images the gradient is 0 by cancellation of terms of the size of one over the number of values.
     error = (gradient - expected_gradient).norm()
     assert error <= 1e-4 * expected_gradient.norm() + 1e-7 / x.numel() ** 0.5

@@ -88,7 +88,8 @@ def test_how_each_ended_the_largest_first(workers, tmp_path):
 SAVING = (
     "import signal, sys, time\nfrom pathlib import Path\n"
     "def save(*_):\n    time.sleep(1)\n    Path('saved').touch()\n    sys.exit(130)\n"
-    "signal.signal(signal.SIGTERM, save)\nPath('began').write_text(str(os.getpid()))\n"
+    "signal.signal(signal.SIGTERM, save)\nPath('new').write_text(str(os.getpid()))\n"
+    "Path('new').rename('began')\n"
     "while os.getppid() == int(os.environ['SURFKIT_DRIVER']): time.sleep(0.05)\n"
     "save()"
 )
@@ -104,6 +105,7 @@ def test_leaving_stops_what_runs_and_what_waits(workers, tmp_path):
     def began():
         if (tmp_path / "000" / "began").exists():
             raise Stop
+        time.sleep(0.05)
         return [], []
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Stop):
@@ -165,12 +167,13 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     node = cluster.add_node(num_cpus=1, object_store_memory=SMALL["object_store_memory"], memory=SMALL["memory"])
     agent = node.all_processes["raylet"][0].process.pid
     reached, gone, command = tmp_path / "reached", tmp_path / "gone", schedule.job_of
+    tests = str(Path(__file__).parents[1])
     code = (
-        "import os, psutil, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
+        f"import psutil, sys, surfkit.run.stage as o\nsys.path[:0] = {[tests]}\n"
+        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
         f"there = {agent} in [parent.pid for parent in psutil.Process().parents()]\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if there and done.index == 7:\n"
-        f"            Path({str(reached)!r}).touch()\n"
-        f"            while not Path({str(gone)!r}).exists(): time.sleep(0.05)\n"
+        f"            await_sigterm(Path({str(reached)!r}))\n"
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
@@ -181,7 +184,6 @@ def test_a_node_is_lost(undisturbed, data, recipe, cluster, workers, tmp_path, m
     def lose():
         wait_for(reached.exists)
         cluster.remove_node(node, allow_graceful=False)
-        time.sleep(2)  # until the worker has noticed
         gone.touch()
 
     thread = threading.Thread(target=lose)

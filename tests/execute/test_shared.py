@@ -83,7 +83,14 @@ def test_an_agent_hears_ctrl_c_also_where_the_shell_ignores_it(tmp_path):
     """As in all that a shell begins in the background: Ray's way to cancel would mean nothing to it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     remote_job = RemoteJob(("-c", "import time; time.sleep(60)"), tmp_path / "log.txt")
-    asking = threading.Timer(0.5, _thread.interrupt_main)
+
+    def ask():
+        until = time.monotonic() + 60
+        while remote_job.process is None and time.monotonic() < until:
+            time.sleep(0.01)
+        _thread.interrupt_main()
+
+    asking = threading.Thread(target=ask)
     try:
         asking.start()
         with pytest.raises(KeyboardInterrupt):

@@ -55,7 +55,7 @@ SAVING = (
     "import signal, sys, time\nfrom pathlib import Path\n"
     "def save(*_):\n    time.sleep(0.3)\n    Path('saved').touch()\n    sys.exit(130)\n"
     "signal.signal(signal.SIGTERM, save)\n"
-    "Path('began').write_text(str(os.getppid()) + ' ' + str(os.getpid()))\ntime.sleep(60)"
+    "Path('new').write_text(str(os.getppid()) + ' ' + str(os.getpid()))\nPath('new').rename('began')\ntime.sleep(60)"
 )
 
 
@@ -90,7 +90,7 @@ def leave(tmp_path, monkeypatch):
     monkeypatch.setattr(slurm.Queue, "ended", ended)
     with pytest.raises(Stop):
         next(Slurm("local", parallel=2).run([job(tmp_path, at, SAVING) for at in (0, 1, 2)]))
-    assert not psutil.wait_procs(found, timeout=20)[1]
+    assert not psutil.wait_procs(found, timeout=60)[1]
     assert all((tmp_path / f"00{at}" / "saved").exists() for at in (0, 1)) and not (tmp_path / "002" / LOG).exists()
 
 
@@ -110,7 +110,7 @@ def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
     folder = tmp_path / "000"
 
     def kill():
-        wait_for(lambda: (folder / "began").exists() and len((folder / "began").read_text().split()) == 2)
+        wait_for((folder / "began").exists)
         processes(folder)[0].kill()
 
     thread = threading.Thread(target=kill)
@@ -123,11 +123,12 @@ def test_a_job_whose_agent_is_killed(tmp_path, monkeypatch):
 
 def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeypatch):
     """At the signal of Slurm the block saves its state, and the job that is queued again goes on; then as ever."""
-    reached, command = tmp_path / "reached", schedule.job_of
+    reached, command, tests = tmp_path / "reached", schedule.job_of, str(Path(__file__).parents[1])
     code = (
-        "import os, sys, time, surfkit.run.stage as o\nfrom pathlib import Path\nD = o.Display\n"
+        f"import sys, surfkit.run.stage as o\nsys.path[:0] = {[tests]}\n"
+        "from pathlib import Path\nfrom two_blocks import await_sigterm\nD = o.Display\n"
         "class K(D):\n    def show(self, done):\n        super().show(done)\n        if done.index == 7:\n"
-        f"            Path({str(reached)!r}).write_text(str(os.getppid())); time.sleep(1)\n"
+        f"            await_sigterm(Path({str(reached)!r}))\n"
         "o.Display = K\nfrom surfkit.cli import main\nsys.exit(main({words!r}))"
     )
 
@@ -138,7 +139,7 @@ def test_preempted_and_queued_again(undisturbed, data, recipe, tmp_path, monkeyp
         return replace(made, needs=(tmp_path / "elsewhere",)) if block.index == 1 else made
 
     def preempt():
-        wait_for(lambda: reached.exists() and reached.read_text())
+        wait_for(reached.exists)
         psutil.Process(int(reached.read_text())).parent().send_signal(signal.SIGUSR2)
 
     thread = threading.Thread(target=preempt)

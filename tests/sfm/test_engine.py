@@ -2,6 +2,7 @@
 
 import _thread
 import signal
+import threading
 import time
 from types import SimpleNamespace
 
@@ -24,13 +25,34 @@ def test_ctrl_c_cancels_the_work_and_waits_for_its_end(interruptible):
 
     def work(token):
         _thread.interrupt_main()
-        until = time.monotonic() + 20
+        until = time.monotonic() + 60
         while not token.is_cancelled and time.monotonic() < until:
             time.sleep(0.01)
-        _thread.interrupt_main()  # an impatient second one
-        time.sleep(0.3)
+        for _ in range(100):  # of somebody impatient, at any moment of the wait
+            _thread.interrupt_main()
+            time.sleep(0.003)
         ended.append(token.is_cancelled)
 
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        engine.run("waiting", work)
+    assert ended == [True] and signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_just_when_the_work_is_cancelled(interruptible, monkeypatch):
+    """Before it is waited for."""
+    ended, cancelled = [], threading.Event()
+
+    class Token:
+        def cancel(self):
+            cancelled.set()
+            _thread.interrupt_main()
+
+    def work(token):
+        _thread.interrupt_main()
+        ended.append(cancelled.wait(60))
+
+    monkeypatch.setattr(engine, "load_engine", lambda: SimpleNamespace(CancellationToken=Token))
     with pytest.raises(KeyboardInterrupt):
         engine.run("waiting", work)
     assert ended == [True]

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass, replace
 
 import pytest
 
 from surfkit.execute.base import Executor, Inline, JobResult
-from surfkit.testing import check_executor
+from surfkit.testing import check_executor, executors
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,9 @@ class Abandons(Plain):
         (Plain(places=0), "Plain.at_once is 0; it must be None or a whole number of 1 or more"),
     ],
 )
-def test_executors_that_are_wrong(executor, message):
+def test_executors_that_are_wrong(executor, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(executors, "QUIET_S", 60.0)  # it ends as soon as something is heard
     with pytest.raises(AssertionError, match=message):
         check_executor(executor)
     for process in Abandons.left:

@@ -7,6 +7,17 @@ from urllib.parse import urlencode, urlsplit
 
 from needs import needs
 
+LONG_S = 60.0
+"""No moment of a test waits longer: the machine may be busy with others meanwhile."""
+
+
+def wait_until(what, seconds=LONG_S):
+    """Until `what()` is true."""
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until, "it took too long"
+        time.sleep(0.01)
+
 
 class Browser:
     """Connects to a page with the token of its address, and says where its camera is."""
@@ -16,7 +27,8 @@ class Browser:
         self.messages = needs("viser._messages")
         at = urlsplit(url)
         protocol = f"viser-v{viser.__version__}"
-        self.socket = client.connect(f"ws://{at.netloc}/?{at.query}", subprotocols=[protocol], max_size=None)
+        settings = {"subprotocols": [protocol], "max_size": None, "open_timeout": LONG_S, "ping_timeout": LONG_S}
+        self.socket = client.connect(f"ws://{at.netloc}/?{at.query}", **settings)
         self.told, self.gui = [], {}
         self.stand(0.0)
 
@@ -54,7 +66,7 @@ class Browser:
         """Of all parts of the panel."""
         return [row["_markdown"] for row in self.gui.values() if row.get("_markdown")]
 
-    def wait_for(self, seen, seconds=20.0):
+    def wait_for(self, seen, seconds=LONG_S):
         """What `seen(self)` returns as soon as it is true, after messages that have come."""
         until = time.monotonic() + seconds
         while not (found := seen(self)):
@@ -93,7 +105,7 @@ class Browser:
 def get(page, target, **headers):
     """Status, body and headers of the answer of a served page to a request."""
     at = urlsplit(page.url)
-    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=10)
+    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=LONG_S)
     connection.request("GET", target, headers=headers)
     answer = connection.getresponse()
     return answer.status, answer.read(), answer.headers

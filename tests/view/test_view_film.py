@@ -1,16 +1,16 @@
 """Videos that the page makes of its camera path: what they show, stopping, going on, and what goes wrong."""
 
 import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import torch
-from browser import Browser
+from browser import LONG_S, Browser, wait_until
 from needs import needs
 
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import Frame
+from surfkit.view.film import FilmTool
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
 from surfkit.view.subject import Points, Subject
@@ -21,14 +21,23 @@ FRAMES = 8
 
 
 class Drawing:
-    """Draws the height of the camera as a grey; waits before a frame if it is told to."""
+    """Draws the height of the camera as a grey; waits before a frame if it is told to.
+
+    Attributes:
+        heights: That were drawn.
+        hold_at: Number of the frame before which it waits.
+        go_on: For what.
+        closing: Set when the server is about to end.
+        error: To raise.
+    """
 
     def __init__(self):
-        self.heights, self.hold_at, self.go_on, self.error = [], None, threading.Event(), None
+        self.heights, self.hold_at, self.error = [], None, None
+        self.go_on, self.closing = threading.Event(), None
 
     def __call__(self, view):
         if len(self.heights) == self.hold_at:
-            assert self.go_on.wait(30)
+            assert self.go_on.wait(LONG_S)
         if self.error is not None:
             raise self.error
         camera = view.camera
@@ -44,6 +53,7 @@ def path_on_page(drawing, folder):
     (folder / "a.ply").write_bytes(b"a model")
     subject = Subject(folder / "a.ply", FRAME, np.array([0.0, 0.0, 1.0]), points=CLOUD, draw=drawing)
     with served(Address(), "test") as page:
+        drawing.closing = page.closing
         show(subject, page, folder / "out")
         browser = Browser(page.url)
         browser.wait_for(Browser.is_whole)
@@ -70,7 +80,7 @@ def test_a_video_shows_the_path(tmp_path):
     drawing = Drawing()
     with path_on_page(drawing, tmp_path) as browser:
         browser.press("make the video")
-        browser.wait_for(lambda b: any("path-color-640x360.mp4` is written" in t for t in b.texts()), 60)
+        browser.wait_for(lambda b: any("path-color-640x360.mp4` is written" in t for t in b.texts()))
         browser.wait_for(lambda b: any(row.get("label") == "make the video" for row in b.gui.values()))
     assert np.allclose(drawing.heights, np.linspace(0.2, 0.9, FRAMES), atol=1e-6)
     frames = frames_of(tmp_path / "out" / "path-color-640x360.mp4")
@@ -80,21 +90,22 @@ def test_a_video_shows_the_path(tmp_path):
     assert names == ["path-color-640x360.mp4", "path.json"]
 
 
-def test_it_stops_and_goes_on(tmp_path):
-    drawing = Drawing()
+def test_it_stops_and_goes_on(tmp_path, monkeypatch):
+    drawing, clicks, clicked = Drawing(), [], FilmTool._clicked
     drawing.hold_at = 3
+    monkeypatch.setattr(FilmTool, "_clicked", lambda tool: clicks.append(clicked(tool)))
     with path_on_page(drawing, tmp_path) as browser:
         browser.press("make the video")
         browser.wait_for(lambda b: len(drawing.heights) == 3)
         browser.wait_for(lambda b: any(row.get("label") == "stop" for row in b.gui.values()))
         browser.press("stop")
-        time.sleep(0.3)  # for the click to come; the frame that is drawn comes to its end
-        drawing.go_on.set()
+        wait_until(lambda: len(clicks) == 2)
+        drawing.go_on.set()  # the frame that is drawn comes to its end
         browser.wait_for(lambda b: any("Stopped;" in t and "goes on." in t and "surfkit" not in t for t in b.texts()))
         out = tmp_path / "out"
         assert len(list((out / "path-color-640x360.mp4.frames").glob("*.png"))) == 4
         browser.press("make the video")
-        browser.wait_for(lambda b: any("is written" in t for t in b.texts()), 60)
+        browser.wait_for(lambda b: any("is written" in t for t in b.texts()))
         assert len(drawing.heights) == FRAMES, "each frame is drawn once"
         assert len(frames_of(out / "path-color-640x360.mp4")) == FRAMES
         browser.set("key views", "remove last")
@@ -108,13 +119,12 @@ def test_the_server_ends_meanwhile(tmp_path, capsys):
     drawing = Drawing()
     drawing.hold_at = 2
     with path_on_page(drawing, tmp_path) as browser:
+        drawing.go_on = drawing.closing
         browser.press("make the video")
         browser.wait_for(lambda b: len(drawing.heights) == 2)
-        threading.Timer(0.5, drawing.go_on.set).start()
-    until = time.monotonic() + 20
-    while any(thread.name == "video" for thread in threading.enumerate()):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+        thread = [each for each in threading.enumerate() if each.name == "video"][-1]
+    thread.join(LONG_S)
+    assert not thread.is_alive()
     assert len(drawing.heights) == 3 and not list((tmp_path / "out").glob("*.mp4"))
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "mp4 is not finished; the pictures so far are kept in" in said

@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from browser import Browser
+from browser import LONG_S, Browser
 from models import ORIGIN, data_set, like_3dgs
 from needs import needs, needs_native
 
@@ -32,6 +31,7 @@ from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
+from surfkit.view.film import FilmTool
 from surfkit.view.page import show
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, served
@@ -159,26 +159,33 @@ def test_files_that_the_page_writes(browser, page):
     assert str(out / "crop.json") in text and str(subject.path) in text
     places = subject.frame.to_input(subject.splats.means.numpy())
     assert 0.6 < crop.inside(places).mean() < 1
-    for _ in range(2):
+    for count in (1, 2):
         browser.press("add this view")
-    browser.wait_for(lambda b: any("2 key views" in t for t in b.texts()))
+        browser.wait_for(lambda b, n=count: any(f"{n} key views" in t for t in b.texts()))
     browser.press("write path file")
     browser.wait_for(lambda b: any("surfkit render" in t for t in b.texts()))
     assert len(json.loads((out / "path.json").read_text())["camera_path"]) == 300
 
 
 @needs_native
-def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys):
+def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys, monkeypatch):
     needs("cv2")
-    begun = threading.Event()
+    drawn, clicks, stopped, clicked = [], [], threading.Event(), FilmTool._clicked
 
-    def slow(view):
-        begun.set()
-        time.sleep(0.05)
+    def held(view):
+        drawn.append(view)
+        assert len(drawn) <= 3 or stopped.wait(LONG_S)
         return page[1].draw(view)
 
+    def stop(tool):
+        clicks.append(clicked(tool))
+        if len(clicks) == 2:
+            stopped.set()
+
+    monkeypatch.setattr(FilmTool, "_clicked", stop)
+
     with served(Address(), "test") as found:
-        show(replace(page[1], draw=slow), found, tmp_path)
+        show(replace(page[1], draw=held), found, tmp_path)
         browser = Browser(found.url)
         browser.wait_for(Browser.is_whole)
         for label, value in (("seconds", 1.0), ("size", "640x360")):
@@ -188,16 +195,16 @@ def test_a_video_that_was_stopped_goes_on_by_the_command(page, tmp_path, capsys)
             browser.press("add this view")
             browser.wait_for(lambda b, n=int(z): any(f"{n} key views" in t for t in b.texts()))
         browser.press("make the video")
-        browser.wait_for(lambda b: begun.is_set() and any(row.get("label") == "stop" for row in b.gui.values()))
+        browser.wait_for(lambda b: drawn and any(row.get("label") == "stop" for row in b.gui.values()))
         browser.press("stop")
         text = browser.wait_for(lambda b: next((t for t in b.texts() if "Stopped;" in t), None))
         browser.close()
-    drawn = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
-    assert 0 < len(drawn) < 30
+    there = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.png")}
+    assert 0 < len(there) <= 4
     words = shlex.split(re.search("`surfkit (.*)`", text)[1])
     assert main([*words, "--keep-frames", "--device", "cpu"]) == 0
     assert "30, 1.0 s at 30 per second" in capsys.readouterr().out
-    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in drawn.items()), (
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items()), (
         "what is there is not drawn again"
     )
     assert (tmp_path / "path-color-640x360.mp4").stat().st_size > 0
@@ -411,7 +418,7 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     )  # a shell's background has it ignored, for children too
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     signal.signal(signal.SIGINT, heard)
-    stop = threading.Timer(120, process.kill)
+    stop = threading.Timer(4 * LONG_S, process.kill)
     stop.start()
     lines = []
     while not any("Ctrl-C" in line for line in lines):
@@ -422,12 +429,14 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     browser.wait_for(lambda b: "/mesh" in b.names())
     browser.wait_for(Browser.is_whole)
     browser.set("seconds", 1000.0)
-    for label in ("add this view", "add this view", "preview"):
-        browser.press(label)
-        time.sleep(0.5)
+    for count in (1, 2):
+        browser.press("add this view")
+        browser.wait_for(lambda b, n=count: any(f"{n} key views" in t for t in b.texts()))
+    browser.press("preview")
+    browser.wait_for(lambda b: any(row["type"] == "SetCameraPositionMessage" for row in b.told))
     Browser(url).close()  # one that leaves at once
     os.kill(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=LONG_S)
     stop.cancel()
     assert process.returncode == 0 and "ended" in out and not err
     browser.close()
