@@ -30,6 +30,13 @@ def little_garbage():
     gc.collect()
 
 
+@pytest.fixture(autouse=True)
+def same_numbers():
+    """What is drawn at random does not depend on the tests before."""
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(0)
+
+
 class Loss(Component):
     """What is minimised."""
 
