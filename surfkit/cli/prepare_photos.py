@@ -193,9 +193,7 @@ def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
     except BadInput:  # of an estimator that is not here, or that the photographs do not suit any more
         outdated = True
     if outdated:
-        text = (
-            f"{scene / FOLDER} has depth maps of other cameras, which training would use; depth:NAME renews them"
-        )
+        text = f"{scene / FOLDER} has depth maps of other cameras, which training would use; depth:NAME renews them"
         emit(Warned(text))
 
 
