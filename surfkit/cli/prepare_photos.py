@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import tyro
 
+from surfkit.cli.prepare_depth import OVERVIEW, Depth
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
-from surfkit.core.codec import load, read_json
+from surfkit.core.codec import load, read_json, write_json
+from surfkit.core.events import Warned, emit
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
+from surfkit.core.registry import choice
+from surfkit.core.stages import Stages, key_of
+from surfkit.depth.base import DepthEstimator
+from surfkit.depth.prepare import Preparation as DepthMaps
+from surfkit.raster.select import Device, torch_device
+from surfkit.readers.data import Data, Reading
+from surfkit.readers.depth_files import FOLDER, read_record
+from surfkit.readers.depth_prior import trust_warning
+from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
+from surfkit.scene.camera import Camera
+from surfkit.scene.scene import View
+from surfkit.sfm.photographs import Photo
 from surfkit.sfm.prepare import PICTURE, Preparation
 from surfkit.sfm.settings import REPORT, WORK, Settings
 from surfkit.train.bars import bars
@@ -29,7 +46,8 @@ class Photos:
 
     SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
     positions in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one
-    with other settings or photographs does again only what depends on them.
+    with other settings or photographs does again only what depends on them. `depth:plane-sweep` or another estimator
+    makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
@@ -41,32 +59,94 @@ class Photos:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
     """How cameras are found."""
 
+    depth: Annotated[DepthEstimator | None, choice(DepthEstimator, optional=True)] = None
+    """How depth maps are estimated at the end, to SCENE/estimated_depths. By default they are not: `surfkit train`
+    makes those that its recipe uses."""
+
+    device: Device = "auto"
+    """Device for depth maps: auto, cpu, cuda, cuda:1, or that of a rasterizer, by its name (`surfkit components
+    rasterizer`)."""
+
+    def __post_init__(self) -> None:
+        if self.depth is None and self.device != "auto":
+            raise BadInput(f"--device {self.device} is for depth maps, and none are made; add depth:plane-sweep")
+
     @property
     def scene(self) -> Path:
         """The folder of the data set."""
         return self.out or self.photos.resolve().with_name(f"{self.photos.resolve().name}-scene")
 
     def run(self) -> None:
+        """Prepare, and print the results and what to do next."""
+        self.prepare()
+        uses = ", which uses the depth maps if its losses or its mesh look at some" if self.depth is not None else ""
+        print(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
+
+    def prepare(self) -> None:
         """Prepare, and print the results."""
         root, scene = self.photos, self.scene
         if not root.is_dir():
             raise BadInput(f"{root}: {'a file' if root.exists() else 'no such folder'}; name a folder of photographs")
         refuse_overlap(root, scene)
         refuse_foreign(scene)
-        with collect_notes(), bars(), locked(scene / WORK):
-            sweep(scene)
-            report = Preparation(root, scene, self.settings).run()
+        if self.depth is not None:
+            torch_device(self.device)
+            self.depth.refuse_missing()
+            refuse_foreign_maps(scene)
+        with collect_notes(), locked(scene / WORK):
+            before = maps_before(scene)
+            with bars():
+                sweep(scene)
+                report = Preparation(root, scene, self.settings, self._refuse_unfit).run()
+            if self.depth is not None:
+                write_json(scene / REPORT, report | {"depth_maps": {"estimator": self.depth}})  # to go on from
+                report |= self._depth_maps(self.depth)
+            elif before is not None:
+                report["depth_maps"] = before
+                warn_outdated(scene, before)
+            write_json(scene / REPORT, report)
         show(report, scene)
 
+    def _refuse_unfit(self, photos: Sequence[Photo]) -> None:
+        """BadInput if the estimator of depth does not fit photographs of these sizes."""
+        if self.depth is not None:
+            self.depth.refuse_unfit([_view(photo, *Reading().size(*photo.size)) for photo in photos])
 
-def settings_of(scene: Path) -> Settings:
-    """The settings that a scene was prepared with; the usual ones where none is complete."""
-    report = scene / REPORT
-    if not (scene / WORK).is_dir() or not report.is_file():
-        return Settings()
+    def _depth_maps(self, estimator: DepthEstimator) -> dict[str, Any]:
+        """Make the depth maps that are not there; what the report says of them, and the time of all stages."""
+        stages, command = Stages(self.scene / WORK), Depth(self.scene, estimator, device=self.device)
+        done = stages.run("depth maps", key_of(estimator), lambda: command.make(renew=True))
+        preparation = DepthMaps(Data(self.scene), estimator, torch_device(self.device))
+        scene = read(preparation.data)
+        count, lacking = len(preparation.views(scene)), preparation.lacking(scene)
+        covered = [step.coverage for step in done if step.coverage is not None]
+        if covered and (text := trust_warning(sum(covered) / len(covered))):
+            emit(Warned(text))
+        found = {"estimator": estimator, "photographs": count - len(lacking), "of": count, "without": lacking}
+        return {"depth_maps": found, "seconds": stages.seconds()}
+
+
+def as_before(photos: Path, device: Device) -> Photos:
+    """The command as it was last completed for a folder of photographs; with the usual settings where it was not.
+
+    Args:
+        photos: The folder.
+        device: Where depth maps are made, if some are.
+
+    Raises:
+        BadInput: The report of the scene is damaged.
+    """
+    usual = Photos(photos)
+    report = usual.scene / REPORT
+    if not (usual.scene / WORK).is_dir() or not report.is_file():
+        return usual
     try:
-        return load(Settings, read_json(report, dict[str, Any])["settings"])
-    except (BadInput, KeyError) as error:
+        told = read_json(report, dict[str, Any])
+        settings, maps = load(Settings, told["settings"]), maps_before(usual.scene)
+        if maps is None:
+            return replace(usual, settings=settings)
+        return replace(usual, settings=settings, depth=load(DepthEstimator, maps["estimator"]), device=device)
+    except (BadInput, KeyError, TypeError) as error:
         raise BadInput(f"{report}: damaged, or of another version; delete it to prepare the scene again") from error
 
 
@@ -84,6 +164,43 @@ def refuse_foreign(scene: Path) -> None:
         return
     if found := next((name for name in ("sparse", "images", REPORT) if (scene / name).exists()), None):
         raise BadInput(f"--out {scene} has {found} that this command did not make; name another folder")
+
+
+def refuse_foreign_maps(scene: Path) -> None:
+    """BadInput if a scene has depth maps that surfkit did not make: they would be replaced."""
+    if not read_record(scene) and any((scene / FOLDER).rglob("*.npy")):
+        raise BadInput(
+            f"{scene / FOLDER} holds depth maps that surfkit did not make; move it away, or make none: leave out "
+            "depth:NAME"
+        )
+
+
+def maps_before(scene: Path) -> dict[str, Any] | None:
+    """What the report of a scene says of the depth maps that this command made; None where there are none."""
+    try:
+        maps = read_json(scene / REPORT, dict[str, Any]).get("depth_maps")
+    except BadInput:
+        return None
+    return maps if isinstance(maps, dict) and (scene / FOLDER).is_dir() else None
+
+
+def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
+    """Say that the depth maps of a scene were made from other cameras than it has now, if so."""
+    data = Data(scene)
+    try:
+        preparation = DepthMaps(data, load(DepthEstimator, maps.get("estimator")), torch.device("cpu"))
+        outdated = preparation.is_outdated(preparation.material(read(data)))
+    except BadInput:  # of an estimator that is not here, or that the photographs do not suit any more
+        outdated = True
+    if outdated:
+        text = f"{scene / FOLDER} has depth maps of other cameras, which training would use; depth:NAME renews them"
+        emit(Warned(text))
+
+
+def _view(photo: Photo, width: int, height: int) -> View:
+    """A photograph before its camera is known."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), width, width, width / 2, height / 2, width, height)
+    return View(photo.name, camera, Path(photo.name))
 
 
 def show(report: dict[str, Any], scene: Path) -> None:
@@ -106,6 +223,8 @@ def show(report: dict[str, Any], scene: Path) -> None:
     if len(models) > 1:
         others = ", ".join(f"sparse/{at} of {model['photographs']}" for at, model in enumerate(models[1:], 1))
         rows.append(("other groups", f"{others} (--model sparse/1 trains one)"))
+    if "photographs" in (maps := report.get("depth_maps") or {}):
+        rows.append(("depth maps", f"of {maps['photographs']} of {maps['of']} photographs that are trained on"))
     rows.append(("seconds", ", ".join(f"{name} {value:.0f}" for name, value in report["seconds"].items())))
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
@@ -114,3 +233,5 @@ def show(report: dict[str, Any], scene: Path) -> None:
     if len(lost) > SHOWN:
         print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
     print(f"data set in {scene}; look at {scene / PICTURE}")
+    if report.get("depth_maps"):
+        print(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")

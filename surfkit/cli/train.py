@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,7 @@ import tyro
 
 import surfkit
 from surfkit.blocks.schedule import Compute
-from surfkit.cli.prepare_photos import Photos, settings_of
+from surfkit.cli.prepare_photos import as_before
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.result import show
 from surfkit.core.check import BadInput
@@ -195,9 +195,8 @@ class Train:
             return data
         if self.reading.images is not None:
             raise BadInput(f"--images {self.reading.images} with --prepare: name the folder of photographs with --data")
-        preparation = Photos(photos)
-        preparation = replace(preparation, settings=settings_of(preparation.scene))
-        preparation.run()
+        preparation = as_before(photos, self.device)
+        preparation.prepare()
         return preparation.scene
 
     def _data(self) -> Path:

@@ -74,6 +74,10 @@ class DepthEstimator(Component):
         """BadInput if the settings do not fit the photographs; asked before anything is written or deleted."""
         return None
 
+    def refuse_missing(self) -> None:
+        """BadInput if what it needs is not on this machine; asked before hours of other work."""
+        return None
+
     def notice(self) -> str | None:
         """What a user should know before the results are used, such as a licence."""
         return None

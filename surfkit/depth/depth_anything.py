@@ -58,6 +58,10 @@ class DepthAnythingV2(DepthEstimator):
         use = "" if self.size == "small" else ", which forbids commercial use"
         return f"the weights {self.source} are under {LICENCES[self.size]}{use}"
 
+    def refuse_missing(self) -> None:
+        """See `DepthEstimator.refuse_missing`."""
+        self.network()
+
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         network = self.network().to(given.device).eval()
         for at in wanted:

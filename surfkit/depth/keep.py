@@ -108,7 +108,7 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
     if not lacking:
         return False, made
     given, damaged = without_damaged(preparation.material(scene, tracks))
-    preparation.open(given.views)
+    preparation.open(given)
     wanted = [at for at, name in enumerate(names) if name in lacking and name not in damaged]
     count = len(names) - len(lacking) - len(made.without)
     made = replace(made, maps=count, without=(*made.without, *sorted(damaged & lacking)))

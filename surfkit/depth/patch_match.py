@@ -133,6 +133,10 @@ class PatchMatch(DepthEstimator):
         if not 0 < self.edge < 1:
             raise BadInput(f"edge is {self.edge:g}; it must lie between 0 and 1")
 
+    def refuse_missing(self) -> None:
+        """See `DepthEstimator.refuse_missing`."""
+        require_native()
+
     def refuse_unfit(self, views: Sequence[View]) -> None:
         """See `DepthEstimator.refuse_unfit`."""
         require_native()

@@ -39,7 +39,7 @@ from surfkit.scene.scene import Scene, View
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
 """What photographs do that are compared and give no depth."""
 MADE_FROM = "made_from"
-"""The file in the folder for work that says, as a digest, what the other files there were made from."""
+"""In the record, and a file in the folder for work: from which cameras and sparse points, as a digest."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class Preparation:
             BadInput: There are maps that something else made, or other settings; or no photograph can be read.
         """
         root, views = self.place, given.views
-        record, before = self.record(views), read_record(root)
+        record, before, whole = self.record(given), read_record(root), given
         paths = [map_path(root, view.name) for view in views]
         if not again and before != record and (before or any(path.exists() for path in paths)):
             raise BadInput(
@@ -134,12 +134,17 @@ class Preparation:
                 normal_path(path).unlink(missing_ok=True)
         if before != record or again:
             shutil.rmtree(self.work, ignore_errors=True)
-        self.open(views)
+        self.open(whole)
         return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
 
-    def open(self, views: Sequence[View]) -> None:
+    def is_outdated(self, given: DepthInput) -> bool:
+        """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""
+        before = read_record(self.place)
+        return bool(before) and before != self.record(given)
+
+    def open(self, given: DepthInput) -> None:
         """Make the folders, and say what the maps are."""
-        record = self.record(views)
+        record = self.record(given)
         if read_record(self.place) != record:
             write_record(self.place, record)
         self.work.mkdir(parents=True, exist_ok=True)
@@ -148,14 +153,16 @@ class Preparation:
         """Names of the views that have no map."""
         return [view.name for view in self.views(scene) if not map_path(self.place, view.name).exists()]
 
-    def record(self, views: Sequence[View]) -> dict[str, Any]:
+    def record(self, given: DepthInput) -> dict[str, Any]:
         """What depth.json says of the maps."""
+        views = given.views
         return {
             "estimator": dump(self.estimator),
             "surfkit": own_version(),
             "aligned": self.estimator.aligned,
             "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
             "matched": [view.name for view in views] if self.estimator.matched else None,
+            MADE_FROM: made_from(given),
         }
 
     def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
@@ -174,12 +181,7 @@ class Preparation:
 
         Its files are named by the position of a photograph, and depend on those that it is compared with.
         """
-        tracks = given.observations
-        parts = [digest(tracks.xyz), digest(tracks.error_px)]
-        for view in given.views:
-            seen = tracks.seen.get(view.name)
-            parts += [view.name, digest(view.camera), "" if seen is None else digest(seen)]
-        found, path = digest("\0".join(parts)), self.work / MADE_FROM
+        found, path = made_from(given), self.work / MADE_FROM
         if not path.exists() or path.read_text() != found:
             shutil.rmtree(self.work, ignore_errors=True)
             with replacing(path) as file:
@@ -195,6 +197,16 @@ class Preparation:
         return float((estimate.confidence > TRUSTED).float().mean())
 
 
+def made_from(given: DepthInput) -> str:
+    """A digest of the names and cameras of photographs, and of the sparse points that they show."""
+    tracks = given.observations
+    parts = [digest(tracks.xyz), digest(tracks.error_px)]
+    for view in given.views:
+        seen = tracks.seen.get(view.name)
+        parts += [view.name, digest(view.camera), "" if seen is None else digest(seen)]
+    return digest("\0".join(parts))
+
+
 def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """How maps were made whose record is another one, in a few words; it is empty if surfkit did not make them."""
     if not before:
@@ -203,6 +215,8 @@ def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return "with other settings"
     if before.get("surfkit") != now["surfkit"]:
         return f"by surfkit {before.get('surfkit', 'of another version')}"
+    if {**before, MADE_FROM: None} == {**now, MADE_FROM: None}:
+        return "from other cameras or sparse points"
     return "of other photographs, or of other sizes"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,11 +39,13 @@ class Preparation:
         root: Folder of the photographs; nothing is written there.
         scene: The data set.
         settings: How cameras are found.
+        refuse: Raises BadInput if the usable photographs do not fit what comes after the cameras.
     """
 
     root: Path
     scene: Path
     settings: Settings
+    refuse: Callable[[Sequence[Photo]], None] = lambda _: None
 
     @property
     def work(self) -> Path:
@@ -61,6 +63,7 @@ class Preparation:
         photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
+        self.refuse(usable)
         site = self._site(usable)
         found = compare(stages, usable, self.root, self.work, self.settings)
         key = key_of(found.key, self.settings.mapper, self.settings.seed)

@@ -18,6 +18,8 @@ MOST = 10_000_000
 """Points that are kept; a click looks among these."""
 AT_ONCE = 1_000_000
 """Points in memory besides."""
+RECORDS = {"WktCoordinateSystemVlr", "GeoKeyDirectoryVlr"}
+"""Of laspy, what a reference system is in."""
 COLORS = ("red", "green", "blue")
 
 
@@ -67,16 +69,18 @@ def _points(file: Any) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _notes(path: Path, header: Any) -> dict[str, str]:
-    """Reference system and unit, where the header has well-known text of a projected system."""
-    text = next((vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"), "")
-    if not text.strip("\0"):
+    """Reference system and unit, where the header has a projected one, as well-known text or as keys of GeoTIFF."""
+    if not {type(vlr).__name__ for vlr in (*header.vlrs, *(header.evlrs or ()))} & RECORDS:
         return {}
     try:
-        from rasterio.crs import CRS
-
-        found = CRS.from_wkt(text.rstrip("\0"))
-        number, unit = found.to_epsg(), found.linear_units_factor[1]
-    except Exception as error:  # no rasterio, or what it does not know
+        with needed("pyproj", "the reference system"):
+            import pyproj  # noqa: F401 (what laspy reads it with)
+        found = header.parse_crs()
+        if found is None:
+            raise BadInput("it is empty, or of no number of EPSG")
+        flat = found.sub_crs_list[0] if found.is_compound else found
+        number, unit = flat.to_epsg(), flat.axis_info[0].unit_conversion_factor if flat.axis_info else 1.0
+    except Exception as error:  # no pyproj, or what it does not know
         emit(Warned(f"{path}: coordinates are shown without their reference system: {' '.join(str(error).split())}"))
         return {}
-    return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and found.is_projected else {}
+    return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and flat.is_projected else {}

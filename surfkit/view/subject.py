@@ -13,6 +13,7 @@ import torch
 from surfkit.blocks.block import plan_file, read_plan
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.evaluate.geometry.place import Y_UP, Z_UP, notes_in, own_notes, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.export.files import read_splat_file
 from surfkit.export.gltf_reader import UPS
@@ -36,7 +37,7 @@ from surfkit.scene.scene import Frame, Scene, View
 from surfkit.texture.deliver import NAME
 from surfkit.texture.make import RECORD
 from surfkit.view.las import CLOUDS, read_las
-from surfkit.view.mesh_files import MESHES, Y_UP, Z_UP, Textured, notes_in, other_mesh, own_notes, root_of, textured
+from surfkit.view.mesh_files import MESHES, Textured, other_mesh, textured
 
 EXTENT = 0.9
 """Share of the positions in a file that lies within the extent of its local frame."""

@@ -1,6 +1,7 @@
 """`surfkit prepare photos`, from a folder of photographs of a known scene to a data set on the map."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from PIL import Image
 
 from surfkit.cli import main
+from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.earth import from_utm
@@ -295,3 +297,72 @@ def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared,
     assert scene.frame.crs == "EPSG:32633"
     for name, centre in cameras(scene).items():
         assert np.linalg.norm(centre - CENTRES[name.replace("_", " ")] - ORIGIN) < 0.2
+
+
+def maps_of(scene):
+    return {path.name: path.read_bytes() for path in (scene / "estimated_depths").glob("*.npy")}
+
+
+SMALL_MAPS = ("depth:plane-sweep", "--depth.longest", "48", "--device", "cpu")
+
+
+def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, monkeypatch, capsys):
+    scene, other = tmp_path / "s", tmp_path / "other"
+    for each in (scene, other):
+        shutil.copytree(prepared, each)
+    words = ["prepare", "photos", str(folder), "--out", str(scene), *QUICK]
+    seen, estimate = watched(monkeypatch), PlaneSweep.estimate
+
+    def interrupted(self, given, wanted):
+        yield next(estimate(self, given, wanted))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PlaneSweep, "estimate", interrupted)
+        assert main([*words, *SMALL_MAPS]) == 130
+    first = maps_of(scene)
+    assert len(first) == 2, "a map and its confidence"
+    capsys.readouterr()
+    assert main([*words, *SMALL_MAPS]) == 0 and seen == []
+    said = capsys.readouterr()
+    assert "1 of 5 photographs have depth maps already" in said.err
+    assert "of 5 of 5 photographs" in said.out and f"surfkit train recipe:surface --data {scene}" in said.out
+    report = json.loads((scene / "report.json").read_text())
+    assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (5, [])
+    assert report["depth_maps"]["estimator"]["longest"] == 48 and report["seconds"]["depth maps"] > 0
+    assert main(["prepare", "depth", str(other), "--estimator.longest", "48", "--device", "cpu"]) == 0
+    assert maps_of(scene) == maps_of(other) and maps_of(scene).items() >= first.items()
+
+    made = maps_of(scene)
+    assert main([*words, *SMALL_MAPS]) == 0 and maps_of(scene) == made
+    assert main([*words, "--lens", "RADIAL"]) == 0
+    assert "has depth maps of other cameras" in capsys.readouterr().err and maps_of(scene) == made
+    assert main([*words, "--lens", "RADIAL", *SMALL_MAPS]) == 0
+    assert maps_of(scene).keys() == made.keys() and maps_of(scene) != made, "of the new cameras"
+    capsys.readouterr()
+    assert main([*words, "--lens", "RADIAL"]) == 0
+    assert "depth maps of other" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("depth:plane-sweep", "--depth.window", "25", "--depth.longest", "32"), "window is 25, and the largest"),
+        (("depth:depth-anything-v2", "--depth.weights", "nowhere"), "depth-anything-v2 needs|nowhere cannot be loaded"),
+        (("--device", "cpu"), "--device cpu is for depth maps, and none are made; add depth:plane-sweep"),
+    ],
+)
+def test_depth_that_cannot_be_made_is_refused_before_the_work(folder, tmp_path, monkeypatch, capsys, words, said):
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK, *words]) == 2
+    err = capsys.readouterr().err
+    assert re.search(said, err) and "Traceback" not in err and seen == []
+
+
+def test_depth_maps_of_other_programs_stay(folder, prepared, tmp_path, capsys):
+    shutil.copytree(prepared, tmp_path / "s")
+    path = tmp_path / "s/estimated_depths/view 1.jpg.npy"
+    path.parent.mkdir()
+    np.save(path, np.ones((3, 4)))
+    assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK, *SMALL_MAPS]) == 2
+    assert "depth maps that surfkit did not make" in capsys.readouterr().err and np.load(path).shape == (3, 4)

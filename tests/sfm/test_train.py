@@ -70,6 +70,24 @@ def test_a_scene_prepared_otherwise_stays_as_it_is(photos, monkeypatch):
     assert (report["settings"]["features"], report["settings"]["lens"]) == (1500, "RADIAL")
 
 
+@needs_native
+def test_depth_maps_of_the_scene_are_taken_and_not_made_again(photos, monkeypatch, tmp_path):
+    """They are also brought up to date, as the rest of the scene."""
+    monkeypatch.setenv("SURFKIT_CACHE", str(tmp_path / "cache"))
+    words = ("depth:plane-sweep", "--depth.longest", "48", "--device", "cpu")
+    assert main(["prepare", "photos", str(photos), "--features", "1500", *words]) == 0
+    folder = photos.parent / "flight-scene/estimated_depths"
+    before = {path.name: path.stat().st_mtime_ns for path in folder.rglob("*.npy")}
+    assert len(before) == 2 * 4, "one of five is held out"
+    run = ["train", "recipe:surface", *QUICK[1:], "--data", str(photos), "--prepare", "--out"]
+    assert main([*run, str(tmp_path / "run")]) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in folder.rglob("*.npy")} == before
+    assert not list((tmp_path / "cache").rglob("*.npy")), "the recipe uses depth maps, and takes those"
+    save(photos / "day 1" / "5.jpg", picture(arc(6)[5]))
+    assert main([*run, str(tmp_path / "second")]) == 0
+    assert len(list(folder.rglob("*.npy"))) == 2 * 5
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

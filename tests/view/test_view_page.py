@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -32,6 +33,7 @@ from surfkit.run.notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
 from surfkit.view.film import FilmTool
+from surfkit.view.las import read_las
 from surfkit.view.page import show
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, served
@@ -440,3 +442,22 @@ def test_ctrl_c_ends_it_at_once(tmp_path):
     stop.cancel()
     assert process.returncode == 0 and "ended" in out and not err
     browser.close()
+
+
+@pytest.mark.parametrize(("number", "unit"), [(32633, 1.0), (2263, 1200 / 3937)])
+def test_las_files_with_keys_of_geotiff(tmp_path, monkeypatch, number, unit):
+    """The record is written here as GeoTIFF lays it out; 2263 is in US survey feet."""
+    laspy, _ = needs("laspy"), needs("pyproj")
+    header = laspy.LasHeader(version="1.2", point_format=0)
+    keys = struct.pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, number)
+    header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "keys", keys))
+    header.offsets = (512_000, 5_800_000, 90)
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = np.array([[512_001, 512_003], [5_800_001, 5_800_002], [90, 91]], np.float64)
+    made.write(tmp_path / "a.las")
+    notes = read_las(tmp_path / "a.las")[2]
+    assert notes["crs"] == f"EPSG:{number}" and np.isclose(float(notes["metres per unit"]), unit, rtol=1e-12)
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with collect_notes() as told:
+        assert read_las(tmp_path / "a.las")[2] == {}
+    assert any("needs the package pyproj" in each and "surfkit[crs]" in each for each in told.texts)

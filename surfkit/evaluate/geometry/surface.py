@@ -11,6 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
+from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.export.ply import TYPES, read_vertices
 from surfkit.readers.sparse_ply import read_points
 
@@ -83,6 +84,7 @@ def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
 def read_surface(path: Path) -> Surface:
     """The mesh or cloud in a file: PLY read here, block by block; OBJ, STL, GLB, OFF and text PLY meshes by trimesh.
 
+    Meshes of surfkit that leave out an offset, or are turned, are brought back to the coordinates of the input.
     Points that are not finite are left out, with a warning, and so are faces at such vertices.
 
     Raises:
@@ -172,7 +174,9 @@ def _other(path: Path) -> Surface:
     vertices, faces = getattr(loaded, "vertices", None), getattr(loaded, "faces", None)
     if vertices is None:
         raise BadInput(f"{path}: no mesh and no cloud of points in it")
-    return Surface(path, np.asarray(vertices, np.float64), None if faces is None else np.asarray(faces))
+    place = place_of(path, root_of(path))
+    vertices = np.asarray(vertices, np.float64) @ place.turn.T + place.offset
+    return Surface(path, vertices, None if faces is None else np.asarray(faces))
 
 
 def _sound(found: Surface) -> Surface:
