@@ -86,7 +86,8 @@ class DepthAnythingV2(DepthEstimator):
         except (OSError, ValueError, RuntimeError) as error:
             raise BadInput(
                 f"the weights {self.source} cannot be loaded: download them on a machine with a network, and give the "
-                f"folder with --estimator.weights ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
+                "folder with --estimator.weights, or --depth.weights in `surfkit prepare photos` "
+                f"({type(error).__name__}: {' '.join(str(error).split())[:160]})"
             ) from error
 
     def inverse_depth(self, network: Any, rgb: Tensor) -> Tensor:

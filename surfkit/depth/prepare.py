@@ -215,6 +215,8 @@ def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return "with other settings"
     if before.get("surfkit") != now["surfkit"]:
         return f"by surfkit {before.get('surfkit', 'of another version')}"
+    if MADE_FROM not in before and {**before, MADE_FROM: now[MADE_FROM]} == now:
+        return "by an earlier surfkit, which did not note of which cameras"
     if {**before, MADE_FROM: None} == {**now, MADE_FROM: None}:
         return "from other cameras or sparse points"
     return "of other photographs, or of other sizes"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +94,10 @@ def shorten(value: object) -> str:
 
 
 def load_pycolmap() -> Any:
-    """The module pycolmap, loaded after Pillow's PNG writer: the other way round, saving a PNG kills the process."""
+    """The module pycolmap, loaded after Pillow's PNG writer: the other way round, saving a PNG kills the process.
+
+    SIGTERM does what it did before: pycolmap would abort with a trace of the stack.
+    """
     import PIL.PngImagePlugin  # noqa: F401
 
     try:
@@ -100,4 +105,7 @@ def load_pycolmap() -> Any:
     except (ImportError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"pycolmap cannot be loaded: {reason}; is it installed, and is there memory for it?") from error
+    handler = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is threading.main_thread() and handler is not None:
+        signal.signal(signal.SIGTERM, handler)
     return pycolmap

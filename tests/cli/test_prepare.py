@@ -167,7 +167,11 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     assert main(["prepare", "depth", str(farm), *SMALL, "--scale", "2"]) == 2
     assert "made of other photographs, or of other sizes; --again" in capsys.readouterr().err
     record = path.with_name("depth.json")
-    record.write_text(json.dumps(json.loads(record.read_text()) | {"surfkit": "0.0.1"}))
+    whole = json.loads(record.read_text())
+    record.write_text(json.dumps({key: value for key, value in whole.items() if key != "made_from"}))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 2
+    assert "by an earlier surfkit, which did not note of which cameras; --again" in capsys.readouterr().err
+    record.write_text(json.dumps(whole | {"surfkit": "0.0.1"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     assert "made by surfkit 0.0.1; --again" in capsys.readouterr().err
 

@@ -2,6 +2,8 @@
 
 import _thread
 import signal
+import subprocess
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -70,3 +72,20 @@ def test_an_old_pycolmap_is_named(monkeypatch):
     monkeypatch.setattr(engine, "load_pycolmap", lambda: SimpleNamespace(__version__="3.11.1"))
     with pytest.raises(BadInput, match="needs pycolmap 4.2 or newer, this is 3.11.1"):
         engine.load_engine()
+
+
+@pytest.mark.parametrize(
+    ("before", "code"),
+    [("pass", -signal.SIGTERM), ("signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))", 7)],
+)
+def test_sigterm_does_what_it_did_before_pycolmap_was_loaded(before, code):
+    program = f"""
+import os, signal, sys, time
+{before}
+from surfkit.readers.capture import load_pycolmap
+load_pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+time.sleep(1)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (code, "")
