@@ -159,6 +159,31 @@ def test_pictures_upside_down_match_as_well(window):
     np.testing.assert_allclose(found[1][::-1, ::-1][inner], found[0][inner], atol=0.02)  # a 64th of a pixel, in noise
 
 
+@pytest.mark.parametrize("away", [(step * far, 0)[::flip] for far in (1, 3) for step in (-1, 1) for flip in (1, -1)])
+def test_the_plane_of_another_pixel_is_taken(away):
+    """By all kernels, whichever of the planes that are tried together is the right one."""
+    value = np.random.default_rng(0).integers(0, 256, (24, 32)).astype(np.uint8)
+    here = Grey(Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, 16.0, 12.0, 32, 24), value)
+    others = []
+    for axis in (0, 1):  # inverse depth 0.5 moves two pixels to the right, or down
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[axis, 3] = 2 / (30 * 0.5)
+        others.append(Grey(replace(here.camera, world_to_camera=pose), np.roll(value, 2, axis=1 - axis)))
+    x, y = 16 + away[0], 12 + away[1]
+    terms = replace(STILL, parallax=4.0)
+    rows, columns = np.mgrid[:24, :32]
+    wrong = (1 + 0.06 * ((columns + 5 * rows) % 31)).astype(np.float32)  # no two of those tried are alike
+    for kernels in module().kernels():
+        planes = Planes.at(wrong, 2)
+        planes.value[y, x, 0], planes.cost[y, x] = 0.5, 0
+        module().use_kernels(kernels)
+        try:
+            improve(here, others, planes, terms, seed=0)
+        finally:
+            module().use_kernels(module().kernels()[0])
+        assert planes.value[12, 16, 0] == 0.5 and planes.cost[12, 16] < 0.05, kernels
+
+
 def test_a_plane_costs_the_soft_minimum_of_its_views():
     """Of pictures that all become brighter to the right, with more and more noise."""
     draw = np.random.default_rng(5)
