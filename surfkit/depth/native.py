@@ -10,13 +10,14 @@ from itertools import groupby
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.native import module
 from surfkit.scene.camera import Camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grey:
     """A camera and the grey values that it saw.
 
@@ -114,7 +115,7 @@ def improve(
     planes: Planes,
     terms: Terms,
     seed: int,
-    known: Sequence[np.ndarray | None] | None = None,
+    known: Sequence[Tensor | None] | None = None,
 ) -> None:
     """One pass over both colours of the checkerboard, in place; no number of threads changes a bit.
 
@@ -134,7 +135,7 @@ def improve(
         pattern(terms.window),
         [other.packed for other in others],
         ways,
-        list(known or [None] * len(others)),
+        [None if inverse is None else inverse.numpy() for inverse in known or [None] * len(others)],
         planes.value,
         planes.cost,
         planes.each,

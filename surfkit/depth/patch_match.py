@@ -18,6 +18,7 @@ from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.depth.consistency import agreement, at_edge
+from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
@@ -156,10 +157,11 @@ class PatchMatch(DepthEstimator):
         depths = ((near, work.last.depth(near)) for near in work.pairs[at])
         others = [(work.camera(near, 0), depth) for near, depth in depths if depth is not None]
         share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
-        said = agreement(camera, found.inverse, others, share)
-        trust = said.trust(self.agree) * found.matched(self.best)
-        trust[at_edge(found.inverse, self.window // 2, self.edge)] = 0
-        return Estimate(at, said.fused, trust, found.normals(camera))
+        inverse = found.inverse.to(work.given.device)
+        said = agreement(camera, inverse, others, share)
+        trust = said.trust(self.agree).cpu() * found.matched(self.best)
+        trust[at_edge(inverse, self.window // 2, self.edge).cpu()] = 0
+        return Estimate(at, said.fused.cpu(), trust, found.normals(camera))
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class Round(NamedTuple):
     Attributes:
         what: What is done while they are made.
         map: Of the view at a position, or None where none can be made.
-        depth: (H, W) inverse depth alone, a seventh of the whole.
+        depth: (H, W) inverse depth alone, a seventh of the whole, on the device of the estimator.
         made: Positions of those that were made, or are not needed.
     """
 
@@ -204,6 +206,7 @@ class Work:
             for other in others:
                 self.users[other].append(at)
         self.sweep = InitialPoints(longest=settings.coarsest)
+        self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
         kept = self.room()
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * kept)(self.read)
@@ -226,7 +229,7 @@ class Work:
         """Of maps that `make` makes, if they are not in the folder for work yet."""
         made: set[int] = set()
         found = lru_cache(1)(lambda at: self.kept(what, at, make, made))
-        return Round(what, found, lru_cache(kept)(lambda at: inverse_of(found(at))), made)
+        return Round(what, found, lru_cache(kept)(lambda at: inverse_of(found(at), self.given.device)), made)
 
     def room(self) -> int:
         """How many pictures and maps are kept in memory."""
@@ -313,7 +316,7 @@ class Work:
                     samples=MANY if level == 0 and index == passes - 1 else FEW,
                     survey=index == 0 and level == self.levels(at),
                 )
-                improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
+                self.improve(here, there, planes, terms, seed=(at * 31 + level) * 31 + index)
         return Map(planes.value, planes.each, parallax)
 
     def passes(self, level: int, at: int) -> int:
@@ -327,12 +330,12 @@ class Work:
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         if found is None or span is None:
             return None
-        known = [None if (depth := before.depth(near)) is None else depth.numpy() for near in self.pairs[at]]
+        known = [before.depth(near) for near in self.pairs[at]]
         planes = Planes.at(found.value[..., 0], len(known))
         planes.value[:], planes.each[:] = found.value, found.each
         terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
         there = [self.grey(near, 0) for near in self.pairs[at]]
-        improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30 - self.rounds.index(before), known=known)
+        self.improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30 - self.rounds.index(before), known=known)
         return Map(planes.value, planes.each, found.parallax)
 
     def terms(self, span: tuple[float, float], parallax: float) -> Terms:

@@ -60,6 +60,6 @@ class Map:
         return -unit(away)
 
 
-def inverse_of(found: Map | None) -> Tensor | None:
-    """(H, W) inverse depth of a map."""
-    return None if found is None else found.inverse
+def inverse_of(found: Map | None, device: torch.device) -> Tensor | None:
+    """(H, W) inverse depth of a map, on a device."""
+    return None if found is None else found.inverse.to(device)

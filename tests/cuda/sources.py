@@ -6,6 +6,7 @@ from pathlib import Path
 
 from surfkit.compress.cuda import codes
 from surfkit.cuda.source import Source
+from surfkit.depth.cuda import passes
 from surfkit.mesh.cuda import grid
 from surfkit.raster.cuda import rasterizer, ssim
 from surfkit.train import adam
@@ -37,10 +38,12 @@ def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
     return rasterizer.source(name, KIND=kind, LEVEL=rasterizer.DISTORTION, CHOSEN=int(on_the_way_back), **width)
 
 
-SHIPPED: tuple[tuple[Source, dict[str, tuple[int, int]]], ...] = (
+SHIPPED: tuple[tuple[Source, dict[str, tuple[int, ...]]], ...] = (
     (adam.SOURCE, {"adam": (40, 0)}),
     (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
     (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
+    (passes.SOURCES[16], {"improve": (128, 0, 1000)}),
+    (passes.SOURCES[32], {"improve": (168, 0, 1000)}),
     (codes.SOURCE, {"approach": (112, 13_000), "settle": (64, 0), "sum_by_code": (48, 0)}),
     (raster("project"), {"measure": (128, 0), "record": (168, 0)}),
     (raster("forward"), {"forward": (85, 18_000)}),
@@ -48,4 +51,5 @@ SHIPPED: tuple[tuple[Source, dict[str, tuple[int, int]]], ...] = (
     (raster("gather"), {"gather": (168, 0)}),
     (raster("contribution"), {"contribution": (80, 7_000), "total": (56, 0), "probe": (56, 0)}),
 )
-"""Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have."""
+"""Each source with the most registers and bytes of shared memory that a thread and a block of each kernel may have; and
+bytes of a thread's own memory, where it keeps lists whose length is not known."""

@@ -266,8 +266,8 @@ def test_the_reprojection_error_counts_up_to_its_limit():
     z = (numbers[:9].reshape(3, 3) @ [16, 12, 1] + 0.5 * numbers[9:])[2]
     exact = np.full(there.value.shape, 0.5 / z, np.float32)  # the depth there of this pixel
     terms = replace(STILL, consistency=0.1)
-    improve(here, [there], with_maps, terms, seed=0, known=[exact])
-    improve(here, [there], with_wrong, terms, seed=0, known=[5 * exact])
+    improve(here, [there], with_maps, terms, seed=0, known=[torch.from_numpy(exact)])
+    improve(here, [there], with_wrong, terms, seed=0, known=[torch.from_numpy(5 * exact)])
     assert 0 <= with_maps.cost[12, 16] - plain.cost[12, 16] < 0.1  # less than a pixel: it is rounded to one there
     assert with_wrong.cost[12, 16] - plain.cost[12, 16] == pytest.approx(0.3, abs=1e-5)
 

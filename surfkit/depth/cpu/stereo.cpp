@@ -17,21 +17,7 @@ namespace surfkit {
 namespace {
 
 constexpr int kVectors = kSamples / kLanes;  // at most
-constexpr float kNoise = 1.0f;       // variance of grey values below which a window shows nothing
-constexpr float kTiny = 1e-30f;      // added to weights, which may all be zero where the middle of a window is not compared
-constexpr float kNothing = 2.0f;     // cost of a plane that a view does not show; more than that of any match
-constexpr float kOblique = 0.12f;    // least cosine between the normal of a plane and the ray
-constexpr float kMostError = 3.0f;   // pixels of reprojection
-constexpr float kMostBend = 2.0f;    // pixels of parallax between neighbours; more is an edge
-constexpr float kSame = 0.12f;       // pixels of parallax by which planes must differ in a window to be tried both
-constexpr float kAcross = 5.0f;       // pixels over which a difference of slopes counts in that
-constexpr float kHidden = 0.3f;      // cost above the best view's at which a view counts 1 / e of it
-constexpr float kFaint = 20.0f;      // variance of grey values at which a window doubles the smoothness
-constexpr float kNever = 1e9f;       // cost of a plane that is not tried
-constexpr int kTrials = 16;          // room for planes that are tried together
-constexpr int kLooked = 2;           // views that are looked at, for each one that counts
-constexpr int kKept = 6;             // planes that are looked at in all of these views, after the first half of them
-constexpr int kFraction = 6, kOne = 1 << kFraction;  // of a pixel, to which positions are rounded
+constexpr int kTrials = 16;  // room for planes that are tried together
 
 struct Window {
     Floats weight[kVectors], centred[kVectors];  // weights that sum to 1; times the grey values less their mean
@@ -413,7 +399,7 @@ struct Pixel {
         for (const auto& step : steps) {
             int best_x = -1, best_y = -1;
             float least = 1e9f;
-            for (int far = 1; far <= 11; far += 2) {
+            for (int far = 1; far <= kFarthest; far += 2) {
                 const int px = x + far * step[0], py = y + far * step[1];
                 if (px < 0 || py < 0 || px >= job.width || py >= job.height) break;
                 if (far == 1) {

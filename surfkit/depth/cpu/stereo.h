@@ -3,12 +3,9 @@
 
 #include <cstdint>
 
-namespace surfkit {
+#include "../stereo_terms.h"
 
-constexpr int kSamples = 32;   // most pixels of a window that are compared
-constexpr int kRadius = 8;     // most pixels from the middle of a window to its border
-constexpr int kMostViews = 16; // that one picture is compared with
-constexpr int kBorder = 32;    // pixels by which pictures to compare with are continued
+namespace surfkit {
 
 // A picture to compare with. A pixel (x, y) of inverse depth w falls on the pixel a (x, y, 1) + b w of it, over the third
 // component; pixels are numbered from the middle of the first one.

@@ -1,0 +1,1 @@
+"""PatchMatch on NVIDIA GPUs."""

@@ -1,0 +1,147 @@
+"""The passes of PatchMatch on a GPU: pictures stay there as long as they are kept, planes come and go."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from surfkit.cuda.modules import Kernels, kernels
+from surfkit.cuda.source import Source
+from surfkit.depth.native import Grey, Planes, Terms, pattern, way
+from surfkit.native import module
+from surfkit.scene.camera import Camera
+
+WIDE, HIGH = 32, 4
+"""Pixels of one colour that a block of threads takes: on so many columns of that colour, and rows."""
+
+
+class View(ctypes.Structure):
+    """`View` of patch_match.cu."""
+
+    _fields_ = (
+        ("first", ctypes.c_longlong),
+        ("first_inverse", ctypes.c_longlong),
+        ("size", ctypes.c_int * 2),
+        ("stride", ctypes.c_int),
+        ("inverse_size", ctypes.c_int * 2),
+        ("to_inverse", ctypes.c_float * 2),
+        ("way", ctypes.c_float * 12),
+        ("back", ctypes.c_float * 12),
+    )
+
+
+class Job(ctypes.Structure):
+    """`Job` of patch_match.cu."""
+
+    _fields_ = (
+        ("size", ctypes.c_int * 2),
+        ("counts", ctypes.c_int * 2),
+        ("survey", ctypes.c_int),
+        ("seed", ctypes.c_uint),
+        ("lens", ctypes.c_float * 4),
+        ("terms", ctypes.c_float * 7),
+        ("stretch", ctypes.c_float),
+        ("pattern", ctypes.c_float * 96),
+    )
+
+
+SOURCES = {
+    samples: Source(
+        Path(__file__).with_name("patch_match.cu"),
+        defines={"SAMPLES": samples, "BLOCKS": blocks},
+        structures={"View": View, "Job": Job},
+    )
+    for samples, blocks in ((16, 4), (32, 3))
+}
+"""By the pixels of a window that are compared. Windows are in registers; so many blocks fit on a multiprocessor."""
+
+
+class GpuPasses:
+    """`depth.native.improve` on a GPU.
+
+    Args:
+        device: The GPU.
+        load: Gives the kernels of a source; by default those for the device.
+    """
+
+    def __init__(self, device: torch.device, load: Callable[[Source], Kernels] | None = None) -> None:
+        self.device, self.load = device, load or (lambda source: kernels(source, device))
+        self.uploaded: WeakKeyDictionary[Grey, Tensor] = WeakKeyDictionary()
+
+    def improve(
+        self,
+        here: Grey,
+        others: Sequence[Grey],
+        planes: Planes,
+        terms: Terms,
+        seed: int,
+        known: Sequence[Tensor | None] | None = None,
+    ) -> None:
+        """See `depth.native.improve`; the same bits twice on one GPU."""
+        on = self.load(SOURCES[terms.samples])
+        pictures = [self.picture(other) for other in others]
+        nothing = torch.empty(0, 0, device=self.device)
+        maps = [nothing if found is None else found.to(self.device) for found in known or [None] * len(others)]
+        views = self.uploads(np.frombuffer(views_of(here.camera, others, pictures, maps), np.uint8))
+        given = self.picture(here), joined(pictures), joined(maps)
+        state = [self.uploads(part) for part in (planes.value, planes.cost, planes.each)]
+        height, width = planes.cost.shape
+        grid = -(-width // (2 * WIDE)), -(-height // HIGH)
+        job = job_of(here.camera, len(others), terms, seed)
+        for colour in (0, 1):
+            on.launch("improve", grid, WIDE * HIGH, job, colour, views, *given, *state)
+        for part, found in zip((planes.value, planes.cost, planes.each), state, strict=True):
+            part[:] = found.cpu().numpy()
+
+    def picture(self, grey: Grey) -> Tensor:
+        """`Grey.packed` on the GPU, as long as it is kept here."""
+        if grey not in self.uploaded:
+            self.uploaded[grey] = self.uploads(grey.packed.view(np.int32))
+        return self.uploaded[grey]
+
+    def uploads(self, values: np.ndarray) -> Tensor:
+        """A copy of an array on the GPU."""
+        return torch.from_numpy(values.copy()).to(self.device)
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """All numbers of several tensors, one after the other: kernels take buffers by name, not lists of them."""
+    return torch.cat([part.flatten() for part in parts])
+
+
+def views_of(here: Camera, others: Sequence[Grey], pictures: Sequence[Tensor], maps: Sequence[Tensor]) -> ctypes.Array:
+    """A `View` for each picture to compare with, of those that are joined."""
+    border = module().STEREO_BORDER
+    made = (View * len(others))()
+    first = first_inverse = 0
+    for view, other, picture, inverse in zip(made, others, pictures, maps, strict=True):
+        height, width = (side - 2 * border for side in picture.shape)
+        view.first, view.first_inverse = first, first_inverse
+        view.size[:], view.stride, view.inverse_size[:] = (width, height), picture.shape[1], inverse.shape[::-1]
+        view.to_inverse[:] = inverse.shape[1] / width, inverse.shape[0] / height
+        view.way[:], view.back[:] = way(here, other.camera), way(other.camera, here)
+        first, first_inverse = first + picture.numel(), first_inverse + inverse.numel()
+    return made
+
+
+def job_of(camera: Camera, views: int, terms: Terms, seed: int) -> Job:
+    """What a pass is told of one picture."""
+    offsets = pattern(terms.window)
+    most = max(1.0, float(np.abs(offsets[:2]).max()))
+    numbers = terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread
+    return Job(
+        (camera.width, camera.height),
+        (views, terms.best),
+        terms.survey,
+        seed % 2**32,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        numbers,
+        (module().STEREO_BORDER - 2) / most,
+        tuple(offsets.flatten().tolist()),
+    )
