@@ -2,8 +2,9 @@
 
 For surfels and ellipsoids, at 1600 x 1200: milliseconds of each part of a step at 1, 5 and 10 million points, pictures
 a second, bytes of a point, what the decomposed gradient costs; the same scene with gsplat, where that is installed; how
-long a photograph takes to the GPU; fusing a depth map, and k-means; and a training on examples/boruszyn beside the
-same on the CPU. Medians after a warm-up. With `--device native` the CPU stands in, to try this program out.
+long a photograph takes to the GPU; a pass of PatchMatch, fusing a depth map, and k-means; and a training on
+examples/boruszyn beside the same on the CPU. Medians after a warm-up. With `--device native` the CPU stands in, to try
+this program out.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from scenes import city
 from surfkit.compress.cuda.codes import GpuSearch
 from surfkit.compress.cuda.codes import sums as gpu_sums
 from surfkit.compress.kmeans import nearest, sums
+from surfkit.depth.cuda.passes import GpuPasses
+from surfkit.depth.native import Grey, Planes, Terms, improve
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.lattice import Lattice, Picture
 from surfkit.mesh.native import grid
@@ -145,6 +148,32 @@ def upload(device: torch.device, rounds: int) -> float:
     return milliseconds(lambda: uploaded(photo, device), rounds, device)
 
 
+def matching(device: torch.device, rounds: int) -> dict[str, float]:
+    """Milliseconds of a pass of PatchMatch with 16 photographs of 1600 x 1200 pixels, and of moving its planes."""
+    draw, pose = np.random.default_rng(0), torch.eye(4, dtype=torch.float64)
+    value = draw.integers(0, 256, SIZE[::-1]).astype(np.uint8)
+    seen = []
+    for at in range(17):
+        pose = pose.clone()
+        pose[0, 3] = -0.01 * at
+        camera = Camera(pose, 1000.0, 1000.0, SIZE[0] / 2, SIZE[1] / 2, *SIZE)
+        seen.append(Grey(camera, np.roll(value, -10 * at, 1)))
+    planes = Planes.at(draw.uniform(0.5, 1.5, value.shape).astype(np.float32), 16)
+    planes.each[:] = draw.integers(0, 256, planes.each.shape)
+    known = [torch.full(value.shape, 1.0, device=device)] * 16
+    terms = Terms(0.2, 2, 80, 0.25, 0.015, 0.2, 15, samples=32, best=3, window=7, survey=False)
+    use = GpuPasses(device).improve if device.type == "cuda" else improve
+
+    def moved() -> None:
+        for part in (planes.value, planes.cost, planes.each):
+            torch.from_numpy(part.copy()).to(device).cpu()
+
+    return {
+        "a pass": milliseconds(lambda: use(seen[0], seen[1:], planes, terms, 0, known), rounds, device),
+        "planes to and fro": milliseconds(moved, rounds, device),
+    }
+
+
 def fusing(device: torch.device, rounds: int) -> float:
     """Milliseconds of fusing a depth map of 1600 x 1200 pixels of the size of a voxel, after a first one."""
     lattice, pose = Lattice(0.01, 0.04), torch.eye(4, dtype=torch.float64)
@@ -192,6 +221,8 @@ def main() -> None:
     rasterizer, title = select(options.device)
     device = rasterizer.where()
     figures: dict[str, object] = {"device": title, "upload of 12 MP, ms": upload(device, options.rounds)}
+    figures["matching a view, ms"] = matching(device, options.rounds)
+    print(json.dumps(figures), flush=True)
     figures["fusing a view, ms"] = fusing(device, options.rounds)
     figures["k-means, ms"] = clustering(device, options.rounds)
     for kind, name in KINDS.items():

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from surfkit.depth.patch_match import PatchMatch
@@ -32,6 +31,5 @@ def test_patch_match_has_maps_as_good_as_on_the_cpu(tmp_path):
     here, there, depth = both(PatchMatch(neighbours=3, passes=1, rounds=1), tmp_path)
     shown = depth > 0
     right = [float(((1 / (each.inverse * depth) - 1).abs() < 0.02)[shown].float().mean()) for each in (here, there)]
-    print(right, float((here.confidence - there.confidence).abs().mean()), float((here.inverse / there.inverse - 1).abs().lt(.005).float().mean()), here.confidence.mean())
     assert right[0] > 0.3 and abs(right[1] - right[0]) < 0.02
     assert not there.inverse.equal(here.inverse)
