@@ -1,6 +1,7 @@
 """What is built holds all files that the code reads: templates, styles, scripts, and packages within packages."""
 
 import fnmatch
+import re
 import subprocess
 from pathlib import Path
 
@@ -53,3 +54,19 @@ def test_packages_of_this_repository_are_built_whole(folder):
     assert not [path for path in there if path.suffix != ".py"], "setuptools leaves out what package-data does not name"
     packages = {".".join(path.relative_to(folder).parent.parts) for path in there}
     assert packages == set(settings["packages"])
+
+
+@pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="surfkit is installed, and is not a checkout")
+def test_the_lowest_versions_are_those_that_were_tried():
+    """The file of constraints with which tests were run; `pip` takes whatever is allowed and there."""
+    said = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    groups = [said["dependencies"], *said["optional-dependencies"].values()]
+    lowest = {}
+    for name, version in (re.match(r"([\w-]+)>=([\d.]+)", each).groups() for group in groups for each in group):
+        lowest.setdefault(name, set()).add(version)
+    lines = (ROOT / "constraints-lowest.txt").read_text().splitlines()
+    tried = dict(line.split("==") for line in lines if not line.startswith("#"))
+    core = {re.match(r"[\w-]+", each)[0] for each in said["dependencies"]}
+    assert core - set(tried) == {"torch"}
+    for name, version in tried.items():
+        assert any(f"{version}.".startswith(f"{least}.") for least in lowest[name]), (name, version, lowest[name])

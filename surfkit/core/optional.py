@@ -13,7 +13,7 @@ from surfkit.core.memory import is_out_of_memory
 EXTRAS = {
     "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "laspy": "maps", "lazrs": "maps",
     "lpips": "lpips", "open3d": "mesh", "pyogrio": "maps", "pyproj": "crs", "rasterio": "maps", "ray": "ray",
-    "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "viser": "view",
+    "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "trimesh": "mesh", "viser": "view",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""
 INSTALLED_AS = {"cv2": "opencv-python-headless", "fast_simplification": "fast-simplification"}

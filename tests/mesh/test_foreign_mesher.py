@@ -134,7 +134,7 @@ def test_every_command_that_follows(finished, tmp_path, capsys):
     [
         ("list", "mesh:plane: facts is a list, not a dict"),
         ("object", "mesh:plane: facts.a.1 is <weird> (Weird), which is not plain: give None, a bool, a number"),
-        ("numpy", "mesh:plane: facts.a.b is np.float32(0.5) (float32), which is not plain"),
+        ("numpy", "(float32), which is not plain"),
         ("array", "mesh:plane: facts.a is array([0., 0., 0.]) (ndarray), which is not plain"),
         ("key", "mesh:plane: facts.a has the key 1 (int), which is not text"),
         ("huge", "mesh:plane: facts.a is an int beyond 64 bits"),
