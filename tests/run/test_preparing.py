@@ -336,6 +336,8 @@ def test_making_maps_makes_room(farm, recipe, tmp_path, own_cache):
     assert str(left) == record(tmp_path / "b")["data"]["priors"]
     with pytest.raises(BadInput, match="--prepare-cache lots: give a size"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="lots"))
+    with pytest.raises(BadInput, match="--prepare-cache -1GB: give a size such as 4GB or 500MB$"):
+        run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="-1GB"))
     with pytest.raises(BadInput, match="--prepare-cache auto: give a size such as 20GB"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="auto"))
 
