@@ -193,7 +193,9 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
 
 def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, recipe, tmp_path, own_cache, monkeypatch):
     seen = counting(monkeypatch)
-    with pytest.raises(BadInput, match="surfkit prepare depth .*depth:patch-match, or choose start:sparse") as refused:
+    with pytest.raises(
+        BadInput, match="prepare depth .*without --no-prepare .*depth:patch-match, or choose start:sparse"
+    ) as refused:
         run(recipe, farm, tmp_path / "a", caches=CacheSettings(maps=None))
     assert "\n" not in str(refused.value) and not (tmp_path / "a").exists()
     sparse = replace(recipe, start=Recipe().start)
