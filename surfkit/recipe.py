@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Literal
@@ -174,7 +175,20 @@ class Recipe:
         return tuple(each.name for each in fields(self) if each.name not in used)
 
 
+def _refuse_weights(path: str, stage: Stage) -> None:
+    """BadInput for a weight that is not finite or below 0, with which a term would be left out without a word."""
+    terms = {f"losses.{key}": loss for key, loss in stage.losses.items()}
+    terms |= {f"regularizers.{key}": term for key, term in stage.regularizers.items()}
+    for key, term in terms.items():
+        for index in (1, stage.steps):
+            if not 0 <= (weight := term.weight_at(index, stage.steps)) < math.inf:
+                raise BadInput(
+                    f"{path}.{key}: its weight in step {index} is {weight:g}; it must be 0 or more, and finite"
+                )
+
+
 def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
+    _refuse_weights(path, stage)
     columns = primitive.columns()
     lacking = [name for name in stage.rates if name not in columns]
     if unknown := [name for name in lacking if name not in RATES]:

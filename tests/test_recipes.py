@@ -192,3 +192,21 @@ def test_a_recipe_that_could_not_be_read_again_is_refused_before_it_runs(part, t
     finally:
         plugins().unregister(offers)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("loss", "said"),
+    [
+        (L1(weight=-1.0), "its weight in step 1 is -1; it must be 0 or more, and finite"),
+        (SSIM(weight=float("inf")), "its weight in step 1 is inf"),
+        (DepthRegression(start=1.0, end=float("inf")), r"its weight in step \d+ is inf"),
+        (Distortion(weight=-0.5, start=1), r"its weight in step \d+ is -0.5"),
+    ],
+)
+def test_weights_that_make_no_sense_are_refused(loss, said):
+    """A negative one left the loss out without a word; an infinite one ended a run as if a photograph was at fault."""
+    recipe = recipes()["2dgs"]
+    recipe.refuse_unfit()
+    stage = replace(recipe.pretrain, losses=recipe.pretrain.losses | {"other": loss})
+    with pytest.raises(BadInput, match=rf"^pretrain\.losses\.other: {said}"):
+        replace(recipe, pretrain=stage).refuse_unfit()

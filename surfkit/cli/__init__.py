@@ -85,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return READER_LEFT
         if not lost and error.errno not in DISK_FULL:
             raise
-        where = f"standard {lost[0]}" if lost else "what was being written"
+        where = f"standard {lost[0]}" if lost else os.fsdecode(error.filename or "what was being written")
         with suppress(OSError):
             print(f"surfkit: {where}: {error.strerror}; what is finished is kept", file=sys.stderr)
         return 1
@@ -141,7 +141,7 @@ def _error_line(error: Exception, words: list[str]) -> tuple[str, int] | None:
         return f"{text}; {MEMORY_ADVICE.get(words[0], 'more memory is needed')}", 1
     if isinstance(error, (FileExistsError, NotADirectoryError)) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: a file is in the place of a folder; name another", 2
-    if isinstance(error, OSError) and error.filename is not None:  # no permission, a folder in the place of a file
+    if isinstance(error, OSError) and error.filename is not None and error.errno not in DISK_FULL:  # no permission
         return f"{os.fsdecode(error.filename)}: {error.strerror}", 2
     return None
 

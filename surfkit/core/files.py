@@ -34,6 +34,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(unfinished, path)
         sync_folder(path.parent)
+    except OSError as error:
+        if error.errno in DISK_FULL and error.filename is None:  # writing does not say to which file
+            error.filename = str(path)
+        raise
     finally:
         unfinished.unlink(missing_ok=True)
 

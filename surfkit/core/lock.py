@@ -68,7 +68,13 @@ def mark_used(folder: Path) -> Iterator[None]:
     """Within, `is_used` is true for the folder, also in other processes."""
     import fcntl
 
-    file = os.open(folder / USED, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        file = os.open(folder / USED, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise
+        yield  # what cannot be written to, nobody deletes either
+        return
     try:
         os.utime(folder / USED)
         with suppress(OSError):  # where there are no locks, the time alone tells

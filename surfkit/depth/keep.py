@@ -10,13 +10,14 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump
-from surfkit.core.events import Progress, emit, say
-from surfkit.core.files import sweep
+from surfkit.core.events import Progress, Warned, emit, say
+from surfkit.core.files import DISK_FULL, sweep
 from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
 from surfkit.depth.prepare import Preparation, without_damaged
+from surfkit.readers.depth_files import FOLDER, RECORD, is_whole, map_path, read_record, write_record
 from surfkit.readers.fingerprint import Fingerprint, digest
 from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
@@ -53,7 +54,8 @@ def maps(
 ) -> Iterator[tuple[Path, Made]]:
     """Within, there are maps of the training views of a scene: their folder, and what is known of them.
 
-    Those that are not there are made; nobody deletes them meanwhile.
+    Those that are not there, or damaged, are made; nobody deletes them meanwhile. A cache that can only be read is used
+    as it is if nothing is missing.
 
     Args:
         preparation: How; of its folder, nothing is used.
@@ -64,16 +66,37 @@ def maps(
 
     Raises:
         BadInput: The cache cannot be written to, or the estimator cannot work.
+        Fault: The disk is full.
     """
     folder = folder_of(key)
+    preparation, scene = replace(preparation, root=folder), replace(scene, held_out=())
+    if folder.is_dir() and not os.access(folder, os.W_OK) and is_complete(preparation, scene):
+        yield folder, read_made(folder)
+        return
     with ExitStack() as use:
         with hold_folder(folder, preparation.data.path):
             sweep(folder)
             use.enter_context(mark_used(folder))
-            fresh, made = make_missing(replace(preparation, root=folder), replace(scene, held_out=()), tracks)
-        if fresh:
-            make_room(folder, budget_bytes)
+            with full_cache_in_one_line(folder):
+                fresh, made = make_missing(preparation, scene, tracks)
+        if fresh and (left := make_room(folder, budget_bytes)) > budget_bytes:
+            most = f"more than the {budget_bytes / 1e9:.2g} GB of --prepare-cache"
+            emit(Warned(f"depth maps that are in use take {left / 1e9:.2g} GB, {most}, and are kept"))
         yield folder, made
+
+
+@contextmanager
+def full_cache_in_one_line(folder: Path) -> Iterator[None]:
+    """Within, a disk that is full becomes a `Fault` that names the folder in the cache."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        raise Fault(
+            f"{error.filename or folder}: the disk is full ({error.strerror}); free some space, and the same command "
+            "goes on after the depth maps that are done, or set SURFKIT_CACHE to a folder on another disk"
+        ) from error
 
 
 @contextmanager
@@ -103,14 +126,24 @@ def hold_folder(folder: Path, data: Path) -> Iterator[None]:
 def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -> tuple[bool, Made]:
     """Make the maps that are not there, one after the other; whether there were any, and what is known of all."""
     folder, names = preparation.place, [view.name for view in scene.train]
+    if broken := damaged_maps(preparation, scene):
+        emit(
+            Warned(f"{folder}: damaged depth maps, {len(broken)} of {len(names)}, {broken[0]} for one, are made again")
+        )
+        for name in broken:
+            map_path(folder, name).unlink()
+    if not (is_known := has_record(folder)):
+        (folder / FOLDER / RECORD).unlink(missing_ok=True)
     made = read_made(folder)
     lacking = set(preparation.lacking(scene)) - set(made.without)
+    count = len(names) - len(lacking) - len(made.without)
     if not lacking:
-        return False, made
+        if not is_known:
+            write_record(folder, preparation.record(preparation.material(scene, tracks)))
+        return False, replace(made, maps=count)
     given, damaged = without_damaged(preparation.material(scene, tracks))
     preparation.open(given)
     wanted = [at for at, name in enumerate(names) if name in lacking and name not in damaged]
-    count = len(names) - len(lacking) - len(made.without)
     made = replace(made, maps=count, without=(*made.without, *sorted(damaged & lacking)))
     write_made(folder, made)
     begun, before, total = time.process_time(), made.cpu_seconds, len(names) - len(made.without)
@@ -124,8 +157,32 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
     return True, made
 
 
-def make_room(mine: Path, budget_bytes: int) -> None:
-    """Delete the folders of maps that are longest unused, and not in use, until all take no more than a budget."""
+def damaged_maps(preparation: Preparation, scene: Scene) -> list[str]:
+    """Names of the training views whose map is there, and cannot be used."""
+    paths = {view.name: map_path(preparation.place, view.name) for view in scene.train}
+    oriented = preparation.estimator.oriented
+    return [name for name, path in paths.items() if path.exists() and not is_whole(path, oriented)]
+
+
+def has_record(folder: Path) -> bool:
+    """Whether it is written down in a folder what its maps are."""
+    with suppress(BadInput):
+        return bool(read_record(folder))
+    return False
+
+
+def is_complete(preparation: Preparation, scene: Scene) -> bool:
+    """Whether no map is missing or damaged."""
+    lacking = set(preparation.lacking(scene)) - set(read_made(preparation.place).without)
+    return not lacking and has_record(preparation.place) and not damaged_maps(preparation, scene)
+
+
+def make_room(mine: Path, budget_bytes: int) -> int:
+    """Delete the folders of maps that are longest unused, and not in use, until all take no more than a budget.
+
+    Returns:
+        Bytes of those that are left.
+    """
     for left in mine.parent.glob(f"{DROPPED}*"):  # of a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     folders = [path for path in mine.parent.iterdir() if path.is_dir() and not path.name.startswith(".")]
@@ -134,6 +191,7 @@ def make_room(mine: Path, budget_bytes: int) -> None:
     for path in sorted(folders, key=last_used):
         if total > budget_bytes and path != mine and drop_folder(path):
             total -= sizes[path]
+    return total
 
 
 def folder_bytes(folder: Path) -> int:

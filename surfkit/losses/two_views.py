@@ -46,7 +46,7 @@ class TwoViews:
     """Which rendered depth is the surface, in both views: the expected one moves all splats of a pixel."""
 
     def __post_init__(self) -> None:
-        if self.weight < 0 or self.every < 1 or not self.limit > 0:
+        if not 0 <= self.weight < float("inf") or self.every < 1 or not self.limit > 0:
             given = f"weight {self.weight:g}, every {self.every}, limit {self.limit:g}"
             raise BadInput(f"{type(self).__name__} has {given}; give 0 or more, 1 or more, and a limit above 0")
 

@@ -65,7 +65,7 @@ class Agreement(Trust):
         for name, low, high in (("alone", 0, 1), ("opaque", 0, 1), ("spread", 0, 1), ("confirmed", 1, 4)):
             if not low <= getattr(self, name) <= high:
                 raise BadInput(f"mesh.trust.{name} is {getattr(self, name):g}; it must be from {low} to {high}")
-        if self.neighbours < 1 or not self.enough > 0:
+        if self.neighbours < 1 or not 0 < self.enough < float("inf"):
             raise BadInput(
                 f"mesh.trust.neighbours is {self.neighbours} and enough {self.enough:g}; give 1 or more and more than 0"
             )

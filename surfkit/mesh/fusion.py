@@ -23,6 +23,7 @@ from surfkit.mesh.native import grid
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tiles import Box, join
+from surfkit.scene.arrays import write_array
 from surfkit.scene.camera import Camera
 
 TILES = ".tiles-*"
@@ -200,7 +201,8 @@ def spooled(task: Task) -> Iterator[Task]:
             )
         for at in range(len(task.cameras)):
             seen = task.see(at)
-            np.save(folder / f"{at}.npy", np.stack([seen.depth.view(np.uint32), seen.shade]))
+            with (folder / f"{at}.npy").open("wb") as file:
+                write_array(file, np.stack([seen.depth.view(np.uint32), seen.shade]))
             emit(Progress("drawing views", at + 1, len(task.cameras)))
 
         def read(at: int) -> Picture:

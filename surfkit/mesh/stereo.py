@@ -61,7 +61,7 @@ class Stereo(Mesher):
         if not len(splats):
             raise BadInput(
                 f"none of {len(subject.views)} views has a depth prior of confidence {self.min_confidence:g} or more; "
-                "lower --mesh.min-confidence, or look at the maps"
+                "lower min_confidence of mesh:stereo, or look at the maps"
             )
         return self.fusion.mesh(replace(subject, draw=draw, draw_of=None, splats=splats))
 

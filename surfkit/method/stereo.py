@@ -27,7 +27,7 @@ class StereoFusion(Method):
         if given.priors is None:
             raise BadInput(
                 "method:stereo fuses depth maps, and there are none that can be used; let the run make them with "
-                "depth:patch-match, or make some with `surfkit prepare depth DATA`"
+                "depth:patch-match and without --no-prepare, or make some with `surfkit prepare depth DATA`"
             )
 
     def reconstruct(self, given: MethodInput) -> Reconstruction:

@@ -14,7 +14,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
-from surfkit.scene.arrays import map_array
+from surfkit.scene.arrays import map_array, write_array
 from surfkit.scene.photos import open_picture
 
 EXR = ".exr"
@@ -141,6 +141,24 @@ def write_map(
     save_array(path, inverse.astype(np.float32))
 
 
+def is_whole(path: Path, oriented: bool) -> bool:
+    """Whether a map that surfkit wrote, and its confidence, can be opened and have one size; numbers are not looked at.
+
+    Args:
+        path: Of the map.
+        oriented: Whether it must have normals.
+    """
+    try:
+        depth, confidence = map_array(path), map_array(confidence_path(path))
+        normal = map_array(normal_path(path)) if oriented else None
+    except Exception:  # it is not there, or damaged, of which numpy raises whatever comes
+        return False
+    if depth.ndim != 2 or depth.dtype != np.float32 or confidence.dtype != np.uint8:
+        return False
+    whole = normal is None or (normal.dtype == np.int8 and normal.shape == (3, *depth.shape))
+    return whole and confidence.shape == depth.shape
+
+
 def read_record(root: Path) -> Mapping[str, Any]:
     """What made the maps of a data set, from estimated_depths/depth.json; empty where other programs made them."""
     path = root / FOLDER / RECORD
@@ -160,7 +178,7 @@ def write_record(root: Path, record: Mapping[str, Any]) -> None:
 def save_array(path: Path, values: np.ndarray) -> None:
     """Save numbers as .npy; the file is whole or not there."""
     with replacing(path) as file:
-        np.save(file, values)
+        write_array(file, values)
 
 
 def _stored(path: Path) -> np.ndarray:

@@ -33,6 +33,8 @@ TRUSTED = 0.5
 """Pixels of a higher confidence count as trusted."""
 HARDLY = 0.02
 """Below this share of trusted pixels, something is wrong with the input of the maps."""
+NAMED = 10
+"""Photographs that a warning names."""
 OFF = "everything that needs them is switched off, such as the losses depth and normal-prior"
 """Consequence of missing depth priors."""
 WITH_NORMALS = "estimator:patch-match"
@@ -247,11 +249,16 @@ def typical_inverse_depth(views: Sequence[View], observations: Observations, sce
 
 
 def list_reasons(reasons: Mapping[str, str]) -> str:
-    """Names by reason, in one line."""
+    """Names by reason, in one line; of many, the first."""
     groups: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         groups.setdefault(reason, []).append(name)
-    return "; ".join(f"{reason}: {', '.join(names)}" for reason, names in groups.items())
+    return "; ".join(f"{reason}: {_listed(names)}" for reason, names in groups.items())
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - NAMED
+    return ", ".join(names) if more <= 1 else f"{', '.join(names[:NAMED])} and {more:,} others"
 
 
 def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene) -> Fit | str:

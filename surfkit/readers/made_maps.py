@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,9 +37,11 @@ def folder_of(key: str) -> Path:
 
 
 def read_made(folder: Path) -> Made:
-    """What is known of the maps in a folder; nothing where there are none."""
+    """What is known of the maps in a folder; nothing where there are none, or the file that tells it is damaged."""
     path = folder / RECORD
-    return read_json(path, Made) if path.exists() else Made()
+    with suppress(BadInput):
+        return read_json(path, Made) if path.exists() else Made()
+    return Made()
 
 
 def write_made(folder: Path, made: Made) -> None:

@@ -76,4 +76,5 @@ def remedy(run: Run, scene: Scene) -> str:
         return f"make others with `surfkit prepare depth {run.data.path} {WITH_NORMALS} --again`"
     if observations(run.data, scene).is_empty:
         return f"`surfkit prepare points {run.data.path}` makes a data set with the points that stereo needs"
-    return f"make some with `surfkit prepare depth {run.data.path}`, let the run make them with depth:patch-match"
+    let = "let the run make them, without --no-prepare and with depth:patch-match"
+    return f"make some with `surfkit prepare depth {run.data.path}`, {let}"

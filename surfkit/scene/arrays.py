@@ -1,9 +1,10 @@
-"""Arrays in .npy files, opened by any thread."""
+"""Arrays in .npy files, opened by any thread, and written."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from threading import Lock
+from typing import BinaryIO
 
 import numpy as np
 
@@ -19,3 +20,10 @@ def map_array(path: Path) -> np.ndarray:
     """
     with _PARSING, np.errstate(over="ignore"):
         return np.lib.format.open_memmap(path, "r")
+
+
+def write_array(file: BinaryIO, values: np.ndarray) -> None:
+    """Write an array as `np.save` does; where the disk is full, the OSError of `np.save` has no number that says so."""
+    values = np.ascontiguousarray(values)
+    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
+    file.write(values.data)

@@ -12,7 +12,7 @@ import numpy as np
 
 from surfkit.core.caches import cache_root
 from surfkit.core.files import replacing
-from surfkit.scene.arrays import map_array
+from surfkit.scene.arrays import map_array, write_array
 
 FOLDER = "resized"
 ENDS = 1 << 16
@@ -47,7 +47,7 @@ class Copies:
             pass
         pixels = make()
         with replacing(copy) as file:
-            np.save(file, pixels)
+            write_array(file, pixels)
         return pixels
 
 

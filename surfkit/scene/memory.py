@@ -20,16 +20,21 @@ OWN = Path("/proc/self/cgroup")
 VMSTAT = Path("/proc/vmstat")
 
 
-def cache_bytes(text: str, flag: str = "--cache", auto: Callable[[], int] | None = None) -> int:
-    """Bytes of a size such as 4GB, 500 MB or 2GiB; for "auto" what `auto` gives, or a share of the free memory."""
+def cache_bytes(
+    text: str, flag: str = "--cache", auto: Callable[[], int] | None = None, other: str = ", or auto"
+) -> int:
+    """Bytes of a size such as 4GB, 500 MB or 2GiB; for "auto" what `auto` gives, or a share of the free memory.
+
+    `other`: what messages name beside a size.
+    """
     if text.strip().lower() == "auto":
         return int(SHARE * free_bytes()) if auto is None else auto()
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?i?)b?\s*", text.lower())
     if not found or found[2] not in UNITS:
-        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, or auto")
+        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB{other}")
     size = float(found[1]) * UNITS[found[2]]
     if size > MOST:
-        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, of at most 1000TB, or auto")
+        raise BadInput(f"{flag} {text}: give a size such as 4GB or 500MB, of at most 1000TB{other}")
     return int(size)
 
 

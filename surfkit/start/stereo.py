@@ -18,7 +18,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.scene.vectors import unit
 from surfkit.start.base import Start, StartInput
-from surfkit.start.voxels import Collected, Samples, Thinned, find_isolated, thin_to
+from surfkit.start.voxels import NEIGHBOURS, Collected, Samples, Thinned, find_isolated, thin_to
 
 EDGE = 0.02
 """Three inverse depths in a row that are bent by a larger share of the middle one do not lie on one surface."""
@@ -28,6 +28,8 @@ SPARSE_OPACITY = 0.1
 """Of sparse points that fill gaps, as of a start from them alone."""
 LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
 """Voxels kept while depth maps are read, at least, and for each point wanted."""
+FEWER = 0.9
+"""A start with less than this share of the points that were asked for is told."""
 OVERLAP = 10
 """How often a place is photographed, for a forecast; a rule of thumb for aerial surveys."""
 
@@ -64,8 +66,11 @@ class StereoStart(Start):
     def __post_init__(self) -> None:
         if self.points != "auto" and self.points < 1:
             raise BadInput(f"start.points is {self.points}; it must be auto, or 1 or more")
-        if self.most < 1 or not (self.spacing_px > 0 and self.size > 0):
-            raise BadInput("start.most must be 1 or more, and start.spacing_px and start.size above 0")
+        if self.most < 1:
+            raise BadInput(f"start.most is {self.most}; it must be 1 or more")
+        for name, low, high in (("spacing_px", 0.01, 1000), ("size", 0.01, 100)):
+            if not low <= getattr(self, name) <= high:
+                raise BadInput(f"start.{name} is {getattr(self, name):g}; it must be from {low:g} to {high:g}")
         if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
             raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
 
@@ -85,6 +90,8 @@ class StereoStart(Start):
         if not len(stereo):
             emit(Warned("no pixel of a depth map is trusted, so the run starts from the sparse points alone"))
             return known.scene.cloud
+        if self.points != "auto" and len(stereo) < FEWER * self.points:
+            emit(Warned(f"start.points is {self.points:,}, and the depth maps give {len(stereo):,}, a pixel apart"))
         return fill_gaps(stereo, known, self)
 
     def expected(self, sparse: int, pixels: int) -> int:
@@ -112,6 +119,8 @@ class StereoStart(Start):
             return Thinned(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
         voxels = collected.settle()
         rough = thin_to(voxels, wanted)
+        if wanted <= NEIGHBOURS:  # too few to tell which of them lie alone
+            return rough
         noise = rough.take(find_isolated(rough))
         return thin_to(voxels.away_from(noise), wanted) if len(noise) else rough
 

@@ -172,6 +172,7 @@ def thin_to(voxels: Voxels, most: int) -> Thinned:
     """As many points as there are, at most `most`, and not fewer by more than 2 % if there are more.
 
     The size of the voxels is found by steps that would be exact on a plane, kept within what was too much and too few.
+    Where no size gives so few, as voxels around the origin never become one, the heaviest points are taken.
     """
     found = thin(voxels, voxels.side)
     if len(found) <= most:
@@ -188,7 +189,7 @@ def thin_to(voxels: Voxels, most: int) -> Thinned:
         side *= np.sqrt(max(len(found), 1) / (0.99 * most))
         if not low < side < high:
             side = 2 * low if high == np.inf else (low + high) / 2
-    return found.take(np.arange(0)) if best is None else best
+    return found.take(np.argsort(-found.weight, kind="stable")[:most]) if best is None else best
 
 
 def apart(xyz: np.ndarray, weight: np.ndarray, radius: float) -> np.ndarray:

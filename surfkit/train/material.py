@@ -55,7 +55,7 @@ class CacheSettings:
         """The disk that depth maps in the user's cache may take."""
         if (self.maps or "").strip().lower() == "auto":
             raise BadInput("--prepare-cache auto: give a size such as 20GB")
-        return 0 if self.maps is None else cache_bytes(self.maps, "--prepare-cache")
+        return 0 if self.maps is None else cache_bytes(self.maps, "--prepare-cache", other="")
 
 
 @dataclass(frozen=True)

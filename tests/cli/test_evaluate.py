@@ -57,6 +57,17 @@ def test_geometry_goes_beside_the_other_figures(folder, capsys):
     assert after["images"]["lpips_not_measured"] == "left out, by --lpips-weights none"
 
 
+def test_pictures_of_an_earlier_comparison_go(folder, capsys):
+    """They were listed among what was written, though the figures are those of another comparison."""
+    words = folder / "run", "--gt", folder / "truth.ply", "--draws", 1, "--visible", 0.4
+    assert spoken(capsys, *words)[0] == 0
+    said = spoken(capsys, *words, "--no-classes")[1]
+    pictures = {path.name for path in (folder / "run/geometry").glob("*.png")}
+    assert "class-" not in said and "view0.png" in said and not [name for name in pictures if "class" in name]
+    (folder / "run/geometry/view9.png").touch()
+    assert "view9.png" not in spoken(capsys, *words)[1]
+
+
 @pytest.mark.parametrize("views", ["run", "data"])
 def test_a_file_needs_no_run(folder, capsys, tmp_path, views):
     options = (

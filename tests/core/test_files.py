@@ -1,3 +1,4 @@
+import errno
 import os
 import stat
 import threading
@@ -42,6 +43,12 @@ def test_what_fails_leaves_the_old_and_nothing_else(tmp_path):
         file.write(b"new")
         raise ValueError
     assert [p.name for p in tmp_path.iterdir()] == ["b.txt"] and path.read_text() == "old"
+
+
+def test_a_full_disk_names_the_file(tmp_path):
+    with pytest.raises(OSError) as error, replacing(tmp_path / "a.npy"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert error.value.filename == str(tmp_path / "a.npy") and not list(tmp_path.iterdir())
 
 
 def test_what_the_dead_left_is_swept_away(tmp_path):

@@ -290,7 +290,7 @@ def test_places_that_are_none_are_outside():
 def test_only_some_steps_count():
     for loss in (Reprojection(start=4, every=3), WarpedPatches(start=4, every=3)):
         assert [index for index in range(13) if loss.weight_at(index, 12)] == [6, 9, 12]
-    for settings in ({"weight": -1.0}, {"every": 0}, {"limit": 0.0}):
+    for settings in ({"weight": -1.0}, {"weight": float("inf")}, {"every": 0}, {"limit": 0.0}):
         for kind in (Reprojection, WarpedPatches):
             with pytest.raises(BadInput, match="give 0 or more"):
                 kind(**settings)

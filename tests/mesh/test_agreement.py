@@ -205,7 +205,7 @@ def test_every_view_is_drawn_once(tmp_path):
 def test_settings_that_cannot_be_are_refused():
     for wrong in (
         {"tolerance": 0.0}, {"angle": 50.0}, {"alone": 1.5}, {"opaque": -0.1}, {"spread": 2.0}, {"confirmed": 0.5},
-        {"neighbours": 0}, {"enough": 0.0},
+        {"neighbours": 0}, {"enough": 0.0}, {"enough": float("inf")},
     ):  # fmt: skip
         with pytest.raises(BadInput, match=f"{next(iter(wrong))} .*(must be|give)"):
             Agreement(**wrong)

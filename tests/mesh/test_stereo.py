@@ -63,7 +63,9 @@ def test_priors_alone_give_the_surface_and_photographs_its_colours():
 def test_what_is_not_confident_is_left_out():
     cameras = around(20)
     given = stereo_subject(cameras, confidence=0.3)
-    with pytest.raises(BadInput, match="none of 20 views has a depth prior of confidence 0.375.*--mesh.min-confidence"):
+    with pytest.raises(
+        BadInput, match="none of 20 views has a depth prior of confidence 0.375.*min_confidence of mesh:stereo"
+    ):
         Stereo().mesh(given)
     assert len(Stereo(min_confidence=0.3).mesh(given).faces) > 1000
 

@@ -193,7 +193,9 @@ def test_a_run_whose_maps_were_deleted_makes_them_again_and_ends_the_same(
 
 def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, recipe, tmp_path, own_cache, monkeypatch):
     seen = counting(monkeypatch)
-    with pytest.raises(BadInput, match="surfkit prepare depth .*depth:patch-match, or choose start:sparse") as refused:
+    with pytest.raises(
+        BadInput, match="prepare depth .*without --no-prepare .*depth:patch-match, or choose start:sparse"
+    ) as refused:
         run(recipe, farm, tmp_path / "a", caches=CacheSettings(maps=None))
     assert "\n" not in str(refused.value) and not (tmp_path / "a").exists()
     sparse = replace(recipe, start=Recipe().start)
@@ -336,6 +338,8 @@ def test_making_maps_makes_room(farm, recipe, tmp_path, own_cache):
     assert str(left) == record(tmp_path / "b")["data"]["priors"]
     with pytest.raises(BadInput, match="--prepare-cache lots: give a size"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="lots"))
+    with pytest.raises(BadInput, match="--prepare-cache -1GB: give a size such as 4GB or 500MB$"):
+        run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="-1GB"))
     with pytest.raises(BadInput, match="--prepare-cache auto: give a size such as 20GB"):
         run(recipe, farm, tmp_path / "c", caches=CacheSettings(maps="auto"))
 

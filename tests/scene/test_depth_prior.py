@@ -15,7 +15,7 @@ from surfkit.losses import L1, DepthRegression, NormalPrior
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
-from surfkit.readers.depth_prior import alignment, read_priors, resized
+from surfkit.readers.depth_prior import alignment, list_reasons, read_priors, resized
 from surfkit.readers.read import observations, read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.align import align, sample
@@ -341,3 +341,9 @@ def test_normals_of_another_kind_are_a_reason_not_to_use_a_map(farm):
     priors, notes = priors_of(data, scene)
     assert priors[1] is None and priors[0] is not None
     assert "normals are float32 of shape (48, 64, 3), not int8 of (3, height, width)" in notes[0]
+
+
+def test_of_many_photographs_a_warning_names_the_first():
+    names = [f"{at}.jpg" for at in range(12)]
+    assert list_reasons(dict.fromkeys(names[:11], "no map")) == f"no map: {', '.join(names[:11])}"
+    assert list_reasons(dict.fromkeys(names, "no map")) == f"no map: {', '.join(names[:10])} and 2 others"

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch.nn.functional import normalize
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
 from surfkit.core.registry import components
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
@@ -178,6 +179,29 @@ def test_without_any_trusted_pixel_the_sparse_points_begin(farm):
     assert StereoStart().cloud(blind) is farm.scene.cloud
 
 
+@pytest.mark.parametrize("few", [1, 2, 3])
+def test_a_few_points_are_no_noise(farm, few):
+    """Too few to have others near by, they were taken for noise, and depth maps for blind."""
+    for start in (StereoStart(points=few), StereoStart(most=few)):
+        assert 0 < len(start.fused(known(farm))) <= few
+    assert start.limited(1).most == 1
+
+
+def test_fewer_points_than_asked_for_are_told(farm, monkeypatch):
+    said = []
+    monkeypatch.setattr("surfkit.start.stereo.emit", said.append)
+
+    def told(start):
+        said.clear()
+        count = len(start.fused(known(farm)))
+        start.cloud(known(farm))
+        return count, [event.text for event in said if isinstance(event, Warned)]
+
+    count, (note,) = told(StereoStart(points=10_000_000))
+    assert note == f"start.points is 10,000,000, and the depth maps give {count:,}, a pixel apart"
+    assert not told(StereoStart(points=1_000))[1] and not told(StereoStart())[1]
+
+
 def plane(count, rng, z=0.0):
     xyz = np.concatenate([rng.uniform(-1, 1, (count, 2)), np.full((count, 1), z)], axis=1)
     up = np.broadcast_to([0.0, 0.0, 1.0], xyz.shape)
@@ -265,10 +289,14 @@ def test_opacities_and_normals_of_a_cloud_are_those_of_the_splats():
     ("settings", "message"),
     [
         ({"points": 0}, "start.points is 0"),
-        ({"spacing_px": 0.0}, "start.spacing_px and start.size above 0"),
-        ({"size": 0.0}, "start.spacing_px and start.size above 0"),
+        ({"spacing_px": 0.0}, "start.spacing_px is"),
+        ({"size": 0.0}, "start.size is"),
         ({"opacity": 1.0}, "start.opacity"),
         ({"min_confidence": 0.0}, "start.min_confidence"),
+        ({"size": float("inf")}, "start.size is inf"),
+        ({"spacing_px": float("inf")}, "start.spacing_px is inf"),
+        ({"spacing_px": 1e-9}, "start.spacing_px is 1e-09"),
+        ({"most": 0}, "start.most is 0"),
     ],
 )
 def test_settings_that_make_no_sense(settings, message):

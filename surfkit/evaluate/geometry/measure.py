@@ -64,6 +64,8 @@ def measure_geometry(
     reconstruction, truth = map(read_surface, files)
     outcome = compare(reconstruction, truth, settings, views, frame)
     found = figures(outcome, settings) | {"reconstruction": str(files[0]), "truth": str(files[1])}
+    for left in (*out.glob("view[0-9].png"), *out.glob("class-*.png")):  # of an earlier comparison
+        left.unlink()
     write_files(out, outcome, settings)
     if frame is not None:
         write_views(out, outcome, views, frame)

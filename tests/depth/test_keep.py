@@ -1,0 +1,134 @@
+"""The cache of depth maps: damaged ones are made again, one that can only be read is used, a full disk is one line."""
+
+import errno
+import os
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+from needs import needs_native
+
+from surfkit.core.check import Fault
+from surfkit.core.events import Warned
+from surfkit.depth import keep
+from surfkit.depth.patch_match import PatchMatch
+from surfkit.depth.prepare import Preparation
+from surfkit.readers.data import Data
+from surfkit.readers.made_maps import folder_of
+from surfkit.readers.read import observations, read
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
+
+pytestmark = needs_native
+
+FAST = PatchMatch(passes=1, rounds=1)
+PLENTY = 1 << 30
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory):
+    """Seven photographs to train on."""
+    folder = tmp_path_factory.mktemp("farm")
+    write_colmap(folder, photograph(Flight(kind="grid", views=8, width=48, height=36, points=300)), tracks=True)
+    return Data(folder)
+
+
+def made(data, budget=PLENTY, estimator=FAST):
+    """The maps in the cache, how many, and what was warned of."""
+    told = []
+    scene = read(data)
+    tracks = observations(data, scene)
+    preparation = Preparation(data, estimator, torch.device("cpu"))
+    with mock.patch.object(keep, "emit", told.append):
+        with keep.maps(preparation, scene, tracks, "some", budget) as (folder, known):
+            assert folder == folder_of("some")
+    return known.maps, [event.text for event in told if isinstance(event, Warned)]
+
+
+def files(folder):
+    """Every file but what changes from run to run."""
+    paths = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in ("made.json", "in-use"))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+@pytest.mark.parametrize(
+    ("name", "left"),
+    [
+        ("view_001.png.npy", b"\x93NUMPY"),
+        ("view_002.png.npy", b""),
+        ("view_001.png.confidence.npy", None),
+        ("view_003.png.normal.npy", None),
+        ("view_003.png.normal.npy", "view_003.png.confidence.npy"),
+        ("view_002.png.confidence.npy", "view_002.png.npy"),
+    ],
+)
+def test_damaged_maps_are_made_again(farm, own_cache, name, left):
+    """Without its confidence, every pixel of a map counted; a photograph whose map was damaged had none."""
+    made(farm)
+    folder = folder_of("some")
+    whole, path = files(folder), folder / "estimated_depths" / name
+    path.unlink()
+    if isinstance(left, str):
+        shutil.copy(path.with_name(left), path)
+    elif left is not None:
+        path.write_bytes(left)
+    count, (told,) = made(farm)
+    assert count == 7 and f"damaged depth maps, 1 of 7, {name[:12]} for one" in told
+    assert files(folder) == whole and made(farm) == (7, [])
+
+
+@pytest.mark.parametrize("damaged", [None, "null", "{"])
+@pytest.mark.parametrize("name", ["made.json", "estimated_depths/depth.json"])
+def test_what_is_written_down_of_maps_is_found_out_again(farm, own_cache, name, damaged):
+    made(farm)
+    folder = folder_of("some")
+    whole, path = files(folder), folder / name
+    path.unlink()
+    if damaged:
+        path.write_text(damaged)
+    assert made(farm) == (7, []) and files(folder) == whole
+
+
+def test_a_cache_that_can_only_be_read_is_used(farm, own_cache, monkeypatch):
+    made(farm)
+    before = {path: path.stat().st_mtime_ns for path in own_cache.rglob("*")}
+    real = os.open
+
+    def opened(path, flags, *rest, **more):
+        if flags & (os.O_RDWR | os.O_WRONLY | os.O_CREAT) and Path(path).is_relative_to(own_cache):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return real(path, flags, *rest, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", opened)
+        patch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+        assert made(farm) == (7, [])
+        with keep.mark_used(folder_of("some")):
+            pass
+        assert {path: path.stat().st_mtime_ns for path in own_cache.rglob("*")} == before
+        (folder_of("some") / "estimated_depths/view_001.png.npy").unlink()
+        with pytest.raises(ValueError, match="cannot be written .Read-only file system.; set SURFKIT_CACHE"):
+            made(farm)
+
+
+def test_a_full_disk_is_one_line_and_the_maps_stay(farm, own_cache, monkeypatch):
+    estimate = PatchMatch.estimate
+
+    def full(self, given, wanted):
+        for found in estimate(self, given, wanted):
+            yield found
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "some.npy")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PatchMatch, "estimate", full)
+        with pytest.raises(Fault, match="^some.npy: the disk is full .*; free some space, .*SURFKIT_CACHE") as error:
+            made(farm)
+    assert "\n" not in str(error.value) and len(list(own_cache.rglob("*png.npy"))) == 1
+    assert made(farm) == (7, [])
+
+
+def test_maps_larger_than_the_budget_are_told(farm, own_cache):
+    count, (told,) = made(farm, budget=1_000)
+    assert count == 7 and told.endswith("GB, more than the 1e-06 GB of --prepare-cache, and are kept")
+    assert made(farm, budget=1_000) == (7, []), "told when they were made"
