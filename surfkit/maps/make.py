@@ -138,10 +138,11 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         seen(subject.views) if settings.colors == "photographs" else "",
     )  # fmt: skip
     with workshop(out, (*files, RECORD), key) as folder:
-        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
+        replaced = (RECORD, *sorted({*FILES.values()} - {*files})) if (out / RECORD).exists() else ()
+        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid), replaced)
         drawn = Drawn(**sheet.once(
             [FILES[name] for name in ("dsm", "orthophoto") if name in done],
-            lambda: asdict(draw(subject, settings, sheet, files)),
+            lambda: asdict(draw(subject, settings, sheet, FILES["orthophoto"] in files)),
         ))  # fmt: skip
         record = {
             "mesh": str(surface.path),
@@ -168,17 +169,13 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     return record
 
 
-def draw(subject: Subject, settings: MapSettings, sheet: Sheet, files: Sequence[str]) -> Drawn:
-    """Draw the surface model, and the orthophoto if it is among the `files` of the maps."""
-    photographs, colored = None, FILES["orthophoto"] in files
+def draw(subject: Subject, settings: MapSettings, sheet: Sheet, colored: bool) -> Drawn:
+    """Draw the surface model, and the orthophoto if it is wanted."""
+    photographs = None
     if colored and settings.colors == "photographs":
         texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
         made = textured(subject, TextureSettings(texel=texel), budget, Kept(sheet.folder))
         photographs = FromPhotographs(made, subject.frame, sheet, settings.tile)
-    if (sheet.out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
-        (sheet.out / RECORD).unlink()
-        for name in {*FILES.values()} - {*files}:
-            (sheet.out / name).unlink(missing_ok=True)
     colors = FILES["orthophoto"] if colored else None
     return draw_surface(subject.surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
 

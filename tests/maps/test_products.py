@@ -21,7 +21,7 @@ from surfkit.scene.scene import Frame, View
 from surfkit.texture.make import Subject
 from surfkit.texture.resolution import ground_sampling_distance
 
-from .shapes import UTM, centres, grid_of, heightfield
+from .shapes import UTM, centres, grid_of, heightfield, merged
 
 rasterio = needs("rasterio")
 FRAME = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, "EPSG:32633")
@@ -163,13 +163,21 @@ def test_surfaces_apart_cannot_be_subtracted(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path):
-    """Degrees where metres belong: what an earlier call drew, of more products, is still there."""
-    here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
+@pytest.mark.parametrize(
+    "bounds, said",
+    [
+        ((13.1, 52.3, 13.2, 52.4), "not in the same place"),
+        ((UTM[0] + 30, UTM[1], UTM[0] + 40, UTM[1] + 9), "none of its"),
+    ],
+)
+def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said):
+    """Degrees where metres belong, a hole of the mesh: what an earlier call drew, of more products, is still there."""
+    parts = [heightfield(rising(0), (UTM[0] + x, UTM[1]), (UTM[0] + x + 20, UTM[1] + 20)) for x in (0, 50)]
+    here = merged(*parts)
     make_maps(Subject(here, FRAME), MapSettings(("hillshade", "contours"), 0.5), tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(BadInput, match="not in the same place"):
-        make_maps(Subject(here, FRAME), MapSettings((), 0.5, bounds=(13.1, 52.3, 13.2, 52.4)), tmp_path)
+    with pytest.raises(BadInput, match=said):
+        make_maps(Subject(here, FRAME), MapSettings((), 0.5, bounds=bounds), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert {"dsm.tif", "hillshade.tif", "contours.gpkg", "maps.json"} <= before.keys()
 
