@@ -128,8 +128,10 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
     grid = grid_of(subject, settings, map_axes(up.direction))
-    for mesh in (surface, *(() if other is None else (other,))):
-        refuse_apart(mesh, grid)
+    if settings.bounds is not None:
+        refuse_apart(surface, grid)
+    if other is not None:
+        refuse_apart(other, grid)
     done, unit = drawable(surface, settings), unit_of(frame, crs)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     key = key_of(

@@ -180,6 +180,8 @@ def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said)
         make_maps(Subject(here, FRAME), MapSettings((), 0.5, bounds=bounds), tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert {"dsm.tif", "hillshade.tif", "contours.gpkg", "maps.json"} <= before.keys()
+    make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "maps.json"}, "none of other maps stays"
 
 
 @pytest.mark.parametrize(
