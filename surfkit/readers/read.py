@@ -53,11 +53,16 @@ def read_capture(data: Data, reader: Reader) -> Capture:
     """What a reader finds in a data set, and in the one that is for tests."""
     if data.model is not None and reader.model_folder(data) is None:
         raise BadInput(f"--model {data.model}: a data set of layout {name_of(reader)} has no such model; leave it out")
+    capture = _read_placed(data, reader)
+    return capture if data.test_data is None else _with_tests(capture, reader, data)
+
+
+def _read_placed(data: Data, reader: Reader) -> Capture:
+    """What a reader finds in a data set, on the map if a file says on which."""
     capture, placed = reader.read(data), _placed(data, reader)
     if placed is not None and capture.crs is not None:
         raise BadInput(f"{data.path / FILE}: the cameras name a system themselves, {capture.crs}; delete this file")
-    capture = capture if placed is None else on_the_map(capture, placed)
-    return capture if data.test_data is None else _with_tests(capture, reader, data)
+    return capture if placed is None else on_the_map(capture, placed)
 
 
 def _placed(data: Data, reader: Reader) -> Placed | None:
@@ -96,7 +101,7 @@ def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
     root = data.test_data
     if root is None or not root.is_dir():
         raise BadInput(f"--test-data {root}: no such folder")
-    own = reader.read(replace(data, path=root, model=None, test_data=None)).shots
+    own = _read_placed(replace(data, path=root, model=None, test_data=None), reader).shots
     tests = [replace(shot, name=f"{root.resolve().name}/{shot.name}") for shot in own]
     return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
 

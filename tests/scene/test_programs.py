@@ -467,6 +467,11 @@ def test_a_file_beside_the_cameras_says_which_map_they_are_on(tmp_path, program)
         scene = read(data)
         seen = observations(data, scene).xyz
         assert np.abs(seen - scene.frame.to_local(DOTS + ORIGIN)).max() < 1e-6 * np.abs(seen).max()
+    both = read_capture(Data(tmp_path, test_data=tmp_path), reader_of(data))
+    same = {shot.name.rpartition("/")[2]: [] for shot in both.shots}
+    for shot in both.shots:
+        same[shot.name.rpartition("/")[2]].append(shot.pose)
+    assert all(len(poses) == 2 and (poses[0] == poses[1]).all() for poses in same.values())
     (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "metres_per_unit": 0}')
     with pytest.raises(BadInput, match="georeference.json"):
         read(data)
