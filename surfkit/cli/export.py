@@ -21,6 +21,7 @@ from surfkit.export.base import Format
 from surfkit.export.files import format_for, format_of, has_suffix
 from surfkit.export.ply import PLY
 from surfkit.export.table import SplatTable, Tile
+from surfkit.export.tiles3d import Tiles3D
 from surfkit.pipeline import loaded
 from surfkit.primitives.model import SplatModel
 from surfkit.run.folder import Run, refuse_no_run
@@ -75,7 +76,7 @@ class Export:
             form.write(path, table, frame, tree)
         told = form.rounding(table)
         print(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
-        if any(frame.shift):
+        if any(frame.shift) and not (isinstance(form, Tiles3D) and form.georeference and frame.crs):
             print(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:

@@ -13,6 +13,7 @@ from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.maps.grid import same_crs
 from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
 from surfkit.readers.read import read
@@ -74,7 +75,7 @@ class MapsOf:
         run = opened(self.against)
         refuse_no_mesh(run)
         theirs = read(run.data).frame
-        if theirs.crs != frame.crs:
+        if not same_crs(theirs.crs, frame.crs):
             raise BadInput(
                 f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "
                 f"of {self.run_folder} {frame.crs or 'not known'}; heights can be subtracted in one system only"
@@ -94,7 +95,7 @@ def mesh_of(path: Path) -> Surface:
 
 def show(out: Path, record: dict[str, Any]) -> None:
     """Print what the maps are, and the paths of what was written."""
-    unit = "m" if record["metres_per_unit"] == 1 else "units"
+    unit = record["unit"]
     rows = [
         ("coordinates", record["coordinates"]),
         ("up", record["up"]),

@@ -44,6 +44,7 @@ class Sheet:
         folder: For files that are being written; on the same disk as the finished ones.
         out: For finished files.
         double: Whether heights need 64-bit floats: 32 bits would be coarser than a hundredth of a cell.
+        replaced: Names of files of maps before that are deleted when the first new one is there.
     """
 
     grid: Grid
@@ -51,6 +52,7 @@ class Sheet:
     folder: Path
     out: Path
     double: bool = False
+    replaced: tuple[str, ...] = ()
 
     @contextmanager
     def raster(self, name: str, kind: Kind) -> Iterator[Raster]:
@@ -113,6 +115,8 @@ class Sheet:
         refuse_full(self.folder)
         with finished.open("rb+") as file:
             os.fsync(file.fileno())
+        for name in self.replaced:
+            (self.out / name).unlink(missing_ok=True)
         os.replace(finished, self.out / finished.name)
         sync_folder(self.out)
         emit(FileWritten(self.out / finished.name, "map"))

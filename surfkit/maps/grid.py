@@ -17,6 +17,9 @@ from surfkit.scene.scene import Frame
 MOST_CELLS = 4e10
 """Of a map: twice those of 14 x 14 km at 0.1 m."""
 
+UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft"}
+"""Short names of units of length, by those of GDAL."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -59,7 +62,7 @@ class Grid:
         """
         west, south, east, north = (value / gsd for value in bounds)
         if not (west <= east and south <= north and math.isfinite(east - west + north - south)):
-            raise BadInput(f"bounds {_shown(bounds)}: nothing lies within; give west south east north of the surface")
+            raise BadInput(f"bounds {shown(bounds)}: nothing lies within; give west south east north of the surface")
         left, low = math.floor(west), math.floor(south)
         width, height = max(1, math.ceil(east) - left), max(1, math.ceil(north) - low)
         if width * height > MOST_CELLS:
@@ -129,5 +132,32 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
     return found, f"{text}, for coordinates about a place on Earth" if place else text
 
 
-def _shown(values: tuple[float, ...]) -> str:
+def unit_of(frame: Frame, crs: Any) -> str:
+    """What lengths of a frame are called behind numbers: m, ft, US ft; "units" if nobody knows.
+
+    Args:
+        frame: Of the input.
+        crs: Its coordinate reference system, of rasterio.
+    """
+    if frame.metres == 1 or frame.crs is None:
+        return "m" if frame.metres == 1 else "units"
+    name, _ = crs.linear_units_factor
+    return UNITS.get(name, name)
+
+
+def same_crs(one: str | None, other: str | None) -> bool:
+    """Whether two coordinate reference systems are the same one, however they are spelt."""
+    if one == other or None in (one, other) or TOPOCENTRIC.fullmatch(one) or TOPOCENTRIC.fullmatch(other):
+        return one == other
+    with needed("rasterio", "surfkit maps"):
+        from rasterio.crs import CRS
+        from rasterio.errors import CRSError
+    try:
+        return CRS.from_user_input(one) == CRS.from_user_input(other)
+    except CRSError:
+        return False
+
+
+def shown(values: tuple[float, ...]) -> str:
+    """Numbers with spaces between, for messages."""
     return " ".join(f"{value:.9g}" for value in values)

@@ -21,7 +21,7 @@ from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import Difference, draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Grid, map_crs
+from surfkit.maps.grid import Grid, map_crs, shown, unit_of
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
@@ -29,7 +29,6 @@ from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
-from surfkit.scene.scene import Frame
 from surfkit.texture.keep import Kept, identity, seen
 from surfkit.texture.make import Subject, TextureSettings, textured
 from surfkit.texture.resolution import ground_sampling_distance
@@ -129,7 +128,11 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     crs, told = map_crs(frame)
     up = up_direction(settings.up, subject.views, frame, np.eye(4))
     grid = grid_of(subject, settings, map_axes(up.direction))
-    done = drawable(surface, settings)
+    if settings.bounds is not None:
+        refuse_apart(surface, grid)
+    if other is not None:
+        refuse_apart(other, grid)
+    done, unit = drawable(surface, settings), unit_of(frame, crs)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
@@ -137,10 +140,11 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         seen(subject.views) if settings.colors == "photographs" else "",
     )  # fmt: skip
     with workshop(out, (*files, RECORD), key) as folder:
-        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid))
+        replaced = (RECORD, *sorted({*FILES.values()} - {*files})) if (out / RECORD).exists() else ()
+        sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid), replaced)
         drawn = Drawn(**sheet.once(
             [FILES[name] for name in ("dsm", "orthophoto") if name in done],
-            lambda: asdict(draw(subject, settings, sheet, files)),
+            lambda: asdict(draw(subject, settings, sheet, FILES["orthophoto"] in files)),
         ))  # fmt: skip
         record = {
             "mesh": str(surface.path),
@@ -149,6 +153,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             "up": up.source,
             "axes": grid.turn.tolist(),
             "metres_per_unit": frame.metres,
+            "unit": unit,
             "gsd": grid.gsd,
             "bounds": list(grid.bounds),
             "size": [grid.width, grid.height],
@@ -159,24 +164,20 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
             record["orthophoto"] = {"from_photographs": round(drawn.from_photographs / drawn.covered, 6)}
         record |= draw_products(subject, settings, sheet, drawn, done)
         if other is not None:
-            record["difference"] = subtract(sheet, other, settings.tile, frame)
+            record["difference"] = subtract(sheet, other, settings.tile, unit)
         record["files"] = files
         write_json(out / RECORD, record)
         emit(FileWritten(out / RECORD, "facts of the maps"))
     return record
 
 
-def draw(subject: Subject, settings: MapSettings, sheet: Sheet, files: Sequence[str]) -> Drawn:
-    """Draw the surface model, and the orthophoto if it is among the `files` of the maps."""
-    photographs, colored = None, FILES["orthophoto"] in files
+def draw(subject: Subject, settings: MapSettings, sheet: Sheet, colored: bool) -> Drawn:
+    """Draw the surface model, and the orthophoto if it is wanted."""
+    photographs = None
     if colored and settings.colors == "photographs":
         texel, budget = sheet.grid.gsd * (subject.frame.metres or 1.0), cache_bytes(settings.memory, "--memory")
         made = textured(subject, TextureSettings(texel=texel), budget, Kept(sheet.folder))
         photographs = FromPhotographs(made, subject.frame, sheet, settings.tile)
-    if (sheet.out / RECORD).exists():  # maps of before; those that are drawn again are replaced one by one
-        (sheet.out / RECORD).unlink()
-        for name in {*FILES.values()} - {*files}:
-            (sheet.out / name).unlink(missing_ok=True)
     colors = FILES["orthophoto"] if colored else None
     return draw_surface(subject.surface, sheet, settings.tile, FILES["dsm"], colors, photographs)
 
@@ -189,6 +190,17 @@ def grid_of(subject: Subject, settings: MapSettings, turn: np.ndarray) -> Grid:
     else:
         gsd = settings.gsd / (frame.metres or 1.0)
     return Grid.around(turn, gsd, settings.bounds or bounds_of(surface, turn))
+
+
+def refuse_apart(surface: Surface, grid: Grid) -> None:
+    """BadInput for a mesh that lies beside the cells, before maps that are there are replaced."""
+    west, south, east, north = found = bounds_of(surface, grid.turn)
+    borders = grid.bounds
+    if west > borders[2] or east < borders[0] or south > borders[3] or north < borders[1]:
+        raise BadInput(
+            f"{surface.path}: it lies within {shown(found)} (west south east north), and the maps within "
+            f"{shown(borders)}: not in the same place"
+        )
 
 
 def drawable(surface: Surface, settings: MapSettings) -> tuple[str, ...]:
@@ -236,11 +248,11 @@ def scatter(surface: Surface, sheet: Sheet, spacing: float) -> dict[str, Any]:
     return {"spacing": spacing, "points": write_cloud(surface, sheet, FILES["points"], spacing)}
 
 
-def subtract(sheet: Sheet, other: Surface, side: int, frame: Frame) -> dict[str, Any]:
+def subtract(sheet: Sheet, other: Surface, side: int, unit: str) -> dict[str, Any]:
     """Draw another mesh on the same grid, subtract it, and return what maps.json says of the difference."""
     sheet.once([FILES["other"]], lambda: asdict(draw_surface(other, sheet, side, FILES["other"])))
     heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
-    name, unit = FILES["difference"], "m" if frame.metres == 1 else "units"
+    name = FILES["difference"]
     found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
     draw_difference(sheet.out / FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}

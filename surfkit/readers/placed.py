@@ -1,4 +1,4 @@
-"""A COLMAP model that lies on a map: a file beside it says on which, and what its coordinates leave out."""
+"""Cameras that lie on a map: a file beside them says on which, and what their coordinates leave out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FILE = "georeference.json"
 
 @dataclass(frozen=True)
 class Placed:
-    """Coordinates on the map are those of the model plus the offset.
+    """Coordinates on the map are those of the cameras plus the offset.
 
     Attributes:
         crs: Coordinate reference system, such as "EPSG:32633".
@@ -34,7 +34,7 @@ class Placed:
 
 
 def read_placed(folder: Path) -> Placed | None:
-    """Where the model in a folder lies; None if no file says so."""
+    """Where the cameras in a folder lie; None if no file says so."""
     path = folder / FILE
     return read_json(path, Placed) if path.is_file() else None
 
@@ -53,5 +53,5 @@ def on_the_map(capture: Capture, placed: Placed) -> Capture:
         xyz=capture.xyz + offset,
         metres=placed.metres_per_unit,
         crs=placed.crs,
-        shift=placed.offset,
+        shift=placed.offset if any(placed.offset) else capture.shift,
     )

@@ -19,6 +19,7 @@ from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.colmap import COLMAP, MODELS
 from surfkit.readers.data import Data
 from surfkit.readers.masks import check_mask, find_masks
+from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
@@ -52,8 +53,21 @@ def read_capture(data: Data, reader: Reader) -> Capture:
     """What a reader finds in a data set, and in the one that is for tests."""
     if data.model is not None and reader.model_folder(data) is None:
         raise BadInput(f"--model {data.model}: a data set of layout {name_of(reader)} has no such model; leave it out")
-    capture = reader.read(data)
+    capture = _read_placed(data, reader)
     return capture if data.test_data is None else _with_tests(capture, reader, data)
+
+
+def _read_placed(data: Data, reader: Reader) -> Capture:
+    """What a reader finds in a data set, on the map if a file says on which."""
+    capture, placed = reader.read(data), _placed(data, reader)
+    if placed is not None and capture.crs is not None:
+        raise BadInput(f"{data.path / FILE}: the cameras name a system themselves, {capture.crs}; delete this file")
+    return capture if placed is None else on_the_map(capture, placed)
+
+
+def _placed(data: Data, reader: Reader) -> Placed | None:
+    """What the data set says of its place on the map; a model in a folder of its own has that file there."""
+    return None if reader.model_folder(data) is not None else read_placed(data.path)
 
 
 def build_scene(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
@@ -87,7 +101,7 @@ def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
     root = data.test_data
     if root is None or not root.is_dir():
         raise BadInput(f"--test-data {root}: no such folder")
-    own = reader.read(replace(data, path=root, model=None, test_data=None)).shots
+    own = _read_placed(replace(data, path=root, model=None, test_data=None), reader).shots
     tests = [replace(shot, name=f"{root.resolve().name}/{shot.name}") for shot in own]
     return replace(capture, shots=[*capture.shots, *tests], held_out=frozenset(shot.name for shot in tests))
 
@@ -155,14 +169,16 @@ def observations(data: Data, scene: Scene) -> Observations:
         data: The data set.
         scene: That `read` gave for it.
     """
-    tracks, seen = reader_of(data).tracks(data), {}
+    reader = reader_of(data)
+    tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
     if tracks is None:
         return Observations(np.zeros((0, 3)), np.zeros(0), {})
     for view in (*scene.train, *scene.held_out):
         if view.name in tracks.seen:
             rows, pixels = tracks.seen[view.name]
             seen[view.name] = Seen(rows, _shares(pixels, tracks.cameras[view.name], view.camera))
-    return Observations(scene.frame.to_local(tracks.xyz), tracks.error_px, seen)
+    xyz = tracks.xyz if placed is None else tracks.xyz + placed.offset
+    return Observations(scene.frame.to_local(xyz), tracks.error_px, seen)
 
 
 def model_folder(data: Data) -> Path:

@@ -160,7 +160,10 @@ def _by_pyproj(crs: str, xyz: np.ndarray) -> np.ndarray:
         from pyproj import CRS, Transformer
         from pyproj.exceptions import ProjError
     try:
-        known = Transformer.from_crs(CRS(crs).to_3d(), "EPSG:4978", always_xy=True)
+        given = CRS(crs)
+        if given.is_geographic:
+            raise BadInput(f"{crs}: it is in degrees, where lengths belong; name a projected one, such as EPSG:32633")
+        known = Transformer.from_crs(given.to_3d(), "EPSG:4978", always_xy=True)
         found = np.stack(known.transform(*xyz.T), axis=1)
     except ProjError as error:
         said = " ".join(str(error).split())[:200]

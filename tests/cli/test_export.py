@@ -1,5 +1,6 @@
 """`surfkit export` from one format to another; runs are exported in tests/test_pipeline.py."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from surfkit.cli import main
+from surfkit.cli.export import Export, one_tile
 from surfkit.export.files import format_of, read_splat_file
 from surfkit.export.ply import PLY, read_splats
 from surfkit.export.spz import SPZ
@@ -93,3 +95,20 @@ def test_mistakes_are_one_line(ply, tmp_path, capsys, words, message):
     status, lines, errors = said(capsys, *words.format(here=tmp_path).split())
     assert status == 2 and not lines and len(errors) == 1 and message in errors[0], errors
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_tiles_on_earth_leave_out_nothing(ply, tmp_path, capsys, monkeypatch):
+    """Their transform places them, so no line tells to add an offset."""
+    table = splat_table("gaussian", 30, 0)
+    frame = Frame(np.array([512_000.0, 5_800_000.0, 0.0]), 1.0, 1.0, "EPSG:32633", (512_000.0, 5_800_000.0, 0.0))
+    near = replace(table, means=table.means.double() + torch.tensor(frame.origin))
+
+    @contextmanager
+    def opened(self):
+        yield near, frame, one_tile(near)
+
+    monkeypatch.setattr(Export, "_opened", opened)
+    status, lines, _ = said(capsys, ply, "format:tiles3d", "--out", tmp_path / "tiles")
+    assert status == 0 and not any("offset" in line for line in lines)
+    status, lines, _ = said(capsys, ply, "format:tiles3d", "--format.no-georeference", "--out", tmp_path / "other")
+    assert status == 0 and lines[1].startswith("coordinates leave out the offset 512000 5800000")

@@ -96,7 +96,7 @@ def test_maps_go_on_after_the_process_was_killed(run, tmp_path):
     "words, line",
     [
         (["--gsd", "0"], "--gsd 0: it is a length"),
-        (["--gsd", "1", "--bounds", "100", "100", "120", "120"], "none of its triangles covers"),
+        (["--gsd", "1", "--bounds", "100", "100", "120", "120"], "not in the same place"),
         (["--gsd", "1e-9"], "too many for one map"),
         (["--against", "nowhere.ply"], "nowhere.ply: no such file"),
         (["--metres-per-unit", "-1"], "--metres-per-unit"),

@@ -13,7 +13,7 @@ from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.cloud import sample_evenly, write_cloud
 from surfkit.maps.contours import contour_lines, even_interval
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Window, map_crs
+from surfkit.maps.grid import Window, map_crs, same_crs
 from surfkit.maps.hillshade import hillshade
 from surfkit.maps.make import MapSettings, make_maps
 from surfkit.scene.camera import Camera
@@ -21,7 +21,7 @@ from surfkit.scene.scene import Frame, View
 from surfkit.texture.make import Subject
 from surfkit.texture.resolution import ground_sampling_distance
 
-from .shapes import UTM, centres, grid_of, heightfield
+from .shapes import UTM, centres, grid_of, heightfield, merged
 
 rasterio = needs("rasterio")
 FRAME = Frame(np.array([*UTM, 0.0]), 0.01, 1.0, "EPSG:32633")
@@ -158,9 +158,49 @@ def test_a_surface_does_not_differ_from_itself(tmp_path):
 def test_surfaces_apart_cannot_be_subtracted(tmp_path):
     west, east = UTM, (UTM[0] + 30, UTM[1])
     here, there = (heightfield(rising(0), at, (at[0] + 20, at[1] + 20)) for at in (west, east))
-    with pytest.raises(BadInput, match="none of its triangles"):
-        make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path, there)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["dsm.tif"], "no picture, no record, no draft"
+    with pytest.raises(BadInput, match="not in the same place"):
+        make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path / "new", there)
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    "bounds, said",
+    [
+        ((13.1, 52.3, 13.2, 52.4), "not in the same place"),
+        ((UTM[0] + 30, UTM[1], UTM[0] + 40, UTM[1] + 9), "none of its"),
+    ],
+)
+def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said):
+    """Degrees where metres belong, a hole of the mesh: what an earlier call drew, of more products, is still there."""
+    parts = [heightfield(rising(0), (UTM[0] + x, UTM[1]), (UTM[0] + x + 20, UTM[1] + 20)) for x in (0, 50)]
+    here = merged(*parts)
+    make_maps(Subject(here, FRAME), MapSettings(("hillshade", "contours"), 0.5), tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(BadInput, match=said):
+        make_maps(Subject(here, FRAME), MapSettings((), 0.5, bounds=bounds), tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert {"dsm.tif", "hillshade.tif", "contours.gpkg", "maps.json"} <= before.keys()
+    make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"dsm.tif", "maps.json"}, "none of other maps stays"
+
+
+@pytest.mark.parametrize(
+    "crs, metres, unit",
+    [("EPSG:32633", 1.0, "m"), ("EPSG:2263+6360", 0.3048006096012192, "US ft"), ("EPSG:2222", 0.3048, "ft")],
+)
+def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
+    here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
+    frame = Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)
+    assert make_maps(Subject(here, frame), MapSettings((), 0.5), tmp_path)["unit"] == unit
+
+
+def test_a_coordinate_reference_system_is_the_same_however_it_is_spelt():
+    text = rasterio.crs.CRS.from_epsg(32633).to_wkt(version="WKT1_ESRI")
+    place = "+proj=topocentric +ellps=WGS84 +lat_0=52.5 +lon_0=16.0 +h_0={}".format
+    assert same_crs("EPSG:32633", text) and same_crs("EPSG:32633", "epsg:32633") and same_crs(None, None)
+    assert not same_crs("EPSG:32633", "EPSG:32632") and not same_crs("EPSG:32633", None)
+    assert same_crs(place(80.0), place(80.0)) and not same_crs(place(80.0), place(90.0))
+    assert not same_crs("EPSG:32633", "some system")
 
 
 def test_all_products_of_a_hill(tmp_path):

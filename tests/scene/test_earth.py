@@ -62,7 +62,7 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
     ("crs", "text"),
     [
         ("EPSG:2263", "its axes are not east, north and up in one unit"),  # feet on the map, metres of height
-        ("EPSG:4326", "pyproj cannot place some of the coordinates"),  # degrees
+        ("EPSG:4326", "it is in degrees, where lengths belong"),
         ("EPSG:1", "pyproj cannot place it on Earth"),
     ],
 )

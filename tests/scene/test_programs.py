@@ -451,3 +451,53 @@ def test_doctor_says_once_what_a_lens_lacks_and_what_to_do_without_points(tmp_pa
     assert main(["doctor", str(tmp_path), "--quick", "--probe", "0"]) == 2
     said = capsys.readouterr().out
     assert said.count("where a finite number belongs") == 1 and "more like it" not in said
+
+
+@pytest.mark.parametrize("program", [realitycapture, bundler])
+def test_a_file_beside_the_cameras_says_which_map_they_are_on(tmp_path, program):
+    project = program(tmp_path)
+    (tmp_path / "georeference.json").write_text(f'{{"crs": "EPSG:32632", "offset": {ORIGIN.tolist()}}}')
+    data = Data(tmp_path)
+    capture = read_capture(data, reader_of(data))
+    assert (capture.crs, capture.metres, capture.shift) == ("EPSG:32632", 1.0, tuple(ORIGIN))
+    for shot in capture.shots:
+        local = (DOTS + ORIGIN) @ shot.pose[:3, :3].T + shot.pose[:3, 3]
+        assert np.allclose(shot.camera.img_from_cam(local), project(shot.name, DOTS), atol=0.05)
+    if program is bundler:
+        scene = read(data)
+        seen = observations(data, scene).xyz
+        assert np.abs(seen - scene.frame.to_local(DOTS + ORIGIN)).max() < 1e-6 * np.abs(seen).max()
+    both = read_capture(Data(tmp_path, test_data=tmp_path), reader_of(data))
+    same = {shot.name.rpartition("/")[2]: [] for shot in both.shots}
+    for shot in both.shots:
+        same[shot.name.rpartition("/")[2]].append(shot.pose)
+    assert all(len(poses) == 2 and (poses[0] == poses[1]).all() for poses in same.values())
+    (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "metres_per_unit": 0}')
+    with pytest.raises(BadInput, match="georeference.json"):
+        read(data)
+
+
+def test_what_files_leave_out_is_found_where_the_file_names_no_offset(tmp_path):
+    """Coordinates of an export are those of the map already; float32 cannot hold them."""
+    realitycapture(tmp_path, change=moved_to_the_map)
+    (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "offset": [0, 0, 0]}')
+    with collect_notes():
+        frame = read(Data(tmp_path)).frame
+    assert frame.crs == "EPSG:32632" and np.abs(np.array(frame.shift[:2]) - ORIGIN[:2]).max() < 1e4
+
+
+def moved_to_the_map(text):
+    head, *rows = text.splitlines()
+    words = [row.split(",") for row in rows]
+    moved = [[w[0], *(repr(float(v) + float(o)) for v, o in zip(w[1:4], ORIGIN, strict=True)), *w[4:]] for w in words]
+    return "\n".join([head, *(",".join(row) for row in moved)]) + "\n"
+
+
+def test_two_that_name_the_map_are_refused(tmp_path):
+    pix4d(tmp_path)
+    (tmp_path / "1_initial/params/survey_wkt.prj").write_text(
+        'PROJCS["WGS 84 / UTM zone 32N",UNIT["metre",1],AUTHORITY["EPSG","32632"]]'
+    )
+    (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "offset": [0, 0, 0]}')
+    with pytest.raises(BadInput, match="delete this file"):
+        read_capture(Data(tmp_path), reader_of(Data(tmp_path)))
