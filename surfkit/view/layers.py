@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfkit.mesh.base import Mesh
-from surfkit.view.display import PALETTE, some
+from surfkit.view.display import PALETTE
 from surfkit.view.glb import unlit_glb
 from surfkit.view.mesh_files import Textured
 from surfkit.view.outlines import block_outlines
+from surfkit.view.pace import Pace
 from surfkit.view.picking import corners_of
-from surfkit.view.screen import WORLD, Latest, quaternion_of, telling
+from surfkit.view.point_layer import PointLayer
+from surfkit.view.screen import WORLD, Following, Latest, quaternion_of, telling
 from surfkit.view.shelf import Shelf
-from surfkit.view.splat_layer import SplatLayer, add_budget, add_points
+from surfkit.view.splat_layer import SplatLayer, add_budget
 
 if TYPE_CHECKING:
     import viser
@@ -30,32 +32,50 @@ MOST_LABELS = 400
 class Layers:
     """What is drawn in one browser, and its switches."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle) -> None:
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace) -> None:
         """Build the switches, and draw."""
         self.shelf, self.client, self.subject = shelf, client, shelf.subject
         self.shows_mesh = self.subject.splats is None
         centres = [view.camera.centre.numpy() for view in self.subject.views]
         self.typical_size = typical_size(np.stack(centres)) if centres else 0.0
         self.camera_size = self.typical_size if self.subject.views else 0.0
-        self.splats: SplatLayer | None = None
+        self.adapting: list[SplatLayer | PointLayer] = []
         gui = client.gui
         with gui.add_folder("Layers"):
+            if self.subject.splats is not None or self.subject.points is not None:
+                pace.add_switch()
             if self.subject.splats is not None:
-                self.splats = SplatLayer(shelf, client, len(self.subject.splats))
+                self.adapting.append(SplatLayer(shelf, client, pace, len(self.subject.splats)))
             if self.subject.mesh is not None:
                 self._mesh_switches(gui, self.subject.mesh)
             if self.subject.points is not None:
-                self._point_switches(gui)
+                self.adapting.append(PointLayer(shelf, client, pace, self.subject.points))
             if self.subject.views:
                 self._camera_switches(gui)
             if self.subject.plan is not None:
                 shown = gui.add_checkbox("blocks", False)
                 shown.on_update(telling(client, lambda _: self._blocks(shown.value)))
 
+        self.following = Following(self._camera, pace.rest)
+        pace.follow = self._follow
+        client.camera.on_update(self.following.moved)
+        self.following.moved()  # it may have, while the first splats were chosen
+
     def stop(self) -> None:
         """The browser has gone."""
-        if self.splats is not None:
-            self.splats.stop()
+        self.following.stop()
+
+    def _camera(self, moves: bool) -> None:
+        for layer in self.adapting:
+            layer.moves = moves
+        self._follow()
+
+    def _follow(self) -> None:
+        for layer in self.adapting:
+            try:
+                layer.follow()
+            except Exception as error:
+                layer.note.content = f"not updated: {' '.join(f'{type(error).__name__}: {error}'.split())}"
 
     def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
         count = len(mesh.faces)
@@ -109,31 +129,6 @@ class Layers:
             receive_shadow=False,
         )
         return f"{textured.path.name} is shown, {len(data) / 1e6:.1f} MB"
-
-    def _point_switches(self, gui: viser.GuiApi) -> None:
-        points = self.subject.points
-        assert points is not None
-        alone = self.subject.splats is None and self.subject.mesh is None
-        count = len(points.xyz)
-        shown = gui.add_checkbox("points" if alone else "sparse points", alone)
-        size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
-        budget = add_budget(gui, "most points", count, self.shelf.most)
-        note = gui.add_markdown("")
-
-        def draw() -> None:
-            for part in (size, budget, note):
-                part.visible = shown.value
-            if not shown.value:
-                self.client.scene.remove_by_name("/points")
-                return
-            rows = some(count, budget.value)
-            add_points(self.client, "/points", points.xyz[rows], points.rgb[rows], size.value)
-            note.content = f"{len(rows):,} of {count:,} points are shown"
-
-        draw()
-        shown.on_update(telling(self.client, lambda _: draw()))
-        for slider in (size, budget):
-            slider.on_update(telling(self.client, Latest(draw)))
 
     def _camera_switches(self, gui: viser.GuiApi) -> None:
         shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")

@@ -1,0 +1,156 @@
+"""Pictures per second of `surfkit view` in a browser without a graphics card, as a user meets them.
+
+    python bench/pace.py --size 3000000
+
+A city of so many surfels, and of so many points, is opened in Chromium without a screen, at the settings of the program.
+The mouse turns it in drags with rests between; each picture that has the model in it is counted. `--chromium`, Playwright:
+as in bench/view.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import save
+from playwright.sync_api import Page, sync_playwright
+from view import COUNTING, QUIET, RENDERER, SIZE, SOFTWARE, city
+
+from surfkit.scene.scene import Frame
+from surfkit.view.page import show
+from surfkit.view.server import Address, served
+from surfkit.view.subject import Points, Subject
+
+DRAG_S, REST_S = 8.0, 6.0
+FAST = 10.0
+"""Pictures a second that the page is to have."""
+SPEED = 40.0
+"""Of the mouse, pixels a second."""
+
+
+def subjects(size: int) -> dict[str, Subject]:
+    """What is looked at, by name."""
+    table, frame, up = city(size), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0])
+    rgb = (0.5 + 0.28 * table.sh0).clamp(0, 1).mul(255).byte().numpy()
+    return {
+        "splats": Subject(Path("city"), frame, up, splats=table),
+        "points": Subject(Path("city"), frame, up, points=Points(table.means.numpy(), rgb)),
+    }
+
+
+def opened(browser: Any, url: str) -> Page:
+    """A page that counts its pictures from its beginning."""
+    page = browser.new_page(viewport=SIZE)
+    page.set_default_timeout(600_000)
+    page.add_init_script(COUNTING)
+    page.goto(url)
+    return page
+
+
+def drag(page: Page, seconds: float) -> None:
+    """Turn the model with the mouse."""
+    begun = time.monotonic()
+    page.mouse.move(300, 360)
+    page.mouse.down()
+    while (gone := time.monotonic() - begun) < seconds:
+        page.mouse.move(300 + SPEED * gone, 360 + 30 * np.sin(3 * gone))
+        page.wait_for_timeout(30)
+    page.mouse.up()
+
+
+def pictures(page: Page) -> np.ndarray:
+    """(N, 2) times, seconds, and sizes of the pictures since the last call."""
+    drawn = np.array(page.evaluate("window.drawn.splice(0)"), float).reshape(-1, 2)
+    return drawn * [1e-3, 1]
+
+
+def rate(times: np.ndarray, first: float, last: float) -> dict[str, Any]:
+    """Of the pictures of a time."""
+    gaps = np.diff([first, *times, last])
+    return {"a second": round(len(times) / (last - first), 2), "longest gap, s": round(float(gaps.max()), 2)}
+
+
+def clock(page: Page) -> float:
+    """Of the page, seconds."""
+    return page.evaluate("performance.now()") / 1000
+
+
+def measured(page: Page, drags: int) -> list[dict[str, Any]]:
+    """A row for each drag with the rest after it."""
+    rows = []
+    for _ in range(drags):
+        pictures(page)
+        first = clock(page)
+        drag(page, DRAG_S)
+        middle = clock(page)
+        moving = pictures(page)
+        page.wait_for_timeout(1000 * REST_S)
+        resting = pictures(page)
+        late = moving[:, 0] > first + DRAG_S / 2
+        rows.append(
+            {
+                "moving": rate(moving[:, 0], first, middle),
+                "of which the second half": rate(moving[late, 0], first + DRAG_S / 2, middle),
+                "things while moving": int(moving[-1, 1]) if len(moving) else 0,
+                "things at rest": int(resting[-1, 1]) if len(resting) else 0,
+                "load of the machine": round(os.getloadavg()[0], 1),
+            }
+        )
+    return rows
+
+
+def first_picture(page: Page, begun: float) -> float:
+    """Seconds until it is there."""
+    page.wait_for_function("window.drawn.length > 1")  # the second begins when the first is done
+    return round(time.monotonic() - begun, 1)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, default=3_000_000)
+    parser.add_argument("--of", nargs="+", default=["splats", "points"])
+    parser.add_argument("--draw", default=None, help="as `surfkit view --draw`")
+    parser.add_argument("--drags", type=int, default=4)
+    parser.add_argument("--browsers", type=int, default=1)
+    parser.add_argument("--pictures", type=Path, default=None, help="folder for what the page looks like")
+    parser.add_argument("--name", default="pace", help="of the result")
+    parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("google-chrome"))
+    asked = parser.parse_args()
+    found: dict[str, Any] = {"size": asked.size, "window": [SIZE["width"], SIZE["height"]], "drawn as": asked.draw}
+    all_of_them = subjects(asked.size)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
+        for name in asked.of:
+            browsers = [
+                play.chromium.launch(executable_path=asked.chromium, args=[*QUIET, *SOFTWARE])
+                for _ in range(asked.browsers)
+            ]
+            with served(Address(), "bench") as page_of:
+                show(all_of_them[name], page_of, Path(folder), **({"form": asked.draw} if asked.draw else {}))
+                begun = time.monotonic()
+                pages = [opened(browser, page_of.url) for browser in browsers]
+                row: dict[str, Any] = {
+                    "seconds until the first picture": [first_picture(each, begun) for each in pages]
+                }
+                row["drags"] = [measured(each, asked.drags) for each in pages]
+                row["webgl"] = pages[0].evaluate(RENDERER)
+                if asked.pictures is not None:
+                    asked.pictures.mkdir(parents=True, exist_ok=True)
+                    for number, each in enumerate(pages):
+                        each.screenshot(path=asked.pictures / f"{name}-{number}-rest.png")
+            for browser in browsers:
+                browser.close()
+            found[name] = row
+            print(name, row, flush=True)
+            save(asked.name, found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
