@@ -2,14 +2,15 @@
 
     python bench/pace.py --size 3000000
 
-A city of so many surfels, and of so many points, is opened in Chromium without a screen, at the settings of the program.
-The mouse turns it in drags with rests between; each picture that has the model in it is counted. `--chromium`, Playwright:
-as in bench/view.py.
+A city of so many surfels, so many points, and a mesh of so many triangles are opened in Chromium without a screen, at
+the settings of the program. The mouse turns them in drags with rests between; each picture that has the model in it is
+counted. Chromium and Playwright are as in bench/view.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shutil
 import sys
@@ -21,13 +22,25 @@ from typing import Any
 import numpy as np
 from machine import save
 from playwright.sync_api import Page, sync_playwright
-from view import COUNTING, QUIET, RENDERER, SIZE, SOFTWARE, city
+from view import QUIET, RENDERER, SIZE, SOFTWARE, city
 
+from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
 from surfkit.view.subject import Points, Subject
 
+COUNTING = """
+window.drawn = [];
+for (const [name, at] of [["drawElementsInstanced", 4], ["drawArrays", 2], ["drawElements", 1]]) {
+  const plain = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...given) {
+    if (given[at] > 3500) window.drawn.push([performance.now(), given[at]]);
+    return plain.apply(this, given);
+  };
+}
+"""
+"""Times of the draw calls of the model, and how many splats, points or corners of triangles they have."""
 DRAG_S, REST_S = 8.0, 6.0
 FAST = 10.0
 """Pictures a second that the page is to have."""
@@ -39,9 +52,17 @@ def subjects(size: int) -> dict[str, Subject]:
     """What is looked at, by name."""
     table, frame, up = city(size), Frame(np.zeros(3), 1.0), np.array([0.0, 0.0, 1.0])
     rgb = (0.5 + 0.28 * table.sh0).clamp(0, 1).mul(255).byte().numpy()
+    side = math.isqrt(size // 2) + 1
+    x, y = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
+    hills = np.stack([x, y, 0.1 * np.sin(40 * x) * np.cos(30 * y)], axis=-1).reshape(-1, 3).astype(np.float32)
+    at = np.arange(side * side, dtype=np.int32).reshape(side, side)
+    a, b, c, d = (corner.ravel() for corner in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    faces, shade = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), 128 + 900 * hills[:, 2:]
+    mesh = Mesh(hills, faces, np.repeat(shade, 3, axis=1).astype(np.uint8))
     return {
         "splats": Subject(Path("city"), frame, up, splats=table),
         "points": Subject(Path("city"), frame, up, points=Points(table.means.numpy(), rgb)),
+        "mesh": Subject(Path("hills"), frame, up, mesh=mesh),
     }
 
 
@@ -115,7 +136,7 @@ def first_picture(page: Page, begun: float) -> float:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=3_000_000)
-    parser.add_argument("--of", nargs="+", default=["splats", "points"])
+    parser.add_argument("--of", nargs="+", default=["splats", "points", "mesh"])
     parser.add_argument("--draw", default=None, help="as `surfkit view --draw`")
     parser.add_argument("--drags", type=int, default=4)
     parser.add_argument("--browsers", type=int, default=1)

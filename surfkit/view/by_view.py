@@ -89,7 +89,7 @@ class PointLot:
     """
 
     def __init__(self, means: Tensor, weights: Tensor | None = None, reach: Tensor | None = None) -> None:
-        """Of (N, 3) positions, (N,) logarithms of weights and (N,) radii: the same weights and no radii if not given."""
+        """Of (N, 3) positions, (N,) logarithms of weights, else the same for all, and (N,) radii, else 0."""
         count = len(means)
         self.means = means.float()
         self.weights = torch.zeros(count) if weights is None else weights

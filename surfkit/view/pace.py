@@ -1,7 +1,7 @@
 """How much a browser gets to draw: less where its pictures come late, as without a graphics card.
 
-A script on the page (pace.js) tells how long pictures have taken, and how many things each draw call of them had. What a
-browser has not been seen to draw slowly is not limited.
+A script on the page (pace.js) tells how long pictures have taken, and how many things each draw call of them had. A
+browser that has not been seen to draw slowly has no limits.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ SLOW_REST_S = 1.0
 """A slow browser's camera that has not moved for so long is at rest: it tells where it is once a picture."""
 HOLD_S = 10.0
 """After it was lowered, a limit is not raised for so long."""
-FIRST = {"splats": LEAST}
-"""Limits of browsers without a graphics card to begin with; `FIRST_POINTS` of what else there is."""
-FIRST_POINTS = 40_000
+FIRST = {"splats": LEAST, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
+"""Limits of browsers without a graphics card to begin with."""
+FEW = 20_000
+"""Things that any browser may be sent before it has said whether it has a graphics card."""
 HELLO_S = 2.0
 """For a browser to say whether it has a graphics card, before it is sent much."""
 MOST_TIMES = 100
@@ -103,7 +104,7 @@ class Pace:
         self.client = client
         self.follow: Callable[[], None] = lambda: None
         self.limits: dict[str, Limit] = {}
-        self.shown: dict[str, tuple[int, int]] = {}
+        self.shown: dict[str, tuple[int, int, int]] = {}
         self.software, self.said, self.answering = False, threading.Event(), threading.Lock()
         self.on: viser.GuiCheckboxHandle | None = None
         client.gui.add_html(f'<span id="surfkit-pace" data-client="{client.client_id}" hidden></span>')
@@ -122,20 +123,18 @@ class Pace:
         """Seconds after which a camera that has not moved is at rest."""
         return SLOW_REST_S if any(limit.most is not None for limit in self.limits.values()) else REST_S
 
-    def sent(self, kind: str, count: int, wanted: int) -> None:
-        """What the browser has of a kind now, and would have without limits."""
-        self.shown[kind] = count, wanted
+    def sent(self, kind: str, count: int, wanted: int, each: int = 1) -> None:
+        """What the browser has of a kind, and would have without limits; draw calls count `each` times as many."""
+        self.shown[kind] = count, wanted, each
 
     def words(self, kind: str, wanted: int, moves: bool) -> str:
         """Why it has fewer, for the line that says how many."""
         if self.allowed(kind, wanted, moves) >= wanted:
             return ""
-        return ". This browser draws slowly, so that it gets fewer than the slider allows" + (
-            ", and more when the camera rests" if moves else ""
-        )
+        return ". This browser draws slowly, so that it gets fewer than the slider allows"
 
     def _limit(self, kind: str) -> Limit:
-        return self.limits.setdefault(kind, Limit(FIRST.get(kind, FIRST_POINTS) if self.software else None))
+        return self.limits.setdefault(kind, Limit(FIRST[kind] if self.software else None))
 
     def answer(self, software: bool, times: Sequence[float], drawn: Sequence[int]) -> tuple[http.HTTPStatus, str]:
         """To what the script tells: times of pictures, seconds, and what each of their draw calls had."""
@@ -146,8 +145,8 @@ class Pace:
             return http.HTTPStatus.TOO_MANY_REQUESTS, "one at a time"
         try:
             before = {kind: limit.most for kind, limit in self.limits.items()}
-            for kind, (count, wanted) in self.shown.items():
-                if count in drawn:  # else these are pictures of what it had before
+            for kind, (count, wanted, each) in self.shown.items():
+                if count * each in drawn:  # else these are pictures of what it had before
                     self._limit(kind).judge(times, count, wanted, time.monotonic())
             if before != {kind: limit.most for kind, limit in self.limits.items()}:
                 if self.on is not None:

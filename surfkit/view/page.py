@@ -12,7 +12,7 @@ from surfkit.render.path import beside
 from surfkit.view.cursor import Cursor, serve_cursors
 from surfkit.view.layers import Layers
 from surfkit.view.measure import coordinates
-from surfkit.view.pace import FIRST_POINTS, HELLO_S, Pace, serve_paces
+from surfkit.view.pace import FEW, HELLO_S, Pace, serve_paces
 from surfkit.view.photographs import Photographs
 from surfkit.view.screen import WORLD, ray_of, ray_through, telling
 from surfkit.view.server import Served
@@ -66,7 +66,7 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
             pace = paces[client.client_id] = Pace(client)
-            if shelf.size > FIRST_POINTS and not served.script.missing:
+            if shelf.size > FEW and not served.script.missing:
                 pace.said.wait(HELLO_S)
             pages[client.client_id] = Page(shelf, client, pace, folder, served)
             if client.client_id not in server.get_clients():  # it left meanwhile

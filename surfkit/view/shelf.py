@@ -66,9 +66,13 @@ class Shelf:
 
     @property
     def size(self) -> int:
-        """Splats or points of the subject, of what there are more."""
-        splats, points = self.subject.splats, self.subject.points
-        return max(0 if splats is None else len(splats), 0 if points is None else len(points.xyz))
+        """Splats, triangles or points of the subject: of what there is most."""
+        splats, mesh, points = self.subject.splats, self.subject.mesh, self.subject.points
+        return max(
+            0 if splats is None else len(splats),
+            0 if mesh is None else len(mesh.faces),
+            0 if points is None else len(points.xyz),
+        )
 
     @property
     def colors(self) -> tuple[Colors, ...]:
