@@ -75,21 +75,25 @@ def opened(browser: Any, url: str) -> Page:
     return page
 
 
-def drag(page: Page, seconds: float) -> None:
-    """Turn the model with the mouse."""
+def drag(pages: list[Page], seconds: float) -> None:
+    """Turn the model in all of them with the mouse."""
     begun = time.monotonic()
-    page.mouse.move(300, 360)
-    page.mouse.down()
+    for page in pages:
+        page.mouse.move(300, 360)
+        page.mouse.down()
     while (gone := time.monotonic() - begun) < seconds:
-        page.mouse.move(300 + SPEED * gone, 360 + 30 * np.sin(3 * gone))
-        page.wait_for_timeout(30)
-    page.mouse.up()
+        for page in pages:
+            page.mouse.move(300 + SPEED * gone, 360 + 30 * np.sin(3 * gone))
+        pages[0].wait_for_timeout(30)
+    for page in pages:
+        page.mouse.up()
 
 
-def pictures(page: Page) -> np.ndarray:
-    """(N, 2) times, seconds, and sizes of the pictures since the last call."""
-    drawn = np.array(page.evaluate("window.drawn.splice(0)"), float).reshape(-1, 2)
-    return drawn * [1e-3, 1]
+def pictures(page: Page) -> tuple[np.ndarray, np.ndarray, float]:
+    """(N,) times, seconds, and (N,) sizes of the pictures since the last call; and what time it is."""
+    drawn, now = page.evaluate("[window.drawn.splice(0), performance.now()]")
+    times, sizes = np.array(drawn, float).reshape(-1, 2).T
+    return times / 1000, sizes.astype(int), now / 1000
 
 
 def rate(times: np.ndarray, first: float, last: float) -> dict[str, Any]:
@@ -98,29 +102,24 @@ def rate(times: np.ndarray, first: float, last: float) -> dict[str, Any]:
     return {"a second": round(len(times) / (last - first), 2), "longest gap, s": round(float(gaps.max()), 2)}
 
 
-def clock(page: Page) -> float:
-    """Of the page, seconds."""
-    return page.evaluate("performance.now()") / 1000
-
-
-def measured(page: Page, drags: int) -> list[dict[str, Any]]:
-    """A row for each drag with the rest after it."""
+def dragged(pages: list[Page]) -> list[dict[str, Any]]:
+    """A row for each page, of a drag and the rest after it."""
+    firsts = [pictures(page)[2] for page in pages]
+    drag(pages, DRAG_S)
+    moving = [pictures(page) for page in pages]
+    pages[0].wait_for_timeout(1000 * REST_S)
+    resting = [pictures(page) for page in pages]
     rows = []
-    for _ in range(drags):
-        pictures(page)
-        first = clock(page)
-        drag(page, DRAG_S)
-        middle = clock(page)
-        moving = pictures(page)
-        page.wait_for_timeout(1000 * REST_S)
-        resting = pictures(page)
-        late = moving[:, 0] > first + DRAG_S / 2
+    for first, (times, sizes, last), (_, at_rest, _) in zip(firsts, moving, resting, strict=True):
+        half = (first + last) / 2
+        fast = [at - first for at, tenth in zip(times, times[int(FAST) :], strict=False) if tenth - at <= 1]
         rows.append(
             {
-                "moving": rate(moving[:, 0], first, middle),
-                "of which the second half": rate(moving[late, 0], first + DRAG_S / 2, middle),
-                "things while moving": int(moving[-1, 1]) if len(moving) else 0,
-                "things at rest": int(resting[-1, 1]) if len(resting) else 0,
+                "moving": rate(times, first, last),
+                "second half": rate(times[times > half], half, last),
+                "seconds until ten a second": round(fast[0], 1) if fast else None,
+                "things while moving": int(sizes[-1]) if len(sizes) else None,
+                "things at rest": int(at_rest[-1]) if len(at_rest) else None,
                 "load of the machine": round(os.getloadavg()[0], 1),
             }
         )
@@ -159,7 +158,7 @@ def main() -> int:
                 row: dict[str, Any] = {
                     "seconds until the first picture": [first_picture(each, begun) for each in pages]
                 }
-                row["drags"] = [measured(each, asked.drags) for each in pages]
+                row["drags"] = [dragged(pages) for _ in range(asked.drags)]
                 row["webgl"] = pages[0].evaluate(RENDERER)
                 if asked.pictures is not None:
                     asked.pictures.mkdir(parents=True, exist_ok=True)

@@ -82,12 +82,9 @@ class Limit:
         took = statistics.median(self.times) * moving / drawn
         self.times = []
         if took > LATE_S:
-            found, self.lowered = max(int(moving * AIM_S / took), LEAST), now
-        elif took < EARLY_S and self.most is not None and now - self.lowered > HOLD_S:
-            found = max(int(moving * min(AIM_S / max(took, 1e-9), GROWTH)), self.most)
-        else:
-            return
-        self.most = None if found >= wanted else found
+            self.most, self.lowered = max(int(moving * AIM_S / took), LEAST), now
+        elif took < EARLY_S and self.most is not None and self.most < wanted and now - self.lowered > HOLD_S:
+            self.most = max(int(moving * min(AIM_S / max(took, 1e-9), GROWTH)), self.most)
 
 
 class Pace:
@@ -121,7 +118,9 @@ class Pace:
 
     def rest(self) -> float:
         """Seconds after which a camera that has not moved is at rest."""
-        return SLOW_REST_S if any(limit.most is not None for limit in self.limits.values()) else REST_S
+        shown = self.shown.copy().items()
+        slow = any(self.allowed(kind, wanted, moves=True) < wanted for kind, (_, wanted, _) in shown)
+        return SLOW_REST_S if slow else REST_S
 
     def sent(self, kind: str, count: int, wanted: int, each: int = 1) -> None:
         """What the browser has of a kind, and would have without limits; draw calls count `each` times as many."""
@@ -136,6 +135,9 @@ class Pace:
     def _limit(self, kind: str) -> Limit:
         return self.limits.setdefault(kind, Limit(FIRST[kind] if self.software else None))
 
+    def _all(self) -> dict[str, int | None]:
+        return {kind: limit.most for kind, limit in self.limits.copy().items()}
+
     def answer(self, software: bool, times: Sequence[float], drawn: Sequence[int]) -> tuple[http.HTTPStatus, str]:
         """To what the script tells: times of pictures, seconds, and what each of their draw calls had."""
         if not self.said.is_set():
@@ -144,11 +146,11 @@ class Pace:
         if not self.answering.acquire(blocking=False):
             return http.HTTPStatus.TOO_MANY_REQUESTS, "one at a time"
         try:
-            before = {kind: limit.most for kind, limit in self.limits.items()}
-            for kind, (count, wanted, each) in self.shown.items():
-                if count * each in drawn:  # else these are pictures of what it had before
+            before = self._all()
+            for kind, (count, wanted, each) in self.shown.copy().items():
+                if count and count * each in drawn:  # else these are pictures of what it had before
                     self._limit(kind).judge(times, count, wanted, time.monotonic())
-            if before != {kind: limit.most for kind, limit in self.limits.items()}:
+            if self._all() != before:
                 if self.on is not None:
                     self.on.visible = True
                 self.follow()
