@@ -83,7 +83,7 @@ def drag(pages: list[Page], seconds: float) -> None:
         page.mouse.down()
     while (gone := time.monotonic() - begun) < seconds:
         for page in pages:
-            page.mouse.move(300 + SPEED * gone, 360 + 30 * np.sin(3 * gone))
+            page.mouse.move(300 + SPEED * gone, 360 + 30 * np.sin(6 * np.pi * gone / seconds))
         pages[0].wait_for_timeout(30)
     for page in pages:
         page.mouse.up()

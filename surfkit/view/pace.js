@@ -5,12 +5,13 @@
   const EVERY_MS = 500; // between two requests, at least
   const LAST = 10; // pictures are told, those before are not
   const IDLE_MS = 500; // after which a picture is a single one: nothing moves
+  const NEW_MS = 500; // for which pictures wait for what was sent
   const COUNTED = 1000; // things in a draw call; those with fewer are marks and lines
   const CALLS = [["drawArrays", 2], ["drawElements", 1], ["drawArraysInstanced", 3], ["drawElementsInstanced", 4]];
   const waiting = []; // pictures that the machine still computes
   let picture = null; // whose draw calls are being made
   let last = -Infinity; // end of the picture before, milliseconds of performance.now()
-  let times = [], drawn = ""; // of pictures with the same things, not yet told
+  let times = [], drawn = "", since = 0; // of pictures with the same things, not yet told; when the first of them ended
   let told = "", busy = false, earliest = 0;
 
   for (const [name, place] of CALLS) {
@@ -39,7 +40,10 @@
     const now = performance.now();
     for (const { began, counts } of done) {
       const time = (now - Math.max(done[0].began, last)) / done.length;
-      if (began - last < IDLE_MS && counts.size) note(time, [...counts].sort().join(","));
+      const things = [...counts].sort().join(",");
+      const belongs = things && began - last < IDLE_MS && began - since > NEW_MS;
+      if (things !== drawn) [times, drawn, since] = [[], things, now];
+      else if (belongs) times = [...times, Math.round(time)].slice(-LAST);
     }
     if (done.length) last = now;
     if (waiting.length) setTimeout(look, 4);
@@ -49,11 +53,6 @@
     const open = fence && gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.UNSIGNALED;
     if (!open) gl.deleteSync(fence);
     return open;
-  }
-
-  function note(time, counts) {
-    if (counts !== drawn) [times, drawn] = [[], counts]; // its first picture also waits for what was sent
-    else times = [...times, Math.round(time)].slice(-LAST);
   }
 
   function isSoftware() {
@@ -66,7 +65,8 @@
   const software = isSoftware() ? 1 : 0;
 
   async function tell() {
-    const client = document.getElementById("surfkit-pace")?.dataset.client ?? told; // not there while the panel is folded
+    const tag = document.getElementById("surfkit-pace"); // not there while the panel is folded: then as before
+    const client = tag ? tag.dataset.client : told;
     if (busy || !client || (client === told && !times.length) || performance.now() < earliest) return;
     busy = true;
     const query = new URLSearchParams({ client, software, ms: times.join(","), drawn });
