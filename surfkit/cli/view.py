@@ -42,7 +42,7 @@ class View:
     """Splats, triangles and points that are sent to a browser at first; sliders on the page change it."""
 
     draw: Form | None = None
-    """How splats are drawn at first. Default: as splats, and as points in a browser without a graphics card; with
+    """How splats are drawn at first. Default: splats, but points in a browser without a graphics card. With
     points-while-moving, splats come back when the camera rests."""
 
     up: Up | None = None

@@ -3,6 +3,7 @@
   "use strict";
   const LOOK_MS = 100; // between two looks for what there is to tell
   const EVERY_MS = 500; // between two requests, at least
+  const AGAIN_MS = 5000; // after one that failed: the server may have ended
   const LAST = 10; // pictures are told, those before are not
   const IDLE_MS = 500; // after which a picture is a single one: nothing moves
   const NEW_MS = 500; // for which pictures wait for what was sent
@@ -71,14 +72,10 @@
     busy = true;
     const query = new URLSearchParams({ client, software, ms: times.join(","), drawn });
     times = [];
-    try {
-      const answer = await fetch(`surfkit/pace?${query}`, { cache: "no-store" });
-      if (answer.ok) told = client;
-    } catch {
-      told = ""; // the server may have ended
-    }
+    const answer = await fetch(`surfkit/pace?${query}`, { cache: "no-store" }).catch(() => null);
+    if (answer?.ok) told = client;
+    earliest = performance.now() + (answer?.ok ? EVERY_MS : AGAIN_MS);
     busy = false;
-    earliest = performance.now() + EVERY_MS;
   }
   setInterval(tell, LOOK_MS);
 })();

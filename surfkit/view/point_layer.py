@@ -28,7 +28,7 @@ class PointLayer:
     def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, points: Points) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.points = shelf, client, pace, points
-        self.drawing, self.moves, self.place, self.asked = threading.Lock(), True, Place(client), 0
+        self.drawing, self.moves, self.place, self.asked, self.has = threading.Lock(), True, Place(client), 0, 0
         alone = shelf.subject.splats is None and shelf.subject.mesh is None
         gui = client.gui
         self.shown = gui.add_checkbox("points" if alone else "sparse points", alone)
@@ -65,11 +65,12 @@ class PointLayer:
         if asked < most:
             stand = self.place.begin()
             rows = self.shelf.points_for_eye(asked, stand.eye)
-            if not self.place.serves(stand):
+            if not self.place.serves(stand, fewer=asked < self.has):
                 return
         else:
             rows = some(count, most)
         add_points(self.client, "/points", self.points.xyz[rows], self.points.rgb[rows], self.size.value)
+        self.has = len(rows)
         self.pace.sent(KIND, len(rows), most)
         self.note.content = f"{len(rows):,} of {count:,} points are shown{self.pace.words(KIND, most, self.moves)}"
 

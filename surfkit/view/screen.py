@@ -130,10 +130,15 @@ class Place:
         self.chosen, self.stand = time.monotonic(), None
         return Stand.of(self.client.camera)
 
-    def serves(self, stand: Stand) -> bool:
-        """Whether what was chosen for a camera is still wanted; if not, the next choice is."""
+    def serves(self, stand: Stand, fewer: bool = False) -> bool:
+        """Whether what was chosen for a camera is still wanted; if not, the next choice is.
+
+        Args:
+            stand: That camera.
+            fewer: It is less than the browser has, which is too slow for more: it is wanted in any case.
+        """
         if Stand.of(self.client.camera).far_from(stand):
-            return False
+            return fewer
         self.stand = stand
         return True
 

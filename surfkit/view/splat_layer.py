@@ -47,6 +47,7 @@ class SplatLayer:
         self.shelf, self.client, self.pace, self.count = shelf, client, pace, count
         self.drawing, self.moves, self.node = threading.Lock(), True, None
         self.asked: Asked | None = None
+        self.has = 0
         self.place, self.places = Place(client), np.zeros(0, np.int64)
         gui = client.gui
         self.shown = gui.add_checkbox("splats", True)
@@ -93,7 +94,7 @@ class SplatLayer:
         if self.by_view(asked):
             stand = self.place.begin()
             chosen, told = self.shelf.for_eye(budget, stand.eye)
-            if not self.place.serves(stand):
+            if not self.place.serves(stand, fewer=budget < self.has):
                 return
             found = self.shelf.drawn(chosen.table, colors)
             if not as_points:
@@ -111,6 +112,7 @@ class SplatLayer:
                 found.opacities[:, None],
                 scale=WORLD * found.unit,
             )
+        self.has = len(found.means)
         self.pace.sent(asked.kind, len(found.means), asked.most)
         told += self.pace.words(asked.kind, asked.most, self.moves)
         legend = {"height": f"; {self.shelf.height_words()}", "normal": "; red east, green north, blue up"}
