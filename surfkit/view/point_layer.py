@@ -61,15 +61,15 @@ class PointLayer:
 
     def _send(self) -> None:
         count, most, asked = len(self.points.xyz), self.most, self.wanted()
-        self.asked = asked
+        self.asked, larger = asked, 1.0
         if asked < most:
             stand = self.place.begin()
-            rows = self.shelf.points_for_eye(asked, stand.eye)
+            rows, larger = self.shelf.points_for_eye(asked, stand.eye)
             if not self.place.serves(stand, fewer=asked < self.has):
                 return
         else:
             rows = some(count, most)
-        add_points(self.client, "/points", self.points.xyz[rows], self.points.rgb[rows], self.size.value)
+        add_points(self.client, "/points", self.points.xyz[rows], self.points.rgb[rows], larger * self.size.value)
         self.has = len(rows)
         self.pace.sent(KIND, len(rows), most)
         self.note.content = f"{len(rows):,} of {count:,} points are shown{self.pace.words(KIND, most, self.moves)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import threading
 from functools import cached_property, lru_cache
@@ -37,6 +38,8 @@ FORMS: tuple[Form, ...] = get_args(Form)
 MOST = 1_000_000
 CONE = 0.004
 """Radius, at distance 1, of the cone in which a click finds a point: four pixels of a window, about."""
+LARGER = 4.0
+"""Points that stand for others are larger by no more than this: else they hide what is near them."""
 KEPT = 2
 """Choices of splats, and of triangles, that are kept: that of now and that of before."""
 
@@ -179,10 +182,14 @@ class Shelf:
                 told = f"{len(found):,} splats, drawn by lot and enlarged, stand for {len(table):,}"
         return found, f"{told}: fine where you are, coarse far away, few beside the picture{self._remedy()}"
 
-    def points_for_eye(self, budget: int, eye: Eye) -> np.ndarray:
-        """(n,) rows of `budget` of the points, of which there are more, for one camera."""
+    def points_for_eye(self, budget: int, eye: Eye) -> tuple[np.ndarray, float]:
+        """(n,) rows of `budget` of the points, of which there are more, for one camera.
+
+        Also how many times larger they are drawn, so that they stand for the others; not more than LARGER.
+        """
         with self.making:
-            return self.point_lot.rows(budget, eye)[0].numpy()
+            rows, raised = self.point_lot.rows(budget, eye)
+        return rows.numpy(), min(math.exp(float(raised.median()) / 2), LARGER)
 
     def _remedy(self) -> str:
         """How to get levels of detail, for a run that has none."""
@@ -212,6 +219,10 @@ class Shelf:
         """Of covariances: the same for all choices, so that one can take the place of another."""
         assert self.subject.splats is not None
         return unit_of(self.subject.splats)
+
+    def dot(self, table: SplatTable) -> float:
+        """`unit` for points that stand for a table: larger if its splats are, as those that were drawn by lot."""
+        return min(max(unit_of(table), self.unit), LARGER * self.unit)
 
     def painted(self, table: SplatTable, colors: Colors) -> np.ndarray | None:
         """(N, 3) uint8; None for the colours of training."""

@@ -96,13 +96,14 @@ class SplatLayer:
             chosen, told = self.shelf.for_eye(budget, stand.eye)
             if not self.place.serves(stand, fewer=budget < self.has):
                 return
-            found = self.shelf.drawn(chosen.table, colors)
+            found, dot = self.shelf.drawn(chosen.table, colors), self.shelf.dot(chosen.table)
             if not as_points:
                 found = found.placed(self._places_of(chosen, budget), budget)
         else:
             found, told = self.shelf.splats(budget, colors)
+            dot = found.unit
         if as_points:
-            self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * found.unit)
+            self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * dot)
         else:
             self.node = self.client.scene.add_gaussian_splats(
                 "/splats",

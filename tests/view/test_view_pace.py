@@ -3,6 +3,7 @@
 import math
 import re
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from surfkit.view.by_view import Eye, PointLot
 from surfkit.view.pace import AT_REST, FEW, FIRST, LATE_S, LEAST, Limit, numbers
 from surfkit.view.page import show
 from surfkit.view.server import Address, served
+from surfkit.view.shelf import LARGER, Shelf
 from surfkit.view.subject import Points, Subject
 
 COUNT = 3 * FEW
@@ -139,6 +141,20 @@ def test_points_near_the_camera_are_more_likely():
     inside = (chosen[:, :2].abs() <= 0.55).all(1).float().mean()
     assert len(rows) == len(rows.unique()) == 1000 and inside > 0.6, "that is 2 % of the points"
     assert PointLot(xyz).rows(999)[0].shape == (999,)
+
+
+def test_points_that_stand_for_others_cover_as_much():
+    draw = np.random.default_rng(0)
+    xyz = np.column_stack([draw.uniform(-0.4, 0.4, (4000, 2)), np.full(4000, 1.0)]).astype(np.float32)
+    eye = Eye(Camera(torch.eye(4, dtype=torch.float64), 100.0, 100.0, 50.0, 50.0, 100, 100), 0.01)
+    shelf = Shelf(subject(points=Points(xyz, np.zeros((4000, 3), np.uint8))))
+    for count, exact in ((2000, 2**0.5), (1000, 2.0), (20, LARGER)):
+        rows, larger = shelf.points_for_eye(count, eye)
+        assert len(rows) == count and larger == pytest.approx(exact, rel=0.1)
+    flat = replace(table(4000), means=torch.from_numpy(xyz))
+    shelf = Shelf(subject(splats=flat))
+    assert shelf.dot(flat) == shelf.unit
+    assert shelf.dot(shelf.for_eye(1000, eye)[0].table) == pytest.approx(2 * shelf.unit, rel=0.1)
 
 
 def table(count=COUNT):
