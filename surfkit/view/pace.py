@@ -32,8 +32,9 @@ LEAST = 5_000
 """No limit is lower."""
 GROWTH = 8.0
 """A limit grows by no more at once."""
-SLOW_REST_S = 1.0
-"""A slow browser's camera that has not moved for so long is at rest: it tells where it is once a picture."""
+SLOW_REST_S, REST_PICTURES = 1.0, 6
+"""A slow browser's camera that has not moved for so long, and for the time of so many pictures, is at rest: it tells
+where it is once a picture."""
 HOLD_S = 10.0
 """After it was lowered, a limit is not raised for so long."""
 FIRST = {"splats": LEAST, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
@@ -92,6 +93,7 @@ class Pace:
 
     Attributes:
         follow: Called when a limit has changed, in another thread, one at a time.
+        took: Seconds of a picture, as was told last.
         software: Whether the browser draws without a graphics card, as soon as it has said so.
         said: Set then.
     """
@@ -102,6 +104,7 @@ class Pace:
         self.follow: Callable[[], None] = lambda: None
         self.limits: dict[str, Limit] = {}
         self.shown: dict[str, tuple[int, int, int]] = {}
+        self.took = 0.0
         self.software, self.said, self.answering = False, threading.Event(), threading.Lock()
         self.on: viser.GuiCheckboxHandle | None = None
         client.gui.add_html(f'<span id="surfkit-pace" data-client="{client.client_id}" hidden></span>')
@@ -120,7 +123,7 @@ class Pace:
         """Seconds after which a camera that has not moved is at rest."""
         shown = self.shown.copy().items()
         slow = any(self.allowed(kind, wanted, moves=True) < wanted for kind, (_, wanted, _) in shown)
-        return SLOW_REST_S if slow else REST_S
+        return max(SLOW_REST_S, REST_PICTURES * self.took) if slow else REST_S
 
     def sent(self, kind: str, count: int, wanted: int, each: int = 1) -> None:
         """What the browser has of a kind, and would have without limits; draw calls count `each` times as many."""
@@ -146,6 +149,7 @@ class Pace:
         if not self.answering.acquire(blocking=False):
             return http.HTTPStatus.TOO_MANY_REQUESTS, "one at a time"
         try:
+            self.took = statistics.median(times) if times else self.took
             before = self._all()
             for kind, (count, wanted, each) in self.shown.copy().items():
                 if count and count * each in drawn:  # else these are pictures of what it had before

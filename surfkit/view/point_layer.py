@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from surfkit.view.display import some
 from surfkit.view.pace import Pace
 from surfkit.view.screen import Latest, Place, telling
-from surfkit.view.shelf import Shelf
+from surfkit.view.shelf import LARGER, Shelf
 from surfkit.view.splat_layer import add_budget, add_points
 from surfkit.view.subject import Points
 
@@ -28,7 +31,8 @@ class PointLayer:
     def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, points: Points) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
         self.shelf, self.client, self.pace, self.points = shelf, client, pace, points
-        self.drawing, self.moves, self.place, self.asked, self.has = threading.Lock(), True, Place(client), 0, 0
+        self.drawing, self.moves, self.place = threading.Lock(), True, Place(client)
+        self.asked, self.rows, self.larger = 0, np.zeros(0, np.int64), 1.0
         alone = shelf.subject.splats is None and shelf.subject.mesh is None
         gui = client.gui
         self.shown = gui.add_checkbox("points" if alone else "sparse points", alone)
@@ -62,15 +66,18 @@ class PointLayer:
     def _send(self) -> None:
         count, most, asked = len(self.points.xyz), self.most, self.wanted()
         self.asked, larger = asked, 1.0
-        if asked < most:
+        if asked < len(self.rows) < most and self.moves:  # at once, and those that are nearer follow
+            rows = self.rows[some(len(self.rows), asked)]
+            larger = min(self.larger * math.sqrt(len(self.rows) / asked), LARGER)
+        elif asked < most:
             stand = self.place.begin()
             rows, larger = self.shelf.points_for_eye(asked, stand.eye)
-            if not self.place.serves(stand, fewer=asked < self.has):
+            if not self.place.serves(stand, fewer=asked < len(self.rows)):
                 return
         else:
             rows = some(count, most)
         add_points(self.client, "/points", self.points.xyz[rows], self.points.rgb[rows], larger * self.size.value)
-        self.has = len(rows)
+        self.rows, self.larger = rows, larger
         self.pace.sent(KIND, len(rows), most)
         self.note.content = f"{len(rows):,} of {count:,} points are shown{self.pace.words(KIND, most, self.moves)}"
 
