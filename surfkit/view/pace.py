@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     import viser
 
 PATH = "/surfkit/pace"
-LATE_S, AIM_S, EARLY_S = 1 / 10, 1 / 15, 1 / 30
+LATE_S, AIM_S, EARLY_S = 1 / 10, 1 / 15, 1 / 20
 """Time of a picture: above which less is drawn, that which is aimed at then, and below which more is drawn again."""
 AT_REST = 3
 """As many times more are drawn while the camera rests."""
 ENOUGH, LONG_S = 5, 1.0
 """Pictures that are judged together; three of them if they took so long."""
-LEAST = 5_000
-"""No limit is lower."""
-GROWTH = 8.0
-"""A limit grows by no more at once."""
+GROWTH = 1.5, 8.0
+"""Times that a limit grows at once, at least and at most."""
 SLOW_REST_S, REST_PICTURES = 1.0, 6
 """A slow browser's camera that has not moved for so long, and for the time of so many pictures, is at rest: it tells
 where it is once a picture."""
 HOLD_S = 10.0
 """After it was lowered, a limit is not raised for so long."""
-FIRST = {"splats": LEAST, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
-"""Limits of browsers without a graphics card to begin with."""
+FIRST = {"splats": 5_000, "splats as points": 40_000, "points": 40_000, "triangles": 20_000}
+"""Limits of browsers without a graphics card to begin with, by kind."""
+LEAST = {"splats": 5_000, "splats as points": 10_000, "points": 10_000, "triangles": 10_000}
+"""No limits are lower."""
 FEW = 20_000
 """Things that any browser may be sent before it has said whether it has a graphics card."""
 HELLO_S = 2.0
@@ -54,9 +54,9 @@ class Limit:
         most: While the camera moves; None for no limit.
     """
 
-    def __init__(self, most: int | None = None) -> None:
-        """No pictures are known yet."""
-        self.most, self.times, self.drawn, self.lowered = most, [], 0, -math.inf
+    def __init__(self, most: int | None = None, least: int = 0) -> None:
+        """No pictures are known yet; the limit never becomes less than `least`."""
+        self.least, self.most, self.times, self.drawn, self.lowered = least, most, [], 0, -math.inf
 
     def allowed(self, wanted: int, moves: bool) -> int:
         """How many of those that a user wants are drawn."""
@@ -65,8 +65,8 @@ class Limit:
     def judge(self, times: Sequence[float], drawn: int, wanted: int, now: float) -> None:
         """Set the limit by pictures that were drawn.
 
-        The time of a picture is taken to grow by the same for each thing in it, beside a part that stays; it need not
-        be known, as limits between which the time lies by a factor of three are left alone.
+        A picture takes some time for each thing in it, beside a part that stays and is not known. So after the limit was
+        lowered it takes AIM_S or longer; and while it takes less than EARLY_S, half as many more are in time.
 
         Args:
             times: Of pictures, one after the other, seconds.
@@ -83,9 +83,10 @@ class Limit:
         took = statistics.median(self.times) * moving / drawn
         self.times = []
         if took > LATE_S:
-            self.most, self.lowered = max(int(moving * AIM_S / took), LEAST), now
-        elif took < EARLY_S and self.most is not None and self.most < wanted and now - self.lowered > HOLD_S:
-            self.most = max(int(moving * min(AIM_S / max(took, 1e-9), GROWTH)), self.most)
+            self.most, self.lowered = max(int(moving * AIM_S / took), self.least), now
+        elif took < EARLY_S and self.most is not None and drawn <= self.most < wanted and now - self.lowered > HOLD_S:
+            low, high = GROWTH
+            self.most = int(self.most * min(max(AIM_S / max(took, 1e-9), low), high))
 
 
 class Pace:
@@ -136,7 +137,7 @@ class Pace:
         return ". This browser draws slowly, so that it gets fewer than the slider allows"
 
     def _limit(self, kind: str) -> Limit:
-        return self.limits.setdefault(kind, Limit(FIRST[kind] if self.software else None))
+        return self.limits.setdefault(kind, Limit(FIRST[kind] if self.software else None, LEAST[kind]))
 
     def _all(self) -> dict[str, int | None]:
         return {kind: limit.most for kind, limit in self.limits.copy().items()}

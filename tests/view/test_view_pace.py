@@ -31,7 +31,7 @@ class Played:
 
     def __init__(self, fixed, each, wanted=1_000_000, first=None, noise=0.15, seed=0):
         self.fixed, self.each, self.wanted, self.noise = fixed, each, wanted, noise
-        self.limit, self.now, self.draw = Limit(first), 0.0, np.random.default_rng(seed)
+        self.limit, self.now, self.draw = Limit(first, 5_000), 0.0, np.random.default_rng(seed)
         self.changes, self.rates = [], []
 
     def takes(self, count):
@@ -105,11 +105,11 @@ def test_what_is_no_slowness_limits_nothing():
 
 
 def test_the_least_and_the_slider():
-    limit = Limit()
+    limit = Limit(least=5_000)
     for now in range(5):
         limit.judge([9.0, 9.0, 9.0], limit.allowed(10**6, True), 10**6, float(now))
-    assert limit.most == LEAST and limit.allowed(3_000, True) == 3_000
-    assert limit.allowed(10**6, False) == AT_REST * LEAST and limit.allowed(8_000, False) == 8_000
+    assert limit.most == 5_000 and limit.allowed(3_000, True) == 3_000
+    assert limit.allowed(10**6, False) == AT_REST * 5_000 and limit.allowed(8_000, False) == 8_000
     slow = Limit(40_000)
     for now in range(0, 200, 20):  # all of a small number is in time: that tells nothing of a million
         slow.judge([0.001] * 5, 10_000, 10_000, float(now))
@@ -120,6 +120,7 @@ def test_pictures_at_rest_are_judged_by_what_moving_ones_would_take():
     limit = Limit(40_000)
     for now in range(50):
         limit.judge([0.2] * 5, AT_REST * 40_000, 10**6, float(now))
+        limit.judge([0.06] * 5, AT_REST * 40_000, 10**6, float(now))  # of which most may be for what stays
     assert limit.most == 40_000
     limit.judge([0.6] * 5, AT_REST * 40_000, 10**6, 60.0)
     assert 10_000 < limit.most < 20_000
@@ -267,7 +268,7 @@ def test_a_mesh_keeps_pace_too(tmp_path):
         first = count_in(browser)
         assert FIRST["triangles"] / 3 < first <= FIRST["triangles"] and says(browser, "draws slowly")
         tell(page, client, software=1, ms="300,300,300,300,300", drawn=3 * first)
-        browser.wait_for(lambda b: LEAST / 3 < count_in(b) <= LEAST)
+        browser.wait_for(lambda b: LEAST["triangles"] / 3 < count_in(b) <= LEAST["triangles"])
 
 
 def test_without_a_word_from_the_browser_nothing_is_limited(tmp_path, monkeypatch):
