@@ -65,8 +65,8 @@ class Limit:
     def judge(self, times: Sequence[float], drawn: int, wanted: int, now: float) -> None:
         """Set the limit by pictures that were drawn.
 
-        A picture takes some time for each thing in it, beside a part that stays and is not known. So after the limit was
-        lowered it takes AIM_S or longer; and while it takes less than EARLY_S, half as many more are in time.
+        A picture takes some time for each thing in it, beside a part that stays and is not known. So after the limit
+        was lowered it takes AIM_S or longer; and while it takes less than EARLY_S, half as many more are in time.
 
         Args:
             times: Of pictures, one after the other, seconds.

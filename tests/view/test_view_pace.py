@@ -121,9 +121,23 @@ def test_pictures_at_rest_are_judged_by_what_moving_ones_would_take():
     for now in range(50):
         limit.judge([0.2] * 5, AT_REST * 40_000, 10**6, float(now))
         limit.judge([0.06] * 5, AT_REST * 40_000, 10**6, float(now))  # of which most may be for what stays
-    assert limit.most == 40_000
+        assert limit.most == 40_000
     limit.judge([0.6] * 5, AT_REST * 40_000, 10**6, 60.0)
     assert 10_000 < limit.most < 20_000
+
+
+def test_a_limit_that_was_lowered_is_not_raised_at_once():
+    limit = Limit()
+    limit.judge([0.2] * 5, 10**6, 10**6, 0.0)
+    lowered = limit.most
+    assert lowered == 333_333
+    for now in (1.0, 5.0, 9.0):
+        limit.judge([0.04] * 5, lowered, 10**6, now)
+        assert limit.most == lowered
+    limit.judge([0.04] * 5, lowered, 10**6, 11.0)
+    assert limit.most == int(lowered * 5 / 3)
+    limit.judge([0.001] * 5, limit.most, 2 * 10**7, 12.0)
+    assert limit.most == 8 * int(lowered * 5 / 3), "and by no more than that at once"
 
 
 def test_numbers():
