@@ -220,10 +220,6 @@ class Shelf:
         assert self.subject.splats is not None
         return unit_of(self.subject.splats)
 
-    def dot(self, table: SplatTable) -> float:
-        """`unit` for points that stand for a table: larger if its splats are, as those that were drawn by lot."""
-        return min(max(unit_of(table), self.unit), LARGER * self.unit)
-
     def painted(self, table: SplatTable, colors: Colors) -> np.ndarray | None:
         """(N, 3) uint8; None for the colours of training."""
         up = self.subject.up

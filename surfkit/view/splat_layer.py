@@ -96,14 +96,13 @@ class SplatLayer:
             chosen, told = self.shelf.for_eye(budget, stand.eye)
             if not self.place.serves(stand, fewer=budget < self.has):
                 return
-            found, dot = self.shelf.drawn(chosen.table, colors), self.shelf.dot(chosen.table)
+            found = self.shelf.drawn(chosen.table, colors)
             if not as_points:
                 found = found.placed(self._places_of(chosen, budget), budget)
         else:
             found, told = self.shelf.splats(budget, colors)
-            dot = found.unit
         if as_points:
-            self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * dot)
+            self.node = add_points(self.client, "/splats", found.means, found.rgb, DOT * found.unit)
         else:
             self.node = self.client.scene.add_gaussian_splats(
                 "/splats",
