@@ -82,6 +82,7 @@ def measured(browser: Any, url: str, form: str, budget: int, asked: argparse.Nam
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(1000 * asked.patience)
     page.add_init_script(COUNTING)
+    page.route("**/surfkit/pace?*", lambda route: route.abort())  # so that all of them are drawn: bench/pace.py
     begun = time.monotonic()
     page.goto(url)
     row = {"drawn as": form, "splats": budget, "load of the machine": round(os.getloadavg()[0], 1)}

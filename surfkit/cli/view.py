@@ -41,9 +41,9 @@ class View:
     most: int = MOST
     """Splats, triangles and points that are sent to a browser at first; sliders on the page change it."""
 
-    draw: Form = "splats"
-    """How splats are drawn at first. Points are for machines without a graphics card; with points-while-moving, splats
-    come back when the camera rests."""
+    draw: Form | None = None
+    """How splats are drawn at first. Default: splats, but points in a browser without a graphics card. With
+    points-while-moving, splats come back when the camera rests."""
 
     up: Up | None = None
     """Axis of the data set that points up. Default: what a run or a file tells; -y in a file of splats that tells

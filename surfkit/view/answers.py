@@ -14,7 +14,7 @@ from surfkit.core.events import say
 
 SCRIPT = "/surfkit/script.js"
 ASK = "/surfkit/ask"
-"""What the script asks."""
+"""What the script asks first of all."""
 END = b"</body>"
 """The script is put before it."""
 
@@ -27,7 +27,7 @@ class Script:
 
     Attributes:
         text: JavaScript.
-        answer: To what it asks with a query to `ASK`.
+        answers: To what it asks, by path.
         missing: Whether there was a page with no place for it.
         without: What the user is told then.
     """
@@ -35,11 +35,15 @@ class Script:
     def __init__(self) -> None:
         """None yet."""
         self.text, self.without, self.missing = "", "", False
-        self.answer: Answer | None = None
+        self.answers: dict[str, Answer] = {}
 
     def set(self, text: str, answer: Answer, without: str) -> None:
         """Give it to all pages from now on."""
-        self.text, self.answer, self.without = text, answer, without
+        self.text, self.answers, self.without = text, {ASK: answer}, without
+
+    def add(self, path: str, text: str, answer: Answer) -> None:
+        """Have it do something else besides, for which it asks at another path."""
+        self.text, self.answers = self.text + text, {**self.answers, path: answer}
 
     async def respond(self, target: str) -> Any:
         """The response to a request, or None if it is no matter of the script.
@@ -48,15 +52,15 @@ class Script:
             target: Path and query of the request, which the gate has let through.
         """
         path, _, query = target.partition("?")
-        if self.answer is None or path not in (SCRIPT, ASK):
-            return None
-        if path == SCRIPT:
+        if path == SCRIPT and self.answers:
             return response(http.HTTPStatus.OK, self.text, {"Content-Type": "text/javascript; charset=utf-8"})
-        return response(*await asyncio.to_thread(self.answer, dict(parse_qsl(query))))
+        if path not in self.answers:
+            return None
+        return response(*await asyncio.to_thread(self.answers[path], dict(parse_qsl(query))))
 
     def into(self, found: Any) -> Any:
         """A response of viser, with the script in it if it is a page."""
-        if self.answer is None or found is None or not is_page(found):
+        if not self.answers or found is None or not is_page(found):
             return found
         body = with_script(found.body, found.headers.get("Content-Encoding", "identity"))
         if body is None:
@@ -71,6 +75,12 @@ class Script:
             headers.pop(name, None)
         headers["Content-Length"] = str(len(body))
         return Response(found.status_code, found.reason_phrase, headers, body)
+
+
+def client_in(asked: Mapping[str, str]) -> int | None:
+    """The number of the client that asks, if it is one."""
+    text = asked.get("client", "")
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 20 else None
 
 
 def is_page(found: Any) -> bool:

@@ -79,29 +79,30 @@ class Chosen:
         return len(self.ids)
 
 
-class Lot:
-    """Splats of a model without levels of detail: drawn by lot, and enlarged so that they stand for the others.
+class PointLot:
+    """Points of a cloud, drawn by lot: the nearer to the camera, the more likely.
 
     Priority sampling (Duffield, Lund and Thorup, "Priority sampling for estimation of arbitrary subset sums", 2007):
-    the weight of a splat is its opacity times the area of its image, its priority is that divided by a random number
-    between 0 and 1, and those with the highest priorities are kept. Weights below the highest priority that is not kept
-    are raised to it, by the area, so that the expected sum of each part of the image stays as it is. The random numbers
-    are the same for all cameras, so that a camera that moves a little keeps most of its splats.
+    each point has a weight, which is divided by the square of its distance; its priority is that divided by a random
+    number between 0 and 1, and those with the highest priorities are kept. The random numbers are the same for all
+    cameras, so that a camera that moves a little keeps most of its points.
     """
 
-    def __init__(self, table: SplatTable) -> None:
-        """Of a table in the local frame."""
-        draw = torch.Generator().manual_seed(0)
-        self.table, self.means = of_degree_0(table), table.means.float()
-        self.weights = visibility(table)
-        self.luck = -torch.rand(len(table), generator=draw).clamp_min(1e-12).log()
-        self.reach = CUTOFF * table.log_scales.float().amax(1).exp()
+    def __init__(self, means: Tensor, weights: Tensor | None = None, reach: Tensor | None = None) -> None:
+        """Of (N, 3) positions, (N,) logarithms of weights, else the same for all, and (N,) radii, else 0."""
+        count = len(means)
+        self.means = means.float()
+        self.weights = torch.zeros(count) if weights is None else weights
+        self.reach = torch.zeros(count) if reach is None else reach
+        self.luck = -torch.rand(count, generator=torch.Generator().manual_seed(0)).clamp_min(1e-12).log()
 
-    def choose(self, budget: int, eye: Eye | None = None) -> Chosen:
-        """At most `budget` splats for a camera, or for no camera in particular."""
+    def rows(self, budget: int, eye: Eye | None = None) -> tuple[Tensor, Tensor]:
+        """(n,) int64 rows in their order, of fewer than there are, for a camera or for no one in particular.
+
+        Also (n,) by how much the logarithms of their weights are raised, so that they stand for those that are not
+        kept: to the highest priority among these, so that the expected sum of each part of the image stays as it is.
+        """
         weights, beside = (self.weights, None) if eye is None else self._seen_by(eye.widened())
-        if len(weights) <= budget:
-            return Chosen(np.arange(len(weights)), self.table)
         priorities = weights + self.luck
         best = priorities.topk(budget + 1).indices
         least = priorities[best[budget]]
@@ -109,11 +110,10 @@ class Lot:
         raised = (least - weights[rows]).clamp_min(0)
         if beside is not None:
             raised[beside[rows]] = 0  # so large, they would reach into the image
-        found = self.table.take(rows)
-        return Chosen(rows.numpy(), replace(found, log_scales=found.log_scales + raised[:, None] / 2))
+        return rows, raised
 
     def _seen_by(self, eye: Eye) -> tuple[Tensor, Tensor]:
-        """(N,) logarithms of weights, and (N,) bool, whether a splat lies beside the image."""
+        """(N,) logarithms of weights, and (N,) bool, whether a point lies beside the image."""
         weights, beside = torch.empty(len(self.weights)), torch.empty(len(self.weights), dtype=torch.bool)
         for first in range(0, len(weights), CHUNK):
             part = slice(first, first + CHUNK)
@@ -121,6 +121,26 @@ class Lot:
             weights[part] = self.weights[part] - 2 * distance.log() + torch.where(inside, 0.0, 2 * math.log(BESIDE))
             beside[part] = ~inside
         return weights, beside
+
+
+class Lot(PointLot):
+    """Splats of a model without levels of detail: drawn by lot, and enlarged so that they stand for the others.
+
+    The weight of a splat is its opacity times the area of its image; weights are raised by the area.
+    """
+
+    def __init__(self, table: SplatTable) -> None:
+        """Of a table in the local frame."""
+        super().__init__(table.means, visibility(table), reach_of(table))
+        self.table = of_degree_0(table)
+
+    def choose(self, budget: int, eye: Eye | None = None) -> Chosen:
+        """At most `budget` splats for a camera, or for no camera in particular."""
+        if len(self.weights) <= budget:
+            return Chosen(np.arange(len(self.weights)), self.table)
+        rows, raised = self.rows(budget, eye)
+        found = self.table.take(rows)
+        return Chosen(rows.numpy(), replace(found, log_scales=found.log_scales + raised[:, None] / 2))
 
 
 class Levels:

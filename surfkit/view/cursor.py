@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from surfkit.view.answers import Script
+from surfkit.view.answers import Script, client_in
 
 if TYPE_CHECKING:
     import viser
@@ -82,8 +82,8 @@ def serve_cursors(script: Script, find: Callable[[int], Cursor | None], without:
     """
 
     def answer(asked: Mapping[str, str]) -> tuple[http.HTTPStatus, str]:
-        client = asked.get("client", "")
-        cursor = find(int(client)) if client.isascii() and client.isdecimal() and len(client) < 20 else None
+        client = client_in(asked)
+        cursor = None if client is None else find(client)
         if cursor is None:
             return http.HTTPStatus.NOT_FOUND, "no such client"
         x, y = (number(asked.get(name, ""), most) for name, most in (("x", WIDEST), ("y", 1.0)))

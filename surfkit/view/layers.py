@@ -6,23 +6,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from surfkit.mesh.base import Mesh
-from surfkit.view.display import PALETTE, some
-from surfkit.view.glb import unlit_glb
-from surfkit.view.mesh_files import Textured
+from surfkit.view.display import PALETTE
+from surfkit.view.mesh_layer import MeshLayer
 from surfkit.view.outlines import block_outlines
+from surfkit.view.pace import Pace
 from surfkit.view.picking import corners_of
-from surfkit.view.screen import WORLD, Latest, quaternion_of, telling
+from surfkit.view.point_layer import PointLayer
+from surfkit.view.screen import WORLD, Following, Latest, telling
 from surfkit.view.shelf import Shelf
-from surfkit.view.splat_layer import SplatLayer, add_budget, add_points
+from surfkit.view.splat_layer import SplatLayer
 
 if TYPE_CHECKING:
     import viser
 
 TRAINED, HELD_OUT = (25, 40, 90), (210, 90, 0)
 """Colours of cameras."""
-SENT = 64_000_000
-"""Bytes of pictures and triangles up to which a browser is sent them without being asked."""
 MOST_LABELS = 400
 """Blocks that get a label."""
 
@@ -30,110 +28,54 @@ MOST_LABELS = 400
 class Layers:
     """What is drawn in one browser, and its switches."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle) -> None:
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace) -> None:
         """Build the switches, and draw."""
         self.shelf, self.client, self.subject = shelf, client, shelf.subject
-        self.shows_mesh = self.subject.splats is None
         centres = [view.camera.centre.numpy() for view in self.subject.views]
         self.typical_size = typical_size(np.stack(centres)) if centres else 0.0
         self.camera_size = self.typical_size if self.subject.views else 0.0
-        self.splats: SplatLayer | None = None
+        self.adapting: list[SplatLayer | MeshLayer | PointLayer] = []
+        self.mesh: MeshLayer | None = None
         gui = client.gui
         with gui.add_folder("Layers"):
+            pace.add_switch()
             if self.subject.splats is not None:
-                self.splats = SplatLayer(shelf, client, len(self.subject.splats))
+                self.adapting.append(SplatLayer(shelf, client, pace, len(self.subject.splats)))
             if self.subject.mesh is not None:
-                self._mesh_switches(gui, self.subject.mesh)
+                self.mesh = MeshLayer(shelf, client, pace, self.subject.mesh)
+                self.adapting.append(self.mesh)
             if self.subject.points is not None:
-                self._point_switches(gui)
+                self.adapting.append(PointLayer(shelf, client, pace, self.subject.points))
             if self.subject.views:
                 self._camera_switches(gui)
             if self.subject.plan is not None:
                 shown = gui.add_checkbox("blocks", False)
                 shown.on_update(telling(client, lambda _: self._blocks(shown.value)))
+        self.following = Following(self._camera, pace.rest)
+        pace.follow = self._follow
+        client.camera.on_update(self.following.moved)
+        self.following.moved()  # it may have, while the first splats were chosen
+
+    @property
+    def shows_mesh(self) -> bool:
+        """Whether clicks are to meet the mesh."""
+        return self.mesh is not None and self.mesh.shown.value
 
     def stop(self) -> None:
         """The browser has gone."""
-        if self.splats is not None:
-            self.splats.stop()
+        self.following.stop()
 
-    def _mesh_switches(self, gui: viser.GuiApi, mesh: Mesh) -> None:
-        count = len(mesh.faces)
-        shown = gui.add_checkbox("mesh", self.shows_mesh)
-        budget = add_budget(gui, "most triangles", count, self.shelf.most)
-        textured, bare = self.subject.textured, mesh.colors is None and self.subject.textured is None
-        sent = textured is not None and textured.path.stat().st_size <= SENT
-        pictures = gui.add_checkbox("mesh with pictures", sent)
-        plain = gui.add_checkbox("mesh in grey", bare, disabled=bare)
-        note = gui.add_markdown("")
+    def _camera(self, moves: bool) -> None:
+        for layer in self.adapting:
+            layer.moves = moves
+        self._follow()
 
-        def draw() -> None:
-            self.shows_mesh = shown.value
-            whole = textured is not None and pictures.value and not plain.value
-            for part, sensible in ((budget, not whole), (pictures, textured is not None), (plain, True), (note, True)):
-                part.visible = shown.value and sensible
-            if not shown.value:
-                self.client.scene.remove_by_name("/mesh")
-            elif whole:
-                note.content = self._add_textured(textured)
-            else:
-                note.content = self._add_mesh(self.shelf.mesh(budget.value), count, plain.value)
-
-        draw()
-        for switch in (shown, pictures, plain):
-            switch.on_update(telling(self.client, lambda _: draw()))
-        budget.on_update(telling(self.client, Latest(draw)))
-
-    def _add_mesh(self, mesh: Mesh, count: int, plain: bool) -> str:
-        """Triangles that stand for `count`; which they are, in words."""
-        if plain or mesh.colors is None:
-            self.client.scene.add_mesh_simple(
-                "/mesh", mesh.vertices, mesh.faces, color=(190, 190, 190), side="double", scale=WORLD
-            )
-        else:
-            self.client.scene.add_glb("/mesh", unlit_glb(mesh), scale=WORLD, cast_shadow=False, receive_shadow=False)
-        if len(mesh.faces) == count:
-            return f"all {count:,} triangles are shown"
-        return f"{len(mesh.faces):,} triangles stand for {count:,}; clicks meet all"
-
-    def _add_textured(self, textured: Textured) -> str:
-        """A file as it is, in its place; which it is, in words."""
-        frame, place, data = self.subject.frame, textured.place, textured.path.read_bytes()
-        self.client.scene.add_glb(
-            "/mesh",
-            data,
-            scale=WORLD * frame.scale,
-            wxyz=quaternion_of(place.turn.T),
-            position=WORLD * frame.to_local(place.offset),
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-        return f"{textured.path.name} is shown, {len(data) / 1e6:.1f} MB"
-
-    def _point_switches(self, gui: viser.GuiApi) -> None:
-        points = self.subject.points
-        assert points is not None
-        alone = self.subject.splats is None and self.subject.mesh is None
-        count = len(points.xyz)
-        shown = gui.add_checkbox("points" if alone else "sparse points", alone)
-        size = gui.add_slider("size of points", 0.5, 10, 0.5, 2.0)
-        budget = add_budget(gui, "most points", count, self.shelf.most)
-        note = gui.add_markdown("")
-
-        def draw() -> None:
-            for part in (size, budget, note):
-                part.visible = shown.value
-            if not shown.value:
-                self.client.scene.remove_by_name("/points")
-                return
-            rows = some(count, budget.value)
-            add_points(self.client, "/points", points.xyz[rows], points.rgb[rows], size.value)
-            note.content = f"{len(rows):,} of {count:,} points are shown"
-
-        draw()
-        shown.on_update(telling(self.client, lambda _: draw()))
-        for slider in (size, budget):
-            slider.on_update(telling(self.client, Latest(draw)))
+    def _follow(self) -> None:
+        for layer in self.adapting:
+            try:
+                layer.follow()
+            except Exception as error:
+                layer.note.content = f"not updated: {' '.join(f'{type(error).__name__}: {error}'.split())}"
 
     def _camera_switches(self, gui: viser.GuiApi) -> None:
         shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")

@@ -12,6 +12,7 @@ from surfkit.render.path import beside
 from surfkit.view.cursor import Cursor, serve_cursors
 from surfkit.view.layers import Layers
 from surfkit.view.measure import coordinates
+from surfkit.view.pace import FEW, HELLO_S, Pace, serve_paces
 from surfkit.view.photographs import Photographs
 from surfkit.view.screen import WORLD, ray_of, ray_through, telling
 from surfkit.view.server import Served
@@ -34,7 +35,7 @@ HELP = """
 """
 
 
-def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form: Form = "splats") -> None:
+def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form: Form | None = None) -> None:
     """Show a subject to every browser that comes.
 
     Args:
@@ -42,7 +43,7 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
         served: A server with an empty scene.
         folder: For the files that a user writes.
         most: Splats, triangles and points that are sent to a browser to begin with.
-        form: How splats are drawn to begin with.
+        form: How splats are drawn to begin with; None leaves it to whether a browser has a graphics card.
     """
     shelf = Shelf(subject, most, form)
     server = served.viser
@@ -53,16 +54,21 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
     server.initial_camera.look_at = middle * WORLD
     threading.Thread(target=shelf.prepare, daemon=True).start()
     pages: dict[int, Page] = {}
+    paces: dict[int, Pace] = {}
 
     def cursor_of(client_id: int) -> Cursor | None:
         return page.cursor if (page := pages.get(client_id)) is not None else None
 
     serve_cursors(served.script, cursor_of, WITHOUT)
+    serve_paces(served.script, paces.get)
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         def build(_event: None) -> None:
-            pages[client.client_id] = Page(shelf, client, folder, served)
+            pace = paces[client.client_id] = Pace(client)
+            if shelf.size > FEW and not served.script.missing:
+                pace.said.wait(HELLO_S)
+            pages[client.client_id] = Page(shelf, client, pace, folder, served)
             if client.client_id not in server.get_clients():  # it left meanwhile
                 leave(client)
 
@@ -70,6 +76,7 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
 
     @server.on_client_disconnect
     def leave(client: viser.ClientHandle) -> None:
+        paces.pop(client.client_id, None)
         if (page := pages.pop(client.client_id, None)) is not None:
             page.path.stop()
             page.layers.stop()
@@ -78,11 +85,11 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
 class Page:
     """What one browser shows; another has its own layers, measures, box and path."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, folder: Path, served: Served) -> None:
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, folder: Path, served: Served) -> None:
         """Build the page."""
         self.shelf, self.client, self.fov = shelf, client, client.camera.fov
         client.gui.add_button("show all").on_click(lambda _: self._show_all())
-        self.layers = Layers(shelf, client)
+        self.layers = Layers(shelf, client, pace)
         self.measure = Measure(shelf, client)
         self.cursor = None if served.script.missing else self._follow_pointer()
         self.photographs = Photographs(shelf, client, self.layers) if shelf.subject.views else None

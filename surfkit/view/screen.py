@@ -25,6 +25,8 @@ REST_S = 0.3
 """A slider or a camera that has not moved for so long is at rest."""
 TICK_S = 0.1
 """Between two looks at a camera that moves."""
+BETWEEN_S = 1.0
+"""From one choice to the next, at least, while the camera moves."""
 FAR, FAR_DEGREES = 0.25, 15.0
 """A camera has moved far when it has gone this share of the way to what it turns about, or has turned by so much."""
 
@@ -48,9 +50,14 @@ class Latest:
 class Following:
     """Looks where a camera is, in a thread of its own: while it moves, and when it has come to rest."""
 
-    def __init__(self, action: Callable[[bool], None]) -> None:
-        """Do `action` with whether the camera still moves; one at a time."""
-        self.action, self.moves, self.ended = action, threading.Event(), False
+    def __init__(self, action: Callable[[bool], None], rest: Callable[[], float] = lambda: REST_S) -> None:
+        """Do `action` with whether the camera still moves; one at a time.
+
+        Args:
+            action: What is done.
+            rest: Seconds after which a camera that has not moved is at rest.
+        """
+        self.action, self.rest, self.moves, self.ended = action, rest, threading.Event(), False
         threading.Thread(target=self._run, name="follow a camera", daemon=True).start()
 
     def moved(self, _camera: Any = None) -> None:
@@ -65,7 +72,7 @@ class Following:
     def _run(self) -> None:
         while True:
             self.moves.wait()
-            while self.moves.wait(REST_S):
+            while self.moves.wait(self.rest()):
                 self.moves.clear()
                 if self.ended:
                     return
@@ -108,6 +115,39 @@ class Stand:
         gone = float((one.centre - two.centre).norm())
         ahead = float(one.world_to_camera[2, :3] @ two.world_to_camera[2, :3])
         return gone > FAR * other.distance or ahead < math.cos(math.radians(FAR_DEGREES))
+
+
+class Place:
+    """Where a browser's camera was when things were last chosen for it."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        """Nowhere yet."""
+        self.client, self.chosen = client, 0.0
+        self.stand: Stand | None = None
+
+    def begin(self) -> Stand:
+        """Where it is now: things are about to be chosen."""
+        self.chosen, self.stand = time.monotonic(), None
+        return Stand.of(self.client.camera)
+
+    def serves(self, stand: Stand, fewer: bool = False) -> bool:
+        """Whether what was chosen for a camera is still wanted; if not, the next choice is.
+
+        Args:
+            stand: That camera.
+            fewer: It is less than the browser has, which is too slow for more: it is wanted in any case.
+        """
+        if Stand.of(self.client.camera).far_from(stand):
+            return fewer
+        self.stand = stand
+        return True
+
+    def is_due(self, moves: bool) -> bool:
+        """Whether to choose again."""
+        if moves and time.monotonic() - self.chosen < BETWEEN_S:
+            return False
+        here = Stand.of(self.client.camera)
+        return self.stand is None or (here.far_from(self.stand) if moves else not here.same_as(self.stand))
 
 
 def telling(client: viser.ClientHandle, action: Callable[..., None]) -> Callable[[Any], None]:

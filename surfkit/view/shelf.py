@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import threading
 from functools import cached_property, lru_cache
 from typing import Literal, get_args
 
 import numpy as np
+import torch
 
 from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.export.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import View
-from surfkit.view.by_view import Chosen, Eye, Levels, Lot
+from surfkit.view.by_view import Chosen, Eye, Levels, Lot, PointLot
 from surfkit.view.display import (
     Colors,
     Drawn,
@@ -36,6 +38,8 @@ FORMS: tuple[Form, ...] = get_args(Form)
 MOST = 1_000_000
 CONE = 0.004
 """Radius, at distance 1, of the cone in which a click finds a point: four pixels of a window, about."""
+LARGER = 4.0
+"""Points that stand for others are larger by no more than this: else they hide what is near them."""
 KEPT = 2
 """Choices of splats, and of triangles, that are kept: that of now and that of before."""
 
@@ -48,10 +52,11 @@ class Shelf:
         axes: (3, 3) east, north and up in rows, local frame.
         heights: What the ends of the colours of heights are, local units along up.
         most: Splats, triangles and points that are sent to a browser, unless its user moves a slider.
-        form: How splats are drawn, unless its user chooses another way.
+        form: How splats are drawn, unless its user chooses another way; None: as points in browsers without a graphics
+            card, and as splats in others.
     """
 
-    def __init__(self, subject: Subject, most: int = MOST, form: Form = "splats") -> None:
+    def __init__(self, subject: Subject, most: int = MOST, form: Form | None = None) -> None:
         """Nothing is made yet."""
         self.subject, self.most, self.form = subject, most, form
         self.axes = map_axes(subject.up)
@@ -61,6 +66,16 @@ class Shelf:
         self._places: Places | None = None
         self._splats = lru_cache(KEPT)(self._choose_splats)
         self._mesh = lru_cache(KEPT)(self._choose_mesh)
+
+    @property
+    def size(self) -> int:
+        """Splats, triangles or points of the subject: of what there is most."""
+        splats, mesh, points = self.subject.splats, self.subject.mesh, self.subject.points
+        return max(
+            0 if splats is None else len(splats),
+            0 if mesh is None else len(mesh.faces),
+            0 if points is None else len(points.xyz),
+        )
 
     @property
     def colors(self) -> tuple[Colors, ...]:
@@ -167,6 +182,15 @@ class Shelf:
                 told = f"{len(found):,} splats, drawn by lot and enlarged, stand for {len(table):,}"
         return found, f"{told}: fine where you are, coarse far away, few beside the picture{self._remedy()}"
 
+    def points_for_eye(self, budget: int, eye: Eye) -> tuple[np.ndarray, float]:
+        """(n,) rows of `budget` of the points, of which there are more, for one camera.
+
+        Also how many times larger they are drawn, so that they stand for the others; not more than LARGER.
+        """
+        with self.making:
+            rows, raised = self.point_lot.rows(budget, eye)
+        return rows.numpy(), min(math.exp(float(raised.median()) / 2), LARGER)
+
     def _remedy(self) -> str:
         """How to get levels of detail, for a run that has none."""
         if self.subject.levels is not None or self.subject.scene is None:
@@ -183,6 +207,12 @@ class Shelf:
         """Of the model."""
         assert self.subject.splats is not None
         return Lot(self.subject.splats)
+
+    @cached_property
+    def point_lot(self) -> PointLot:
+        """Of the points."""
+        assert self.subject.points is not None
+        return PointLot(torch.from_numpy(self.subject.points.xyz))
 
     @cached_property
     def unit(self) -> float:

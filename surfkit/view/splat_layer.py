@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import threading
-import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from surfkit.view.by_view import Chosen, in_places
 from surfkit.view.display import Colors
-from surfkit.view.screen import WORLD, Following, Latest, Stand, telling
-from surfkit.view.shelf import FORMS, Shelf
+from surfkit.view.pace import Pace
+from surfkit.view.screen import WORLD, Latest, Place, telling
+from surfkit.view.shelf import FORMS, Form, Shelf
 
 if TYPE_CHECKING:
     import viser
 
 MOVING = 100_000
 """Points while the camera moves."""
-BETWEEN_S = 1.0
-"""From one choice to the next, at least, while the camera moves."""
 FINER = "Splats are chosen for where you are, again when you rest. Otherwise they are chosen once, for all places."
 STEP = 10_000
 """Of the sliders."""
@@ -27,18 +26,33 @@ DOT = 200.0
 """Size of splats that are drawn as points, thousandths of `Drawn.unit`: two standard deviations."""
 
 
-class SplatLayer:
-    """Draws the splats, again when a switch is moved, and of a large model again where the camera comes to rest."""
+@dataclass(frozen=True)
+class Asked:
+    """Splats for a browser: drawn as what, how many its user allows, and how many of these it can draw in time."""
 
-    def __init__(self, shelf: Shelf, client: viser.ClientHandle, count: int) -> None:
+    kind: str
+    most: int
+    budget: int
+
+
+class SplatLayer:
+    """Draws the splats, again when a switch is moved, and of a large model again where the camera comes to rest.
+
+    Attributes:
+        moves: Whether the camera does.
+    """
+
+    def __init__(self, shelf: Shelf, client: viser.ClientHandle, pace: Pace, count: int) -> None:
         """Build the switches in the folder of the panel that is open, and draw."""
-        self.shelf, self.client, self.count = shelf, client, count
-        self.drawing, self.moving, self.node = threading.Lock(), False, None
-        self.stand: Stand | None = None
-        self.chosen, self.places = 0.0, np.zeros(0, np.int64)
+        self.shelf, self.client, self.pace, self.count = shelf, client, pace, count
+        self.drawing, self.moves, self.node = threading.Lock(), True, None
+        self.asked: Asked | None = None
+        self.has = 0
+        self.place, self.places = Place(client), np.zeros(0, np.int64)
         gui = client.gui
         self.shown = gui.add_checkbox("splats", True)
-        self.form = gui.add_dropdown("draw as", FORMS, initial_value=shelf.form, hint="Points are less work.")
+        form: Form = shelf.form or ("points" if pace.software else "splats")
+        self.form = gui.add_dropdown("draw as", FORMS, initial_value=form, hint="Points are less work.")
         self.colors = gui.add_dropdown("colours", shelf.colors)
         self.budget = add_budget(gui, "most splats", count, shelf.most)
         self.near_me = gui.add_checkbox("finer where I am", True, hint=FINER)
@@ -47,42 +61,41 @@ class SplatLayer:
         for switch in (self.shown, self.form, self.colors, self.near_me):
             switch.on_update(telling(client, lambda _: self.draw()))
         self.budget.on_update(telling(client, Latest(self.draw)))
-        self.following = Following(self._follow)
-        client.camera.on_update(self.following.moved)
-        self.following.moved()  # it may have, while the first splats were chosen
 
-    @property
-    def by_view(self) -> bool:
+    def wanted(self) -> Asked:
+        """What the switches and the pace of the browser ask for now."""
+        as_points = self.form.value == "points" or (self.form.value == "points-while-moving" and self.moves)
+        most = min(self.budget.value, self.count)
+        if self.moves and self.form.value == "points-while-moving":
+            most = min(most, MOVING)
+        kind = "splats as points" if as_points else "splats"
+        return Asked(kind, most, self.pace.allowed(kind, most, self.moves))
+
+    def by_view(self, asked: Asked) -> bool:
         """Whether the splats are chosen for the camera: there are more than the browser is to have."""
-        return self.near_me.value and self.count > self.budget.value
+        return self.near_me.value and self.count > asked.budget
 
     def draw(self) -> None:
         """Send what the switches say."""
         with self.drawing:
             for part in (self.form, self.colors, self.budget, self.near_me, self.note):
                 part.visible = self.shown.value
-            self.near_me.visible = self.shown.value and self.count > self.budget.value
+            asked = self.asked = self.wanted()
+            self.near_me.visible = self.shown.value and self.count > asked.budget
             if self.shown.value:
-                self._send()
+                self._send(asked)
             elif self.node is not None:
                 self.node.remove()
                 self.node = None
 
-    def stop(self) -> None:
-        """The browser has gone."""
-        self.following.stop()
-
-    def _send(self) -> None:
+    def _send(self, asked: Asked) -> None:
         colors: Colors = self.colors.value
-        budget = min(self.budget.value, MOVING) if self.moving else self.budget.value
-        as_points = self.moving or self.form.value == "points"
-        if self.by_view:
-            self.chosen, self.stand = time.monotonic(), None
-            stand = Stand.of(self.client.camera)
+        budget, as_points = asked.budget, asked.kind == "splats as points"
+        if self.by_view(asked):
+            stand = self.place.begin()
             chosen, told = self.shelf.for_eye(budget, stand.eye)
-            if Stand.of(self.client.camera).far_from(stand):
-                return  # these are no longer wanted: the next ones are
-            self.stand = stand
+            if not self.place.serves(stand, fewer=budget < self.has):
+                return
             found = self.shelf.drawn(chosen.table, colors)
             if not as_points:
                 found = found.placed(self._places_of(chosen, budget), budget)
@@ -99,6 +112,9 @@ class SplatLayer:
                 found.opacities[:, None],
                 scale=WORLD * found.unit,
             )
+        self.has = len(found.means)
+        self.pace.sent(asked.kind, len(found.means), asked.most)
+        told += self.pace.words(asked.kind, asked.most, self.moves)
         legend = {"height": f"; {self.shelf.height_words()}", "normal": "; red east, green north, blue up"}
         self.note.content = told + legend.get(colors, "")
 
@@ -110,22 +126,11 @@ class SplatLayer:
         self.places[found] = chosen.ids
         return found
 
-    def _follow(self, moves: bool) -> None:
-        """Points in the place of splats until the camera rests, and other splats where it has come to."""
-        if not self.shown.value:
-            return
-        before, self.moving = self.moving, moves and self.form.value == "points-while-moving"
-        try:
-            if self.moving != before or (self.by_view and self._is_due(moves)):
-                self.draw()
-        except Exception as error:
-            self.note.content = f"not updated: {' '.join(f'{type(error).__name__}: {error}'.split())}"
-
-    def _is_due(self, moves: bool) -> bool:
-        if moves and time.monotonic() - self.chosen < BETWEEN_S:
-            return False
-        here = Stand.of(self.client.camera)
-        return self.stand is None or (here.far_from(self.stand) if moves else not here.same_as(self.stand))
+    def follow(self) -> None:
+        """Draw what is wanted while the camera moves, and where it has come to."""
+        asked = self.wanted()
+        if self.shown.value and (asked != self.asked or (self.by_view(asked) and self.place.is_due(self.moves))):
+            self.draw()
 
 
 def add_points(client: viser.ClientHandle, name: str, xyz: np.ndarray, rgb: np.ndarray, size: float) -> Any:
