@@ -16,7 +16,6 @@ from surfkit.core.optional import needed
 from surfkit.core.stages import key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
-from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
 from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import Difference, draw_difference, write_difference
@@ -29,6 +28,7 @@ from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
 from surfkit.scene.memory import cache_bytes
+from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.texture.keep import Kept, identity, seen
 from surfkit.texture.make import Subject, TextureSettings, textured
 from surfkit.texture.resolution import ground_sampling_distance

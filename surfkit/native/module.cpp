@@ -12,6 +12,7 @@ void add_mesh(nanobind::module_& m);
 void add_stereo(nanobind::module_& m);
 void add_compress(nanobind::module_& m);
 void add_texture(nanobind::module_& m);
+void add_start(nanobind::module_& m);
 
 namespace {
 
@@ -34,4 +35,5 @@ NB_MODULE(_native, m) {
     surfkit::add_stereo(m);
     surfkit::add_compress(m);
     surfkit::add_texture(m);
+    surfkit::add_start(m);
 }

@@ -34,6 +34,7 @@ from surfkit.recipe import Recipe
 from surfkit.recipes import RECIPES, city, surface
 from surfkit.recipes.surface import STEREO
 from surfkit.report.ablation import Row, Table
+from surfkit.start.stereo import StereoStart
 from surfkit.train.stage import Stage
 
 COARSE_BASELINE = Recipe(
@@ -220,10 +221,11 @@ SURFACE = Table(
     (
         Row("2DGS, sparse points"),
         Row("+ stereo depth as a loss", DEPTH | {"depth": surface.SURFACE.depth}),
-        Row("+ dense start", {"start": surface.SURFACE.start, "pretrain.densify": surface.SURFACE.pretrain.densify}),
+        Row("+ dense start", {"start": StereoStart(), "pretrain.densify": surface.SURFACE.pretrain.densify}),
         Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
         Row("+ no normal consistency", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
         Row("+ fusion by agreement", {"mesh": surface.SURFACE.mesh}),
+        Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),

@@ -23,7 +23,8 @@ SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
     primitive=Surfel2D(),
     depth=PatchMatch(),
-    start=StereoStart(),
+    # In alleys, where no depth is trusted, training keeps right points that it has and finds few by itself.
+    start=StereoStart(closing=0.2),
     pretrain=Stage(
         losses={
             "l1": L1(),

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
-from surfkit.evaluate.geometry.up_direction import up_direction
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, Scene, View
+from surfkit.scene.up_direction import up_direction
 
 FROM, TO = 0.05, 0.95
 """Where a flight over the scene begins and ends: quantiles of the camera positions along it."""

@@ -18,6 +18,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Cloud, Scene
 from surfkit.scene.vectors import unit
 from surfkit.start.base import Start, StartInput
+from surfkit.start.closing import closing_points
 from surfkit.start.voxels import NEIGHBOURS, Collected, Samples, Thinned, find_isolated, thin_to
 
 EDGE = 0.02
@@ -39,7 +40,8 @@ class StereoStart(Start):
     """Start from the fused depth maps of all views, thinned evenly (as EDGS, Kotovenko et al. 2025, from matches).
 
     Colours come from the photographs, and directions from normal maps or the slopes of the depth maps. Sparse points
-    are used only where the maps have none; what neither knows is left to densification.
+    are used only where the maps have none. With `closing`, points also lie on the surfaces that close the space which
+    trusted depth sees into. What is left is for densification.
     """
 
     points: int | Literal["auto"] = "auto"
@@ -63,6 +65,11 @@ class StereoStart(Start):
     """Initial standard deviation of a splat, as a share of the distance between points; for sparse points it is the
     whole distance."""
 
+    closing: float = 0.0
+    """Initial opacity of points where no depth is trusted, as in alleys: trusted depth sees through the space before
+    and around them, and what it neither sees nor sees through is taken for what lies above it, free or solid. They are
+    guesses, which training keeps or fades. 0: none."""
+
     def __post_init__(self) -> None:
         if self.points != "auto" and self.points < 1:
             raise BadInput(f"start.points is {self.points}; it must be auto, or 1 or more")
@@ -71,6 +78,8 @@ class StereoStart(Start):
         for name, low, high in (("spacing_px", 0.01, 1000), ("size", 0.01, 100)):
             if not low <= getattr(self, name) <= high:
                 raise BadInput(f"start.{name} is {getattr(self, name):g}; it must be from {low:g} to {high:g}")
+        if not 0 <= self.closing < 1:
+            raise BadInput(f"start.closing is {self.closing:g}; it must be at least 0 and below 1")
         if not (0 < self.opacity < 1 and 0 < self.min_confidence <= 1):
             raise BadInput("start.opacity must lie between 0 and 1, and start.min_confidence above 0 and at most at 1")
 
@@ -92,7 +101,12 @@ class StereoStart(Start):
             return known.scene.cloud
         if self.points != "auto" and len(stereo) < FEWER * self.points:
             emit(Warned(f"start.points is {self.points:,}, and the depth maps give {len(stereo):,}, a pixel apart"))
-        return fill_gaps(stereo, known, self)
+        return fill_gaps(stereo, self.closed(known, stereo), known, self)
+
+    def closed(self, known: StartInput, stereo: Thinned) -> Thinned:
+        """The points where no depth is trusted; together with those of the depth maps no more than are wanted."""
+        most = (self.most if self.points == "auto" else self.points) - len(stereo)
+        return closing_points(known, stereo, lambda at: self.unsure(known, at), most if self.closing else 0)
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
@@ -129,6 +143,15 @@ class StereoStart(Start):
         mask = None if known.masks is None else known.masks[at]
         trusted = (prior.inverse > 0) & (prior.confidence >= self.min_confidence)
         return trusted if mask is None else trusted & mask
+
+    def unsure(self, known: StartInput, at: int) -> Tensor | None:
+        """(H, W) which pixels of a photograph have no depth that is used, or None without a depth map."""
+        prior = known.priors[at] if known.priors else None
+        if prior is None:
+            return None
+        unused = ~self.trusted(known, at, prior)
+        mask = None if known.masks is None else known.masks[at]
+        return unused if mask is None else unused & mask
 
 
 def pixel_size(scene: Scene, prior: DepthPrior) -> float:
@@ -194,20 +217,21 @@ def _slope(values: Tensor, dim: int) -> Tensor:
     return slope
 
 
-def fill_gaps(stereo: Thinned, known: StartInput, start: StereoStart) -> Cloud:
-    """Points of depth maps, and sparse points where there are none of those."""
+def fill_gaps(stereo: Thinned, closing: Thinned, known: StartInput, start: StereoStart) -> Cloud:
+    """Points of depth maps, those that close what these see into, and sparse points where maps have none."""
     from scipy.spatial import cKDTree
 
     sparse = known.scene.cloud
     distance, near = cKDTree(stereo.xyz).query(sparse.xyz.numpy())
     more = torch.from_numpy(distance > FILL * stereo.size[near])
     anyhow = torch.randn(int(more.sum()), 3, generator=known.generator)
-    xyz = torch.cat([torch.from_numpy(stereo.xyz).float(), sparse.xyz[more]])
-    counts = torch.tensor([len(stereo), len(anyhow)])
+    made = [(points, torch.from_numpy(points.xyz).float()) for points in (stereo, closing) if len(points)]
+    colors = [torch.from_numpy(points.rgb.round().clip(0, 255)).to(torch.uint8) for points, _ in made]
+    counts = torch.tensor([len(stereo), len(closing), len(anyhow)])
     return Cloud(
-        xyz=xyz,
-        rgb=torch.cat([torch.from_numpy(stereo.rgb.round().clip(0, 255)).to(torch.uint8), sparse.rgb[more]]),
-        normals=torch.cat([torch.from_numpy(stereo.normals).float(), unit(anyhow, 1)]),
-        opacity=torch.tensor([start.opacity, SPARSE_OPACITY]).repeat_interleave(counts),
-        size=torch.cat([start.size * gaps(xyz[: len(stereo)]), gaps(sparse.xyz[more])]),
+        xyz=torch.cat([*(xyz for _, xyz in made), sparse.xyz[more]]),
+        rgb=torch.cat([*colors, sparse.rgb[more]]),
+        normals=torch.cat([*(torch.from_numpy(points.normals).float() for points, _ in made), unit(anyhow, 1)]),
+        opacity=torch.tensor([start.opacity, start.closing, SPARSE_OPACITY]).repeat_interleave(counts),
+        size=torch.cat([*(start.size * gaps(xyz) for _, xyz in made), gaps(sparse.xyz[more])]),
     )

@@ -13,10 +13,10 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.evaluate.geometry.up_direction import map_axes, up_direction
 from surfkit.export.gltf_reader import UPS
 from surfkit.scene.crop import Axis
 from surfkit.scene.scene import Frame, View
+from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.texture.candidates import NONE
 from surfkit.texture.files import SUFFIX, Part, material_lines, part_of, write_obj, write_textured_glb
 from surfkit.texture.fill import Paint, Pictures, encoded, paint

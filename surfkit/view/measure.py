@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.scene.earth import TOPOCENTRIC
 from surfkit.scene.scene import Frame
+from surfkit.scene.up_direction import map_axes
 
 
 @dataclass(frozen=True)

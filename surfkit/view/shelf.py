@@ -11,11 +11,11 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.export.table import SplatTable
 from surfkit.mesh.base import Mesh
 from surfkit.raster.api import Maps
 from surfkit.scene.scene import View
+from surfkit.scene.up_direction import map_axes
 from surfkit.view.by_view import Chosen, Eye, Levels, Lot, PointLot
 from surfkit.view.display import (
     Colors,

@@ -18,11 +18,11 @@ from surfkit.evaluate.geometry.sightings import near_edges, sightings
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.evaluate.geometry.terrain import terrain
 from surfkit.evaluate.geometry.transform import apply
-from surfkit.evaluate.geometry.up_direction import up_direction
 from surfkit.evaluate.images.seams import Seams
 from surfkit.export.ply import read_vertices
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
+from surfkit.scene.up_direction import up_direction
 from surfkit.testing.synthetic import Flight, photograph
 
 from .test_crop_volume import exact_visible, overhead, synthetic_points

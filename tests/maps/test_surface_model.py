@@ -6,7 +6,6 @@ from needs import needs
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Grid, map_crs
 from surfkit.maps.rasters import NODATA
@@ -14,6 +13,7 @@ from surfkit.maps.surface_model import draw_surface, needs_double
 from surfkit.maps.zbuffer import NONE
 from surfkit.scene.earth import geocentric, to_ecef
 from surfkit.scene.scene import Frame
+from surfkit.scene.up_direction import map_axes
 
 from .shapes import UTM, box, centres, drawn, grid_of, heightfield, merged, surface_of
 

@@ -9,7 +9,6 @@ import torch
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.mesh.base import Mesh
 from surfkit.method.base import Reconstruction
 from surfkit.partition.base import Cells, Contraction, Ground
@@ -21,6 +20,7 @@ from surfkit.run.method import with_drawing
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import read_crop, write_crop
 from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.up_direction import map_axes
 from surfkit.view.crop_box import edges, sizes, turned_box, upright_axis
 from surfkit.view.keyframes import KeyPath, write_path
 from surfkit.view.layers import frustum_lines

@@ -12,11 +12,11 @@ from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.evaluate.geometry.surface import read_surface
-from surfkit.evaluate.geometry.up_direction import map_axes
 from surfkit.export.gltf_reader import UPS
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.scene.scene import Frame
+from surfkit.scene.up_direction import map_axes
 from surfkit.texture.files import Part, write_obj, write_textured_glb
 from surfkit.view.page import show
 from surfkit.view.screen import WORLD

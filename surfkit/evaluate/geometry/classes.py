@@ -16,9 +16,9 @@ from surfkit.evaluate.geometry.sightings import Sightings, sightings
 from surfkit.evaluate.geometry.terrain import Terrain, terrain
 from surfkit.evaluate.geometry.thinning import thin
 from surfkit.evaluate.geometry.transform import apply, scale_of
-from surfkit.evaluate.geometry.up_direction import Up, up_direction
 from surfkit.evaluate.images.seams import Seams
 from surfkit.scene.scene import Frame, View
+from surfkit.scene.up_direction import Up, up_direction
 
 REACH = 5.0
 """Multiples of tau within which a point of the reconstruction has the class of the nearest point of the truth."""

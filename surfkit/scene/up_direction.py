@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.transform import scale_of
 from surfkit.scene.crop import Axis
 from surfkit.scene.scene import Frame, View
 
@@ -60,7 +59,7 @@ def up_direction(axis: Axis | None, views: Sequence[View], frame: Frame | None, 
         return Up(np.eye(3)["xyz".index(axis)], "--up")
     if frame is None or not views:
         return Up(np.eye(3)[2], "z, as no cameras are known")
-    turn = matrix[:3, :3] / scale_of(matrix)
+    turn = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
     if frame.crs is not None:
         return Up(_snapped(turn[:, 2]), "georeferenced frame")
     found = _up_of_cameras(views)
