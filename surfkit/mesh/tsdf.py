@@ -26,7 +26,7 @@ from surfkit.scene.scene import Frame
 
 LEAST_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
-AUTO_TRIANGLES = 10_000_000
+AUTO_TRIANGLES = 15_000_000
 """About as many as an automatic voxel gives at most."""
 
 
@@ -36,7 +36,7 @@ class TSDF(Mesher):
 
     voxel: Length = "auto"
     """Voxel size, metres; auto is the size of one pixel at the median depth, larger where there would be more than
-    about ten million triangles."""
+    about fifteen million triangles."""
 
     truncation: Length = "auto"
     """Truncation distance, metres; auto is `truncation_voxels` voxels. Walls thinner than this may get lost."""

@@ -19,8 +19,8 @@ from surfkit.scene.camera import Camera
 
 MOST_VOXELS = 1 << 27
 """Voxels of a grid; those of a larger scene are made larger."""
-OUTLIERS = 0.002
-"""Share of the points on each side, along each axis, that the grid need not hold."""
+OUTLIERS = np.array([[0.03, 0.03, 0.002], [0.97, 0.97, 0.998]])
+"""Shares of the points up to which the grid reaches along each axis: few views see the rim of a scene."""
 MARGIN = 8
 """Voxels around those points."""
 NEAR, BEYOND = 0.8, 1.6
@@ -53,7 +53,8 @@ class Grid:
     @classmethod
     def around(cls, points: np.ndarray, axes: np.ndarray, side: float, most: int = MOST_VOXELS) -> Grid:
         """The grid that holds nearly all of (N, 3) points; with larger voxels where there would be more than `most`."""
-        low, high = np.quantile(points @ axes.T, (OUTLIERS, 1 - OUTLIERS), axis=0)
+        placed = points @ axes.T
+        low, high = np.stack([np.quantile(placed[:, i], OUTLIERS[:, i]) for i in range(3)], 1)
 
         def sizes(side: float) -> np.ndarray:
             return np.ceil((high - low) / side).astype(np.int64) + 1 + 2 * MARGIN
@@ -97,9 +98,20 @@ def votes(grid: Grid, maps: Iterable[tuple[Camera, Tensor]]) -> Votes:
         if (native := module()) is None:
             vote(found, scaled, lens, pose)
         else:
-            way = pose.ravel().tolist()
-            native.carve(found.surfaces, found.through, scaled, lens, way, NEAR, BEYOND, torch.get_num_threads())
+            low, high = reach(grid, camera, pose, float(scaled.max(initial=0)))
+            way = [*pose.ravel().tolist(), NEAR, BEYOND]
+            native.carve(found.surfaces, found.through, scaled, lens, way, low, high, torch.get_num_threads())
     return found
+
+
+def reach(grid: Grid, camera: Camera, pose: np.ndarray, depth: float) -> tuple[list[int], list[int]]:
+    """Columns that a camera may see up to a depth in voxels, along both axes on the ground: the first, and the end."""
+    x, y = np.array([0, camera.width]), np.array([0, camera.height])
+    rays = [[(a - camera.cx) / camera.fx, (b - camera.cy) / camera.fy, 1] for a in x for b in y]
+    corners = (np.array([[0, 0, 0], *rays]) * depth - pose[:, 3]) @ pose[:, :3]
+    ends = np.stack([np.floor(corners.min(0)), np.ceil(corners.max(0)) + 1])[:, :2]
+    low, high = ends.clip(0, grid.size[:2]).astype(int).tolist()
+    return low, high
 
 
 def vote(found: Votes, depth: np.ndarray, lens: list[float], pose: np.ndarray) -> None:

@@ -23,8 +23,6 @@ VOXEL = 0.5
 """Side of a voxel, as a share of the distance between points."""
 STEP = 2
 """Every second pixel of every second row looks for a surface."""
-HITS = 3
-"""Pixels that must meet a surface in a voxel of the points."""
 APART = 0.75
 """Share of the distance between points from which a point of depth maps is so near that no other is needed."""
 
@@ -40,9 +38,8 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
         most: Points.
     """
     nothing = Thinned(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
-    priors = known.priors or ()
-    looking = {at: where for at in range(len(priors)) if (where := unsure(at)) is not None and where.any()}
-    if not looking or most < 1 or not len(stereo):
+    count = len(known.priors or ())
+    if most < 1 or not len(stereo) or not any(found is not None and found.any() for found in map(unsure, range(count))):
         return nothing
     spacing = float(np.median(stereo.size))
     up = up_direction(None, known.scene.train, known.scene.frame, np.eye(4)).direction
@@ -50,12 +47,13 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
     solid = solid_of(votes(grid, trusted_maps(known)))
     side = grid.side / VOXEL
     collected = Collected(side, max(1 << 20, 6 * most))
-    for count, (at, where) in enumerate(looking.items(), 1):
-        with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
-            collected.add(seen_from(grid, solid, known.scene.train[at].camera, where, known.photos[at]))
-        emit(Progress("closing what depth maps see into", count, len(looking)))
-    voxels = collected.settle()
-    points = thin_to(voxels.without(voxels.sums[:, 0] < HITS), most)
+    for at in range(count):
+        where = unsure(at)
+        if where is not None and where.any():
+            with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
+                collected.add(seen_from(grid, solid, known.scene.train[at].camera, where, known.photos[at]))
+        emit(Progress("closing what depth maps see into", at + 1, count))
+    points = thin_to(collected.settle(), most)
     return points.take(away_from(points.xyz, stereo.xyz, APART * side)) if len(points) else nothing
 
 

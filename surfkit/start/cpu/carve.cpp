@@ -27,10 +27,11 @@ inline void count_up(uint8_t& value) { value += value < 255; }
 
 }  // namespace
 
-void carve(const CarveGrid& grid, const CarveView& view, double near, double beyond, uint8_t* surfaces, uint8_t* through, int threads) {
+void carve(const CarveGrid& grid, const CarveView& view, uint8_t* surfaces, uint8_t* through, int threads) {
     const double* p = view.pose;
-    parallel(grid.size[0], threads, [&](int64_t i) {
-        for (int j = 0; j < grid.size[1]; j++) {
+    parallel(std::max(0, view.high[0] - view.low[0]), threads, [&](int64_t row) {
+        const int64_t i = view.low[0] + row;
+        for (int j = view.low[1]; j < view.high[1]; j++) {
             // Along a column, pixel coordinates times depth, and depth, are linear in k.
             const double x0 = p[0] * i + p[1] * j + p[3], y0 = p[4] * i + p[5] * j + p[7], z0 = p[8] * i + p[9] * j + p[11];
             const double u0 = view.fx * x0 + view.cx * z0, u1 = view.fx * p[2] + view.cx * p[10];
@@ -42,16 +43,16 @@ void carve(const CarveGrid& grid, const CarveView& view, double near, double bey
             require(view.width * z0 - u0, view.width * p[10] - u1, low, high);
             require(view.height * z0 - v0, view.height * p[10] - v1, low, high);
             if (!(low <= high)) continue;
-            const int64_t column = ((int64_t)i * grid.size[1] + j) * grid.size[2];
+            const int64_t column = (i * grid.size[1] + j) * grid.size[2];
             for (int k = (int)std::ceil(low); k <= (int)std::floor(high); k++) {
                 const double z = z0 + k * p[10], turn = 1 / z;
                 const int u = std::clamp((int)((u0 + k * u1) * turn), 0, view.width - 1);
                 const int v = std::clamp((int)((v0 + k * v1) * turn), 0, view.height - 1);
                 const double found = view.depth[(int64_t)v * view.width + u];
                 if (found <= 0) continue;
-                if (found > z + beyond) {
+                if (found > z + view.beyond) {
                     count_up(through[column + k]);
-                } else if (std::fabs(found - z) <= near) {
+                } else if (std::fabs(found - z) <= view.near) {
                     count_up(surfaces[column + k]);
                 }
             }

@@ -17,11 +17,13 @@ struct CarveView {
     int width, height;
     double fx, fy, cx, cy;
     double pose[12];
+    double near, beyond;  // voxels
+    int low[2], high[2];  // columns along x and y that it may see: from, to
 };
 
 // Count, for each voxel, a view more that sees a surface within `near` voxels of its middle, or that sees through it: a
 // surface more than `beyond` voxels behind it. Counts end at 255.
-void carve(const CarveGrid& grid, const CarveView& view, double near, double beyond, uint8_t* surfaces, uint8_t* through, int threads);
+void carve(const CarveGrid& grid, const CarveView& view, uint8_t* surfaces, uint8_t* through, int threads);
 
 // Where each of `count` rays from `from` first meets a solid voxel, in steps of half a voxel: lengths along the rays, which
 // need no unit length, 0 where it meets none; and directions (count, 3) from the solid around there, not of unit length.
