@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.core.events import Progress, emit
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.start.base import StartInput
@@ -46,6 +46,13 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
     grid = Grid.around(stereo.xyz, map_axes(up), VOXEL * spacing)
     solid = solid_of(votes(grid, trusted_maps(known)))
     side = grid.side / VOXEL
+    if side > 1.01 * spacing:
+        emit(
+            Warned(
+                f"the scene is large: where no depth is trusted, initial points are {side / spacing:.1f} times as far "
+                "apart as elsewhere"
+            )
+        )
     collected = Collected(side, max(1 << 20, 6 * most))
     for at in range(count):
         where = unsure(at)

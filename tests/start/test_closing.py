@@ -10,9 +10,10 @@ from needs import needs_native
 from scipy.spatial import cKDTree
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
-from surfkit.start import carve
+from surfkit.start import carve, closing
 from surfkit.start.base import StartInput
 from surfkit.start.carve import Grid, Votes, meet, solid_of, votes
 from surfkit.start.stereo import StereoStart
@@ -59,8 +60,8 @@ def test_walls_and_ground_of_an_alley_that_no_depth_is_trusted_in(town):
     given = known(town)
     stereo = StereoStart(points=6_000).fused(given)
     assert not in_alley(town.scene.frame.to_input(stereo.xyz).T, 2.9).any()
-    closing = StereoStart(points=20_000, closing=0.2).closed(given, stereo)
-    places = town.scene.frame.to_input(closing.xyz)
+    found = StereoStart(points=20_000, closing=0.2).closed(given, stereo)
+    places = town.scene.frame.to_input(found.xyz)
     inside = in_alley(places.T, 2.9)
     off = np.min([shape.distance(places) for shape in ALLEY], axis=0)
     side = float(np.median(stereo.size)) / town.scene.frame.scale
@@ -68,10 +69,10 @@ def test_walls_and_ground_of_an_alley_that_no_depth_is_trusted_in(town):
     ground, wall = inside & (places[:, 2] < side), inside & (places[:, 2] > side)
     assert ground.sum() > 10 and wall.sum() > 10
     level = ground & (np.abs(places[:, 0]) < 0.6)  # not in the corners; the axes of the frame are those of the input
-    assert (closing.normals[level] @ [0, 0, 1] > 0.8).mean() > 0.8
-    toward = closing.normals[wall][:, 0] * np.sign(places[wall][:, 0])
+    assert (found.normals[level] @ [0, 0, 1] > 0.8).mean() > 0.8
+    toward = found.normals[wall][:, 0] * np.sign(places[wall][:, 0])
     assert (toward < -0.6).mean() > 0.7  # walls face the alley
-    assert cKDTree(stereo.xyz).query(closing.xyz)[0].min() >= 0.75 * stereo.size.min()
+    assert cKDTree(stereo.xyz).query(found.xyz)[0].min() >= 0.75 * stereo.size.min()
 
 
 def test_the_cloud_has_them_at_an_opacity_of_their_own_and_0_leaves_them_out(town):
@@ -97,6 +98,16 @@ def test_nothing_is_added_where_all_depth_is_trusted_or_masked(town):
     lost = [torch.from_numpy(~in_alley(places_of(town, v, town.exact[v.name].depth), 3.0)) for v in town.scene.train]
     masked = known(town, masks=lost)
     assert len(StereoStart(points=20_000, closing=0.2).closed(masked, start.fused(masked))) == 0
+
+
+def test_points_that_are_further_apart_in_a_large_scene_are_told(town, monkeypatch):
+    given = known(town)
+    stereo = StereoStart(points=6_000).fused(given)
+    monkeypatch.setattr(Grid.around.__func__, "__defaults__", (20_000,))
+    told = []
+    monkeypatch.setattr(closing, "emit", told.append)
+    StereoStart(points=20_000, closing=0.2).closed(given, stereo)
+    assert any(isinstance(event, Warned) and "times as far apart" in event.text for event in told)
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.0, float("nan")])
@@ -168,7 +179,7 @@ def test_compiled_votes_and_rays_are_those_of_numpy(monkeypatch, threads):
         np.testing.assert_allclose(normal[same], way[same], atol=1e-5)
 
 
-def test_counts_end_at_255(monkeypatch):
+def test_counts_end_at_255():
     grid, maps, _ = scattered(5)
     found = votes(grid, maps[:1] * 300)
     assert found.through.max() == 255 and set(np.unique(found.through)) == {0, 255}
