@@ -64,6 +64,12 @@ class Grid:
         size = tuple(int(n) for n in sizes(side))
         return cls(axes.T @ (low - MARGIN * side), axes, side, (size[0], size[1], size[2]))
 
+    def voxels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(3, M) voxels that (M, 3) points lie in, or nearest to those outside; and (M,) bool, inside of the grid."""
+        at = np.rint((points - self.origin) @ self.axes.T / self.side).astype(np.int64)
+        nearest = at.clip(0, np.array(self.size) - 1)
+        return nearest.T, (at == nearest).all(1)
+
     def pose(self, camera: Camera) -> np.ndarray:
         """(3, 4) from (i, j, k, 1) of a voxel to the camera's axes, in voxels."""
         pose = camera.world_to_camera.numpy()

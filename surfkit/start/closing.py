@@ -1,4 +1,4 @@
-"""Initial points where no depth is trusted: on the surfaces that close what trusted depth sees into."""
+"""Initial points where no depth is trusted: depth that nothing contradicts, and what closes the space seen into."""
 
 from __future__ import annotations
 
@@ -14,38 +14,44 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.scene.camera import Camera
 from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.start.base import StartInput
-from surfkit.start.carve import Grid, meet, solid_of, votes
-from surfkit.start.voxels import Collected, Samples, Thinned, thin_to
+from surfkit.start.carve import Grid, Votes, meet, solid_of, votes
+from surfkit.start.depth_points import points_of
+from surfkit.start.voxels import Collected, Samples, Thinned, thin
 
 TRUSTED = 0.375
 """Least confidence of a depth that sees a surface, and through what lies before it."""
 VOXEL = 0.5
 """Side of a voxel, as a share of the distance between points."""
+PIXELS = 2
+"""Depth that is not trusted makes a point where so many pixels have it, of one view or more."""
 STEP = 2
-"""Every second pixel of every second row looks for a surface."""
+"""Every second pixel of every second row looks for a surface that closes what is seen into."""
 APART = 0.75
-"""Share of the distance between points from which a point of depth maps is so near that no other is needed."""
+"""Share of the distance between points from which another point is so near that none is needed."""
+LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
+"""Voxels kept while points are collected, at least, and for each point that may be made."""
 
 
 def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], Tensor | None], most: int) -> Thinned:
-    """Points on the surfaces that close the space which trusted depth sees into, `most` at most.
+    """Points where no depth is trusted, none of them close to another or to one of the depth maps.
+
+    They lie at depth that is not trusted, if trusted depth does not see through it; and on the surfaces that close the
+    space which trusted depth sees into.
 
     Args:
         known: What the start is given, with priors.
-        stereo: Points of the depth maps; none is made close to one.
-        unsure: (H, W) bool by position of the training view: pixels without a point, which look for a surface; None
-            where there are none.
-        most: Points.
+        stereo: Points of the depth maps.
+        unsure: (H, W) bool by position of the training view: pixels without a point; None where there are none.
+        most: Points; if there are more, those stay that most pixels see, and it is told.
     """
-    nothing = Thinned(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
     count = len(known.priors or ())
-    if most < 1 or not len(stereo) or not any(found is not None and found.any() for found in map(unsure, range(count))):
-        return nothing
+    if not len(stereo) or not any(found is not None and found.any() for found in map(unsure, range(count))):
+        return Thinned.none()
     spacing = float(np.median(stereo.size))
     up = up_direction(None, known.scene.train, known.scene.frame, np.eye(4)).direction
     grid = Grid.around(stereo.xyz, map_axes(up), VOXEL * spacing)
-    solid = solid_of(votes(grid, trusted_maps(known)))
-    side = grid.side / VOXEL
+    found = votes(grid, trusted_maps(known))
+    solid, side = solid_of(found), grid.side / VOXEL
     if side > 1.01 * spacing:
         emit(
             Warned(
@@ -53,15 +59,29 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
                 "apart as elsewhere"
             )
         )
-    collected = Collected(side, max(1 << 20, 6 * most))
+    unseen, closing = (Collected(side, max(LEAST_VOXELS, VOXELS_A_POINT * most)) for _ in range(2))
     for at in range(count):
-        where = unsure(at)
-        if where is not None and where.any():
+        where, prior = unsure(at), known.priors[at] if known.priors else None
+        if where is not None and prior is not None and where.any():
             with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
-                collected.add(seen_from(grid, solid, known.scene.train[at].camera, where, known.photos[at]))
-        emit(Progress("closing what depth maps see into", at + 1, count))
-    points = thin_to(collected.settle(), most)
-    return points.take(away_from(points.xyz, stereo.xyz, APART * side)) if len(points) else nothing
+                camera, photo = known.scene.train[at].camera, known.photos[at]
+                unseen.add(not_seen_through(grid, found, points_of(camera, prior, photo, where & (prior.inverse > 0))))
+                closing.add(seen_from(grid, solid, camera, where, photo))
+        emit(Progress("points where no depth is trusted", at + 1, count))
+    first = thin(unseen.settle(), unseen.voxels.side)
+    first = first.take((first.weight >= PIXELS) & away_from(first.xyz, stereo.xyz, APART * side))
+    second = thin(closing.settle(), closing.voxels.side)
+    second = second.take(away_from(second.xyz, np.concatenate([stereo.xyz, first.xyz]), APART * side))
+    points = first.joined(second)
+    if len(points) > most:
+        emit(
+            Warned(
+                f"of {len(points):,} initial points where no depth is trusted, {most:,} are used: start.points or "
+                "start.most allows no more"
+            )
+        )
+        points = points.take(np.sort(np.argsort(-points.weight, kind="stable")[:most]))
+    return points
 
 
 def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
@@ -74,6 +94,20 @@ def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
             camera, (height, width) = known.scene.train[at].camera, prior.inverse.shape
             yield camera.resized(width, height), torch.where(there, 1 / prior.inverse.clamp_min(1e-20), 0.0)
         emit(Progress("seeing through space", at + 1, len(known.priors or ())))
+
+
+def not_seen_through(grid: Grid, found: Votes, points: Samples) -> Samples:
+    """The points that no more trusted depth maps see through than see a surface there; a pixel has a weight of 1."""
+    (i, j, k), inside = grid.voxels_of(points.xyz)
+    keep = inside & (found.through[i, j, k] <= found.surfaces[i, j, k])
+    count = int(keep.sum())
+    return Samples(
+        points.xyz[keep],
+        points.rgb[keep],
+        points.normals[keep],
+        weight=np.ones(count, np.float32),
+        grain=np.full(count, grid.side),
+    )
 
 
 def seen_from(grid: Grid, solid: np.ndarray, camera: Camera, where: Tensor, photo: Tensor) -> Samples:
@@ -90,7 +124,7 @@ def seen_from(grid: Grid, solid: np.ndarray, camera: Camera, where: Tensor, phot
         xyz=((rays * depth[:, None] - shift) @ turn)[met],
         rgb=photo[:, some].T.float().numpy()[met],
         normals=facing[met],
-        weight=np.ones(int(met.sum()), np.float32),
+        weight=np.full(int(met.sum()), STEP**2, np.float32),
         grain=np.full(int(met.sum()), grid.side),
     )
 
@@ -99,4 +133,6 @@ def away_from(points: np.ndarray, others: np.ndarray, distance: float) -> np.nda
     """(P,) bool: points with none of the others within a distance."""
     from scipy.spatial import cKDTree
 
+    if not len(points) or not len(others):
+        return np.ones(len(points), bool)
     return ~np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])

@@ -47,9 +47,18 @@ class Thinned:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @classmethod
+    def none(cls) -> Thinned:
+        """No points."""
+        return cls(*np.zeros((3, 0, 3)), *np.zeros((2, 0)))
+
     def take(self, rows: np.ndarray) -> Thinned:
         """A selection of the points."""
         return Thinned(*(value[rows] for value in vars(self).values()))
+
+    def joined(self, other: Thinned) -> Thinned:
+        """These points, then others."""
+        return Thinned(*map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True)))
 
 
 @dataclass(frozen=True)

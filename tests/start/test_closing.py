@@ -16,7 +16,9 @@ from surfkit.scene.camera import Camera
 from surfkit.start import carve, closing
 from surfkit.start.base import StartInput
 from surfkit.start.carve import Grid, Votes, meet, solid_of, votes
+from surfkit.start.closing import not_seen_through
 from surfkit.start.stereo import StereoStart
+from surfkit.start.voxels import Samples
 from surfkit.testing import synthetic
 from surfkit.testing.synthetic import Box, Flight, Ground, photograph
 
@@ -44,14 +46,15 @@ def in_alley(places, below):
     return (np.abs(x) < 1.01) & (np.abs(y) < 4) & (z < below)
 
 
-def known(town, below=3.0, masks=None):
-    """What a start is given: exact depth, but in the alley below a height, where it is wrong and not trusted."""
+def known(town, below=3.0, masks=None, wrong=1.5):
+    """What a start is given: exact depth, but in the alley below a height, where it is not trusted, and too near
+    by a factor."""
     priors = []
     for view in town.scene.train:
         depth = town.exact[view.name].depth
         lost = torch.from_numpy(in_alley(places_of(town, view, depth), below))
         inverse = torch.where(depth > 0, 1 / depth, 0).float()
-        priors.append(DepthPrior(torch.where(lost, 1.1 * inverse, inverse), (~lost & (inverse > 0)).float(), 0.7))
+        priors.append(DepthPrior(torch.where(lost, wrong * inverse, inverse), (~lost & (inverse > 0)).float(), 0.7))
     photos = [(town.exact[view.name].color * 255).round().to(torch.uint8) for view in town.scene.train]
     return StartInput(town.scene, photos, masks, priors, torch.Generator().manual_seed(0))
 
@@ -75,7 +78,36 @@ def test_walls_and_ground_of_an_alley_that_no_depth_is_trusted_in(town):
     assert cKDTree(stereo.xyz).query(found.xyz)[0].min() >= 0.75 * stereo.size.min()
 
 
-def test_the_cloud_has_them_at_an_opacity_of_their_own_and_0_leaves_them_out(town):
+def test_depth_that_is_not_trusted_is_used_where_nothing_contradicts_it(town):
+    """Exact here: points lie on the surface itself, not on the border of voxels; where it is too near, the views
+    that look down see through it, and it makes no points."""
+    start, off = StereoStart(points=20_000, closing=0.2), {}
+    for wrong in (1.0, 1.5):
+        given = known(town, wrong=wrong)
+        stereo = StereoStart(points=6_000).fused(given)
+        found = start.closed(given, stereo)
+        places = town.scene.frame.to_input(found.xyz)
+        inside = in_alley(places.T, 2.9)
+        side = float(np.median(stereo.size)) / town.scene.frame.scale
+        off[wrong] = np.min([shape.distance(places[inside]) for shape in ALLEY], axis=0) / side
+    assert len(off[1.0]) > 50 and (off[1.0] < 1e-3).mean() > 0.5 > 10 * (off[1.5] < 1e-3).mean()
+
+
+def test_points_that_more_see_through_than_see_are_left_out():
+    grid = Grid(np.array([1.0, 2.0, 3.0]), np.eye(3)[[1, 2, 0]], 0.5, (4, 3, 2))
+    surfaces, through = np.zeros((2, 4, 3, 2), np.uint8)
+    through[1, 2, 1], through[3, 0, 0], surfaces[3, 0, 0] = 1, 2, 2
+    voxels = np.array([[1, 2, 1], [3, 0, 0], [0, 1, 1], [4, 0, 0], [0, -1, 0]])
+    places = grid.origin + 0.5 * (voxels + [0.4, -0.4, 0.3]) @ grid.axes
+    given = Samples(places, np.arange(15.0).reshape(5, 3), np.eye(3)[[0, 1, 2, 0, 1]], np.ones(5), np.full(5, 0.1))
+    kept = not_seen_through(grid, Votes(surfaces, through), given)
+    np.testing.assert_array_equal(kept.rgb, given.rgb[[1, 2]])
+    np.testing.assert_array_equal(kept.xyz, places[[1, 2]])
+    np.testing.assert_array_equal(kept.normals, given.normals[[1, 2]])
+    assert kept.weight.tolist() == [1, 1] and kept.grain.tolist() == [0.5, 0.5]
+
+
+def test_the_cloud_has_them_at_an_opacity_of_their_own_and_0_leaves_them_out(town, monkeypatch):
     given, start = known(town), StereoStart(points=20_000, spacing_px=2.0, closing=0.2)
     cloud, without = start.cloud(given), replace(start, closing=0.0).cloud(given)
     extra = (cloud.opacity == 0.2).sum()
@@ -87,8 +119,12 @@ def test_the_cloud_has_them_at_an_opacity_of_their_own_and_0_leaves_them_out(tow
     again = start.cloud(known(town))
     assert all(torch.equal(a, b) for a, b in zip(vars(cloud).values(), vars(again).values(), strict=True))
     stereo = start.fused(given)
+    told = []
+    monkeypatch.setattr(closing, "emit", told.append)
     few = StereoStart(points=len(stereo) + 10, closing=0.2)
-    assert len(few.closed(given, stereo)) <= 10 and len(StereoStart(points=100, closing=0.2).closed(given, stereo)) == 0
+    assert len(few.closed(given, stereo)) == 10 and len(StereoStart(points=100, closing=0.2).closed(given, stereo)) == 0
+    left = [event.text for event in told if isinstance(event, Warned)]
+    assert len(left) == 2 and "10 are used" in left[0] and " 0 are used" in left[1]
 
 
 def test_nothing_is_added_where_all_depth_is_trusted_or_masked(town):

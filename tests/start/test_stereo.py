@@ -14,9 +14,10 @@ from surfkit.core.registry import components
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.scene import Cloud
 from surfkit.start.base import Start, StartInput
+from surfkit.start.depth_points import normals_of
 from surfkit.start.plain import RandomStart, SparseStart
 from surfkit.start.splats import SplatStart
-from surfkit.start.stereo import StereoStart, normals_of, pixel_size
+from surfkit.start.stereo import StereoStart, pixel_size
 from surfkit.start.voxels import Collected, Samples, apart, thin, thin_to
 from surfkit.testing.synthetic import SURFACES, Flight, photograph
 
