@@ -240,3 +240,9 @@ def test_a_grid_stays_within_its_number_of_voxels():
     low = large.origin
     high = large.origin + large.side * (np.array(large.size) - 1)
     assert ((points > low) & (points < high)).all(1).mean() > 0.98
+
+
+def test_a_forecast_counts_them():
+    without, with_them = (StereoStart(closing=value).expected(0, 900_000) for value in (0.0, 0.2))
+    assert without == 10_000 and with_them == 16_000
+    assert StereoStart(closing=0.2, most=12_000).expected(0, 900_000) == 12_000
