@@ -28,8 +28,6 @@ STEP = 2
 """Every second pixel of every second row looks for a surface that closes what is seen into."""
 APART = 0.75
 """Share of the distance between points from which another point is so near that none is needed."""
-LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
-"""Voxels kept while points are collected, at least, and for each point that may be made."""
 
 
 def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], Tensor | None], most: int) -> Thinned:
@@ -45,7 +43,10 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
         most: Points; if there are more, those stay that most pixels see, and it is told.
     """
     count = len(known.priors or ())
-    if not len(stereo) or not any(found is not None and found.any() for found in map(unsure, range(count))):
+    if not len(stereo) or not any(where is not None and where.any() for where in map(unsure, range(count))):
+        return Thinned.none()
+    if most < 1:
+        emit(Warned("no initial points where no depth is trusted: start.points or start.most allows no more points"))
         return Thinned.none()
     spacing = float(np.median(stereo.size))
     up = up_direction(None, known.scene.train, known.scene.frame, np.eye(4)).direction
@@ -59,29 +60,33 @@ def closing_points(known: StartInput, stereo: Thinned, unsure: Callable[[int], T
                 "apart as elsewhere"
             )
         )
-    unseen, closing = (Collected(side, max(LEAST_VOXELS, VOXELS_A_POINT * most)) for _ in range(2))
-    for at in range(count):
-        where, prior = unsure(at), known.priors[at] if known.priors else None
+    untrusted, closing = (Collected.for_points(side, most) for _ in range(2))
+    for at, prior in enumerate(known.priors or ()):
+        where = unsure(at)
         if where is not None and prior is not None and where.any():
             with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
                 camera, photo = known.scene.train[at].camera, known.photos[at]
-                unseen.add(not_seen_through(grid, found, points_of(camera, prior, photo, where & (prior.inverse > 0))))
+                guesses = points_of(camera, prior, photo, where & (prior.inverse > 0))
+                untrusted.add(not_seen_through(grid, found, guesses))
                 closing.add(seen_from(grid, solid, camera, where, photo))
         emit(Progress("points where no depth is trusted", at + 1, count))
-    first = thin(unseen.settle(), unseen.voxels.side)
+    first, second = (thin(voxels, voxels.side) for voxels in (untrusted.settle(), closing.settle()))
     first = first.take((first.weight >= PIXELS) & away_from(first.xyz, stereo.xyz, APART * side))
-    second = thin(closing.settle(), closing.voxels.side)
     second = second.take(away_from(second.xyz, np.concatenate([stereo.xyz, first.xyz]), APART * side))
-    points = first.joined(second)
-    if len(points) > most:
-        emit(
-            Warned(
-                f"of {len(points):,} initial points where no depth is trusted, {most:,} are used: start.points or "
-                "start.most allows no more"
-            )
+    return most_seen(first.joined(second), most)
+
+
+def most_seen(points: Thinned, most: int) -> Thinned:
+    """The points that most pixels see, `most` at most; it is told if that are not all."""
+    if len(points) <= most:
+        return points
+    emit(
+        Warned(
+            f"of {len(points):,} initial points where no depth is trusted, {most:,} are used: start.points or "
+            "start.most allows no more"
         )
-        points = points.take(np.sort(np.argsort(-points.weight, kind="stable")[:most]))
-    return points
+    )
+    return points.take(np.sort(np.argsort(-points.weight, kind="stable")[:most]))
 
 
 def trusted_maps(known: StartInput) -> Iterator[tuple[Camera, Tensor]]:
@@ -133,6 +138,4 @@ def away_from(points: np.ndarray, others: np.ndarray, distance: float) -> np.nda
     """(P,) bool: points with none of the others within a distance."""
     from scipy.spatial import cKDTree
 
-    if not len(points) or not len(others):
-        return np.ones(len(points), bool)
     return ~np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])

@@ -20,13 +20,13 @@ def focal(camera: Camera) -> float:
 
 
 def points_of(camera: Camera, prior: DepthPrior, photo: Tensor, there: Tensor) -> Samples:
-    """The points of a depth map where it is trusted, in the world; their grain is a pixel.
+    """The points of some pixels of a depth map, in the world; their weight is the confidence, their grain a pixel.
 
     Args:
         camera: Of the map.
         prior: The map.
         photo: (3, H, W) uint8.
-        there: (H, W) bool, where it has a depth that is trusted.
+        there: (H, W) bool, the pixels; each has a depth.
     """
     depth = 1 / prior.inverse[there].double()
     rays = camera.rays(torch.float64)[:, there]

@@ -25,14 +25,12 @@ FILL = 2.0
 """A sparse point is used where no point of the depth maps lies within so many voxels."""
 SPARSE_OPACITY = 0.1
 """Of sparse points that fill gaps, as of a start from them alone."""
-LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
-"""Voxels kept while depth maps are read, at least, and for each point wanted."""
 FEWER = 0.9
 """A start with less than this share of the points that were asked for is told."""
 OVERLAP = 10
 """How often a place is photographed, for a forecast; a rule of thumb for aerial surveys."""
 CLOSING = 0.6
-"""Points where no depth is trusted, for each of the depth maps, for a forecast: 0.55 in a city with many alleys."""
+"""Points where no depth is trusted, for each point of the depth maps, for a forecast: 0.55 in a city of alleys."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class StereoStart(Start):
             if prior is not None:
                 if collected is None:
                     side = unit * pixel_size(scene, prior)
-                    collected = Collected(side, max(LEAST_VOXELS, VOXELS_A_POINT * wanted))
+                    collected = Collected.for_points(side, wanted)
                 with suppress(BadInput):  # a damaged photograph: training passes over it too, and tells
                     found = points_of(view.camera, prior, known.photos[at], self.trusted(known, at, prior))
                     collected.add(replace(found, grain=unit * found.grain))

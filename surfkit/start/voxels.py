@@ -20,6 +20,8 @@ BATCH = 1 << 19
 """Minimum number of buffered voxels before they are merged into the sorted ones."""
 APART = 0.5
 """Points closer to each other than this share of a voxel are duplicates, from voxels whose corners cut a surface."""
+LEAST_VOXELS, VOXELS_A_POINT = 1 << 20, 6
+"""Voxels kept while points are collected, at least, and for each point that may be made."""
 LONELY, NEIGHBOURS = 3.0, 3
 """A point with fewer others within this many voxel sizes is noise."""
 WEIGHT, PLACE, COLOR, NORMAL = 0, slice(1, 4), slice(4, 7), slice(7, 10)
@@ -142,6 +144,11 @@ class Collected:
         """Empty; `side`: of the smallest voxels; `most`: how many are kept."""
         self.voxels = Voxels(side, np.zeros(0, np.int64), np.zeros((0, 10), np.float32))
         self.most, self.waiting = most, []
+
+    @classmethod
+    def for_points(cls, side: float, points: int) -> Collected:
+        """Empty, with memory for as many voxels as so many points need."""
+        return cls(side, max(LEAST_VOXELS, VOXELS_A_POINT * points))
 
     def add(self, samples: Samples) -> None:
         """Add the points of a view."""

@@ -124,7 +124,7 @@ def test_the_cloud_has_them_at_an_opacity_of_their_own_and_0_leaves_them_out(tow
     few = StereoStart(points=len(stereo) + 10, closing=0.2)
     assert len(few.closed(given, stereo)) == 10 and len(StereoStart(points=100, closing=0.2).closed(given, stereo)) == 0
     left = [event.text for event in told if isinstance(event, Warned)]
-    assert len(left) == 2 and "10 are used" in left[0] and " 0 are used" in left[1]
+    assert len(left) == 2 and "10 are used" in left[0] and "no initial points" in left[1]
 
 
 def test_nothing_is_added_where_all_depth_is_trusted_or_masked(town):
