@@ -55,7 +55,7 @@ class Step:
         index: Steps done, this one included.
         steps: Of the whole stage.
         seen: (N,) bool, the point may touch a pixel of this step's view.
-        splats: The splats that were rendered, N of them, detached.
+        splats: The splats, N of them, detached; where the step was for the points in view, in the colours of degree 0.
         grad_norm: (N,) length of the densification signal, as `Gradients.signal`; 0 where not seen.
         radii: (N,) pixels; 0 where not seen.
         image_px: Longer side of this step's view, pixels.

@@ -300,6 +300,13 @@ class Rasterizer(Component):
             BadInput: A scale, opacity, mean or quaternion is not finite, or a shape is wrong.
         """
 
+    def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """(N,) bool, the splats that may touch a pixel: all that `render` would see, and more; by default all.
+
+        The picture is the same without the others. Only means and scales are looked at.
+        """
+        return torch.ones_like(splats.means[:, 0], dtype=torch.bool)
+
     @abstractmethod
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float

@@ -40,6 +40,20 @@ class NativeRasterizer(Rasterizer):
     ) -> Render:
         return NativeRender(splats, camera, near, MAPS[: 2 + 3 * geometry + (geometry and distortion)])
 
+    def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.in_view`."""
+        found = torch.empty(len(splats), dtype=torch.bool)
+        native.module().in_view(
+            splats.kind == "surfel",
+            GEOMETRIES.index(splats.geometry),
+            *(t.detach().to("cpu", torch.float32).contiguous() for t in (splats.means, splats.scales)),
+            *_pose_and_lens(camera),
+            near,
+            found,
+            torch.get_num_threads(),
+        )
+        return found.to(splats.means.device)
+
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:
@@ -57,6 +71,11 @@ class NativeRasterizer(Rasterizer):
         return opacity
 
 
+def _pose_and_lens(camera: Camera) -> tuple[list[float], list[float], int, int]:
+    pose = camera.world_to_camera.double().flatten().tolist()
+    return pose, [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
+
+
 class _Pass:
     """Splats projected onto one camera and sorted into tiles; `rim` is 0 if more than pixel centres will be drawn."""
 
@@ -69,10 +88,7 @@ class _Pass:
             splats.kind == "surfel",
             GEOMETRIES.index(splats.geometry),
             self.arrays,
-            camera.world_to_camera.double().flatten().tolist(),
-            [camera.fx, camera.fy, camera.cx, camera.cy],
-            camera.width,
-            camera.height,
+            *_pose_and_lens(camera),
             near,
             splats.dilation,
             splats.antialias,

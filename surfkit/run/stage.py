@@ -269,7 +269,7 @@ def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable
 
     def draw(view: View, geometry: bool) -> Maps:
         with job.meter.adding("pictures"):
-            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), state.sh_degree))
+            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), state.sh_degree), state.sh_degree)
             return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
 
     return draw

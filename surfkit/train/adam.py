@@ -17,14 +17,40 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 SOURCE = Source(Path(__file__).parent / "cuda" / "adam.cu")
 PER_BLOCK = 1024
 """Values that a block of the kernel updates."""
+UPDATED = "updated"
+"""Column of `Points.stats`: the last step in which a point was updated, where some are updated alone."""
 
 
 @torch.no_grad()
-def adam_step(points: Points, grads: Columns, rates: Mapping[str, float], index: int) -> None:
-    """Take step `index` (from 1) of Adam on every column that has a gradient, in place."""
+def adam_step(
+    points: Points, grads: Columns, rates: Mapping[str, float], index: int, rows: Tensor | None = None
+) -> None:
+    """Take a step of Adam on every column that has a gradient, in place.
+
+    With `rows`, the other points keep values and moments. The second moments of a point fade in the steps in which it is
+    not among these too, as if its gradient were 0 then, so that a gradient moves a point that few views show as far as
+    in steps for all points. Only what momentum adds between is left out; it comes with the next gradients.
+
+    Args:
+        points: N of them.
+        grads: (N, ...) by column, or (R, ...) of the rows.
+        rates: Learning rates.
+        index: The step, from 1.
+        rows: (R,) int64, different points that alone are updated; None for all.
+    """
     values = points.all_params()
+    if rows is None and UPDATED in points.stats:
+        rows = torch.arange(len(points), device=values["means"].device)
+    if rows is None:
+        for name, grad in grads.items():
+            update(values[name], grad, points.exp_avg[name], points.exp_avg_sq[name], rates[name], index)
+        return
+    updated = points.stat(UPDATED)
+    kept = (BETA2 ** (index - 1 - updated[rows])).clamp_max(1)
     for name, grad in grads.items():
-        update(values[name], grad, points.exp_avg[name], points.exp_avg_sq[name], rates[name], index)
+        moments = points.exp_avg[name], points.exp_avg_sq[name]
+        update_rows(values[name], rows, kept, grad, *moments, rates[name], index)
+    updated[rows] = index
 
 
 def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int) -> None:
@@ -42,14 +68,76 @@ def update(value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rat
     value.addcdiv_(exp_avg, exp_avg_sq.sqrt().mul_(correction).add_(EPSILON), value=-rate)
 
 
+def update_rows(
+    value: Tensor,
+    rows: Tensor,
+    kept: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rate: float,
+    index: int,
+) -> None:
+    """What `update` does, on some rows of a tensor (N, ...) and its moments alone.
+
+    Args:
+        value: (N, ...).
+        rows: (R,) int64, different ones.
+        kept: (R,) what is left of the second moments before this step.
+        grad: (R, ...) of these rows.
+        exp_avg: (N, ...).
+        exp_avg_sq: (N, ...).
+        rate: The learning rate.
+        index: From 1.
+    """
+    tensors = (value, kept, grad, exp_avg, exp_avg_sq)
+    if all(_is_gpu(t) for t in tensors):
+        launch_update_rows(kernels(SOURCE, value.device), value, rows, kept, grad, exp_avg, exp_avg_sq, rate, index)
+        return
+    if native.module() is not None and all(_plain(t) for t in tensors):
+        rate, correction = _corrected(rate, index)
+        native.module().adam_rows(
+            value, rows, kept, grad, exp_avg, exp_avg_sq, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
+        )
+        return
+    some = [tensor[rows] for tensor in (value, exp_avg, exp_avg_sq)]
+    some[2] *= kept.view(-1, *[1] * (value.dim() - 1))
+    update(some[0], grad, *some[1:], rate, index)
+    for tensor, part in zip((value, exp_avg, exp_avg_sq), some, strict=True):
+        tensor[rows] = part
+
+
 def launch_update(
     on: Kernels, value: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, rate: float, index: int
 ) -> None:
     """What `update` does, by the kernel of adam.cu."""
+    on.launch("adam", _blocks(grad), 256, value, grad, exp_avg, exp_avg_sq, *_numbers(rate, index))
+
+
+def launch_update_rows(
+    on: Kernels,
+    value: Tensor,
+    rows: Tensor,
+    kept: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rate: float,
+    index: int,
+) -> None:
+    """What `update_rows` does, by the kernel of adam.cu."""
+    wide = grad[:1].numel()
+    tensors = value, rows, kept, grad, exp_avg, exp_avg_sq
+    on.launch("adam_rows", _blocks(grad), 256, *tensors, wide, *_numbers(rate, index))
+
+
+def _blocks(grad: Tensor) -> int:
+    return (grad.numel() + PER_BLOCK - 1) // PER_BLOCK
+
+
+def _numbers(rate: float, index: int) -> tuple[float, ...]:
     rate, correction = _corrected(rate, index)
-    blocks = (value.numel() + PER_BLOCK - 1) // PER_BLOCK
-    numbers = (rate, 1 - BETA1, 1 - BETA2, correction, EPSILON)
-    on.launch("adam", blocks, 256, value, grad, exp_avg, exp_avg_sq, *numbers)
+    return rate, 1 - BETA1, 1 - BETA2, correction, EPSILON
 
 
 def _corrected(rate: float, index: int) -> tuple[float, float]:

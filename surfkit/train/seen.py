@@ -9,6 +9,7 @@ from torch import Tensor
 from surfkit.losses.base import Target
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Render, Splats
+from surfkit.train.in_view import InView
 from surfkit.train.look import Look
 
 
@@ -18,7 +19,8 @@ class Seen:
 
     Attributes:
         target: The view and its photograph.
-        leaves: Raw parameters, that gradients can be taken by.
+        some: The points in view, where a step is for these alone.
+        leaves: Raw parameters of these points, or of all, that gradients can be taken by.
         shape: The splats made of them.
         splats: The same, detached, and the frozen ones.
         render: The view as drawn.
@@ -28,6 +30,7 @@ class Seen:
     """
 
     target: Target
+    some: InView | None
     leaves: Columns
     shape: Splats
     splats: Splats

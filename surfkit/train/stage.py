@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -28,10 +28,12 @@ from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, 
 from surfkit.primitives.points import Columns, Points
 from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
 from surfkit.readers.depth_prior import DepthPrior
+from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
 from surfkit.train.cotangents import added, as_numbers, gradient, pulled, regularizer_terms
 from surfkit.train.faults import require_finite_losses, require_finite_values
+from surfkit.train.in_view import InView
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.reads import maps_read
 from surfkit.train.rig import Rig
@@ -82,6 +84,11 @@ class Stage:
 
     near: float = 0.005
     """Nothing nearer to a camera than this is drawn, as a share of the scene extent."""
+
+    update: Literal["all", "in-view"] = "all"
+    """Points that a step updates: all, of which those out of view move on by momentum, as in 3DGS, or only those in
+    view, which takes less time, the more so the larger a scene is. Steps with regularizers or a second view, and
+    primitives that draw themselves or have parameters that belong to no point, always update all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MOST_STEPS:
@@ -201,9 +208,11 @@ class Trainer:
         stage, index = self.stage, state.index + 1
         shown, target = self.target(state)
         active, reads = stage.weights_at(index), self.maps_read(index)
-        leaves = {name: value.detach().requires_grad_() for name, value in state.points.all_params().items()}
+        some = self.in_view(state, target.view.camera)
+        params = state.points.all_params() if some is None else some.of_columns(state.points.params)
+        leaves = {name: value.detach().requires_grad_() for name, value in params.items()}
         shape = self.primitive.activate(leaves, state.sh_degree)
-        splats = self.drawn(state, shape)
+        splats = self.drawn(state, shape, state.sh_degree, some and target.view.camera)
 
         paired = stage.is_paired(index)
         geometry, distortion = paired or bool(reads.keys() & GEOMETRY), "distortion" in reads
@@ -214,8 +223,8 @@ class Trainer:
         compared = replace(target, neighbour=second)
         look = self.look(state, shown)
         losses, total, chosen, by_look = self.cotangents(active, render.maps, compared, look)
-        gradients = render.backward(total, chosen, stage.signal.absolute, len(state.points))
-        return Seen(target, leaves, shape, splats, render, losses, gradients, look and (look, by_look))
+        gradients = render.backward(total, chosen, stage.signal.absolute, len(shape))
+        return Seen(target, some, leaves, shape, splats, render, losses, gradients, look and (look, by_look))
 
     def learn(self, state: StageState, found: Seen) -> None:
         """Change the points by what a step has seen."""
@@ -224,28 +233,40 @@ class Trainer:
         if found.look is not None:
             look, by_look = found.look
             look.learn(by_look)
-        seen = render.seen[: len(state.points)]
+        seen = render.seen[: len(found.shape)]
         given = RegularizerInput(index, stage.steps, target, render.maps, seen, state.points.stat, found.leaves)
         terms = regularizer_terms(stage.regularizers, found.shape, given)
         found.losses.update(as_numbers(terms))
         require_finite_losses(index, target.view.name, found.losses)
-        facts = self.facts(state, found.splats, target, render, found.gradients)
+        facts = self.facts(state, found)
         edit = self.wanted(state.points, facts)
         grads = pulled(found.shape, found.gradients, found.leaves, list(terms.values()))
-        adam_step(state.points, grads, facts.rates, index)
-        require_finite_values(index, target.view.name, state.points.all_params())
+        adam_step(state.points, grads, facts.rates, index, found.some and found.some.rows)
+        # Of a finite gradient Adam makes a finite value.
+        require_finite_values(index, target.view.name, state.points.all_params() if found.some is None else grads)
         state.points = fitted(self.primitive, state.points)
         if edit is not None:
             state.points = sparing(state, self.uploads, lambda: self.edited(state, edit, index))
         state.index, state.whole = index, True
 
-    def drawn(self, state: StageState, shape: Splats) -> Splats:
-        """The splats of a state, detached, and then those that are frozen."""
-        splats = shape.detached()
-        if not state.frozen:
+    def in_view(self, state: StageState, camera: Camera) -> InView | None:
+        """The points that a step is for; None where it is for all (`Stage.update`)."""
+        stage, index = self.stage, state.index + 1
+        if stage.update == "all" or stage.regularizers or stage.is_paired(index):
+            return None
+        if self.draws is not self.rasterizer or state.points.shared:
+            return None
+        return InView.of(self.primitive, state.points.params, camera, self.rasterizer, stage.near)
+
+    def drawn(self, state: StageState, shape: Splats, degree: int, camera: Camera | None = None) -> Splats:
+        """The splats of a state, detached, and then those that are frozen; with a camera, the frozen ones in its view."""
+        splats, frozen = shape.detached(), state.frozen
+        if not frozen:
             return splats
+        if camera is not None:
+            frozen = InView.of(self.primitive, frozen, camera, self.rasterizer, self.stage.near).of_columns(frozen)
         shared = {name: value.detach() for name, value in state.points.shared.items()}
-        return splats.and_then(self.primitive.activate(state.frozen | shared, state.sh_degree))
+        return splats.and_then(self.primitive.activate(frozen | shared, degree))
 
     @cached_property
     def draws(self) -> Rasterizer:
@@ -339,25 +360,28 @@ class Trainer:
         rate = self.stage.appearance.rate_at(state.index + 1, self.stage.steps) / 2**state.halvings
         return Look(self.stage.appearance, state.looks, shown, rate)
 
-    def facts(self, state: StageState, splats: Splats, target: Target, render: Render, gradients: Gradients) -> Step:
+    def facts(self, state: StageState, found: Seen) -> Step:
         """What the policies are told about a step, and nothing about frozen points."""
-        index, count = state.index + 1, len(state.points)
+        index, count, render, gradients = state.index + 1, len(found.shape), found.render, found.gradients
+        signal, among_all = self.stage.signal, found.some.among_all if found.some else (lambda values: values)
         chosen = gradients.signal if gradients.chosen is None else gradients.chosen
+        camera = found.target.view.camera
+        drawn = found.splats if found.some is None else self.drawn(state, found.some.splats, 0)
         return Step(
             index=index,
             steps=self.stage.steps,
-            seen=render.seen[:count],
-            splats=splats.first(count),
-            grad_norm=self.stage.signal.combine(chosen, gradients.signal).norm(dim=-1),
-            radii=render.radii[:count],
-            image_px=max(target.view.camera.width, target.view.camera.height),
-            views=ViewContributions(self.views, self.draws, splats, self.stage.near, count),
+            seen=among_all(render.seen[:count]),
+            splats=drawn.first(len(state.points)),
+            grad_norm=among_all(signal.combine(chosen, gradients.signal).norm(dim=-1)),
+            radii=among_all(render.radii[:count]),
+            image_px=max(camera.width, camera.height),
+            views=ViewContributions(self.views, self.draws, drawn, self.stage.near, len(state.points)),
             since_reset=index - state.reset_at,
             rates={n: rate.at(index, self.stage.steps) / 2**state.halvings for n, rate in self.rates.items()},
             seed=state.seed,
             owns=self.owns,
-            signed_norm=gradients.signal.norm(dim=-1),
-            derived=gradients.derived and gradients.derived.combined(self.stage.signal.combine),
+            signed_norm=among_all(gradients.signal.norm(dim=-1)),
+            derived=gradients.derived and gradients.derived.combined(signal.combine),
         )
 
     def wanted(self, points: Points, step: Step) -> Edit | None:

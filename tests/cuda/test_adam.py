@@ -5,7 +5,7 @@ import torch
 
 from surfkit.primitives.points import Points
 from surfkit.train import adam
-from surfkit.train.adam import SOURCE, adam_step, launch_update, update
+from surfkit.train.adam import SOURCE, adam_step, launch_update, launch_update_rows, update, update_rows
 
 
 @pytest.mark.parametrize("shape", [(1,), (1023, 1), (1024,), (1025,), (700, 3), (65, 16, 3), (0, 3)])
@@ -23,6 +23,23 @@ def test_agrees_with_the_cpu(load, shape):
         assert torch.allclose(our.cpu(), their, rtol=1e-5, atol=1e-7)
     if value.numel():
         assert not torch.equal(ours[0].cpu(), value)
+
+
+@pytest.mark.parametrize("shape", [(1,), (1500,), (700, 3), (131, 15, 3)])
+def test_some_rows_agree_with_the_cpu(load, shape):
+    on = load(SOURCE)
+    draw = torch.Generator().manual_seed(len(shape))
+    theirs = [torch.randn(shape, generator=draw), torch.zeros(shape), torch.zeros(shape)]
+    ours = [tensor.clone().to(on.device) for tensor in theirs]
+    for index in range(1, 6):
+        rows = (torch.rand(shape[0], generator=draw) < 0.6).nonzero()[:, 0]
+        kept = torch.rand(len(rows), generator=draw)
+        grad = torch.randn(len(rows), *shape[1:], generator=draw)
+        there = [tensor.to(on.device) for tensor in (rows, kept, grad)]
+        launch_update_rows(on, ours[0], *there, *ours[1:], 0.01, index)
+        update_rows(theirs[0], rows, kept, grad, *theirs[1:], 0.01, index)
+    for our, their in zip(ours, theirs, strict=True):
+        assert torch.allclose(our.cpu(), their, rtol=1e-5, atol=1e-7)
 
 
 def test_columns_without_gradient_stay(monkeypatch):

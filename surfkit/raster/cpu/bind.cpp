@@ -20,6 +20,8 @@ namespace {
 
 const Kernels* active = nullptr;
 
+constexpr int64_t kRowsOfAdam = 256;  // updated as one piece of work
+
 using Array = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<bool, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<int64_t, nb::c_contig, nb::device::cpu>;
@@ -40,6 +42,10 @@ SplatArrays arrays(const std::vector<Array>& s) {  // in the order of api.Splats
             s[2].data(),
             s[3].data(),
             s[4].data()};
+}
+
+Kind kind_of(bool surfel, splat::Geometry geometry) {
+    return surfel ? kSurfel : geometry == splat::kRay ? kGaussianRay : kGaussian;
 }
 
 splat::CameraModel<double> camera(const std::vector<double>& pose, const std::vector<double>& lens, int width,
@@ -89,8 +95,7 @@ void add_raster(nb::module_& m) {
                  const auto c = camera(pose, lens, width, height, near);
                  nb::gil_scoped_release free;
                  const splat::GaussianForm form{dilation, antialias, (splat::Geometry)geometry};
-                 const Kind kind = surfel ? kSurfel : form.geometry == splat::kRay ? kGaussianRay : kGaussian;
-                 new (self) Pass(kind, s, c, form, rim, threads, seen.data(), radii.data());
+                 new (self) Pass(kind_of(surfel, form.geometry), s, c, form, rim, threads, seen.data(), radii.data());
              })
         .def_ro("first_invalid", &Pass::first_invalid)
         .def_prop_ro("pairs", &Pass::pairs)
@@ -124,6 +129,13 @@ void add_raster(nb::module_& m) {
             self.probe(points.data(), (int64_t)points.shape(0), opacity.data(), threads);
         });
 
+    m.def("in_view", [](bool surfel, int geometry, Array means, Array scales, std::vector<double> pose, std::vector<double> lens,
+                        int width, int height, double near, Flags found, int threads) {
+        const SplatArrays s{(int64_t)means.shape(0), 0, means.data(), nullptr, scales.data(), nullptr, nullptr};
+        const auto c = camera(pose, lens, width, height, near);
+        nb::gil_scoped_release free;
+        in_view(kind_of(surfel, (splat::Geometry)geometry), s, c, threads, found.data());
+    });
     m.def(
         "kernels",
         [] {
@@ -172,6 +184,26 @@ void add_raster(nb::module_& m) {
         float* g = d_depth.data();
         nb::gil_scoped_release free;
         return normal_disagreement(job, g, threads);
+    });
+    m.def("adam_rows", [](Array value, Counts rows, Array kept, Array gradient, Array first, Array second, double rate,
+                          double beta1, double beta2, double second_correction, double epsilon, int threads) {
+        const int64_t n = (int64_t)rows.size(), wide = n ? (int64_t)gradient.size() / n : 0;
+        float *p = value.data(), *m1 = first.data(), *m2 = second.data();
+        const float *g = gradient.data(), *decay = kept.data();
+        const int64_t* row = rows.data();
+        nb::gil_scoped_release free;
+        parallel(wide ? (n + kRowsOfAdam - 1) / kRowsOfAdam : 0, threads, [&](int64_t piece) {
+            const int64_t end = std::min(n, (piece + 1) * kRowsOfAdam);
+            for (int64_t r = piece * kRowsOfAdam; r < end;) {  // rows that follow one another are one stretch of memory
+                const int64_t begin = r, at = row[begin] * wide;
+                for (bool next = true; next; next = r < end && row[r] == row[begin] + r - begin) {
+                    for (int64_t k = 0; k < wide; k++) m2[row[r] * wide + k] *= decay[r];
+                    r++;
+                }
+                kernels().adam((r - begin) * wide, p + at, g + begin * wide, m1 + at, m2 + at, (float)rate,
+                               (float)(1 - beta1), (float)(1 - beta2), (float)second_correction, (float)epsilon);
+            }
+        });
     });
     m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2,
                      double second_correction, double epsilon, int threads) {

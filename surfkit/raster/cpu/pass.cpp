@@ -318,6 +318,19 @@ void Pass::probe(const double* points, int64_t count, float* opacity, int thread
     });
 }
 
+void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, int threads, bool* found) {
+    const int columns = scale_columns(kind);
+    const Outlook outlook(camera);
+    parallel(chunks_of(splats.count, kChunk), threads, [&](int64_t c) {
+        for (int64_t i = c * kChunk; i < std::min(splats.count, (c + 1) * kChunk); i++) {
+            SplatIn<double> in{};
+            in.mean = {splats.means[3 * i], splats.means[3 * i + 1], splats.means[3 * i + 2]};
+            for (int k = 0; k < columns; k++) in.scale[k] = splats.scales[columns * i + k];
+            found[i] = !outlook.misses(kind, in, splat::mul(camera.turn, in.mean) + camera.shift);
+        }
+    });
+}
+
 double ssim(const float* x, const float* y, int channels, int width, int height, float* gradient, int threads) {
     const int band = 48, bands = (height + band - 1) / band;
     const size_t plane = (size_t)width * height;

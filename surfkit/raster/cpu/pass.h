@@ -77,6 +77,9 @@ class Pass {
     std::vector<uint64_t> blocks_;
 };
 
+// Which splats may touch a pixel: all that a Pass would draw, and some more. Only means and scales are read.
+void in_view(Kind kind, const SplatArrays& splats, const splat::CameraModel<double>& camera, int threads, bool* found);
+
 // The compilation in use, and those that this machine can run (best first).
 const Kernels& kernels();
 std::vector<const Kernels*> runnable_kernels();

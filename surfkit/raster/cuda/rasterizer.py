@@ -21,6 +21,7 @@ from surfkit.core.check import BadInput
 from surfkit.cuda.modules import Kernels
 from surfkit.cuda.source import Source
 from surfkit.raster.api import GEOMETRIES, MAPS, Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.outlook import may_touch
 from surfkit.raster.validate import validate
 from surfkit.scene.camera import Camera
 
@@ -248,6 +249,10 @@ class TileRasterizer(Rasterizer):
         program.launch("contribution", drawn.tiles, TILE * TILE, *given, sums, counts)
         program.launch("total", blocks(len(drawn.index)), 128, drawn.index, drawn.first, sums, counts, total, count)
         return total.to(drawn.home), count.to(drawn.home)
+
+    def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
+        """See `Rasterizer.in_view`."""
+        return may_touch(splats, camera, near)
 
     def opacity_before(self, splats: Splats, camera: Camera, near: float, points: Tensor) -> Tensor:
         drawn = self._pass(_grey(splats), camera, near, rim=0.0)

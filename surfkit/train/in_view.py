@@ -1,0 +1,43 @@
+"""The points that a step is for, where it leaves out those that its view does not show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from surfkit.primitives.base import Primitive
+from surfkit.primitives.points import Columns
+from surfkit.raster.api import Rasterizer, Splats
+from surfkit.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class InView:
+    """R of N points.
+
+    Attributes:
+        rows: (R,) int64, in their order.
+        splats: All N splats, detached, in the colours of degree 0.
+    """
+
+    rows: Tensor
+    splats: Splats
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, primitive: Primitive, params: Columns, camera: Camera, rasterizer: Rasterizer, near: float) -> InView:
+        """The points that may touch a pixel of a view."""
+        splats = primitive.activate(params, 0)
+        return cls(rasterizer.in_view(splats, camera, near).nonzero()[:, 0], splats)
+
+    def of_columns(self, columns: Columns) -> Columns:
+        """(R, ...) of each of (N, ...)."""
+        return {name: value[self.rows] for name, value in columns.items()}
+
+    def among_all(self, values: Tensor) -> Tensor:
+        """(N, ...) of (R, ...), 0 for the points that are not in view."""
+        found = values.new_zeros(len(self.splats), *values.shape[1:])
+        found[self.rows] = values
+        return found

@@ -1,0 +1,168 @@
+"""Steps that are for the points in view alone."""
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+import torch
+
+from surfkit.densify import ADC, Trim
+from surfkit.densify.base import Prune
+from surfkit.losses.reprojection import Reprojection
+from surfkit.losses.photometric import L1
+from surfkit.losses.regularizers import MeanOpacity
+from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
+from surfkit.primitives.points import Points
+from surfkit.train import checkpoint
+from surfkit.train.adam import UPDATED
+from surfkit.train.in_view import InView
+from surfkit.train.stage import Stage
+
+from .conftest import looking_down
+
+QUIET = Stage(steps=6, densify=None, sh_every=2, update="in-view")
+
+
+@dataclass(frozen=True)
+class Noted(Prune):
+    """Keeps what policies are told."""
+
+    steps: list = field(default_factory=list)
+
+    def edit(self, points, step):
+        self.steps.append(step)
+
+
+@pytest.fixture
+def apart(begin):
+    """As `begin`, with small points and views so far apart that none shows all of them."""
+
+    def start(stage, primitive=None):
+        trainer, state = begin(stage, primitive)
+        params = state.points.params
+        params["means"] = params["means"] * torch.tensor([2.0, 2.0, 1.0])
+        params["scales"] = params["scales"] - 0.5
+        cameras = [looking_down(x, y) for x in (-0.7, 0.0, 0.7) for y in (-0.4, 0.4)]
+        views = tuple(replace(view, camera=camera) for view, camera in zip(trainer.views, cameras, strict=True))
+        return replace(trainer, views=views), state
+
+    return start
+
+
+def held(points):
+    return {name: value.clone() for name, value in points.params.items()}
+
+
+def visible(trainer, state, done):
+    """(N,) what the view of a step may show, of points as they are."""
+    camera = done.target.view.camera
+    rows = InView.of(trainer.primitive, state.points.params, camera, trainer.rasterizer, trainer.stage.near).rows
+    return torch.zeros(len(state.points), dtype=torch.bool).index_fill(0, rows, True)
+
+
+@pytest.mark.parametrize("primitive", [Surfel2D(1), Gaussian3D(1), Flat3D(1)], ids=lambda part: type(part).__name__)
+def test_only_points_in_view_change(apart, primitive):
+    trainer, state = apart(QUIET, primitive)
+    other, whole = apart(replace(QUIET, update="all"), primitive)
+    left = 0
+    for _ in range(6):
+        before, twin = held(state.points), {name: value.clone() for name, value in state.points.params.items()}
+        done = trainer.step(state)
+        inside = visible(trainer, replace(state, points=replace(state.points, params=twin)), done)
+        for name, value in state.points.params.items():
+            assert torch.equal(value[~inside], before[name][~inside]), name
+        assert not torch.equal(state.points.params["means"][inside], before["means"][inside])
+        assert state.points.stats[UPDATED][inside].eq(state.index).all()
+        left += int((~inside).sum())
+    assert left > 6, "all points were in view"
+    list(other.run(whole))
+    assert not torch.equal(state.points.params["means"], whole.points.params["means"])
+
+
+def test_the_first_step_is_that_of_all_points(apart):
+    """The gradients are the same, moments begin at 0, and points out of view have no gradient."""
+    notes = [Noted(), Noted()]
+    states = []
+    for update, note in zip(("in-view", "all"), notes, strict=True):
+        trainer, state = apart(replace(QUIET, update=update, prune=(note,)))
+        trainer.step(state)
+        states.append(state)
+    (one,), (other,) = (note.steps for note in notes)
+    assert not other.seen.all() and other.grad_norm.any()
+    for name in ("seen", "radii", "grad_norm", "signed_norm"):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(one.splats, name), getattr(other.splats, name)), name
+    for name, value in states[0].points.params.items():
+        assert torch.equal(value, states[1].points.params[name]), name
+
+
+@pytest.mark.parametrize("change", [
+    {"regularizers": {"opacity": MeanOpacity(weight=0.1)}},
+    {"losses": {"l1": L1(), "two": Reprojection(weight=0.1, start=0, every=1)}},
+], ids=["regularizers", "two views"])  # fmt: skip
+def test_steps_that_need_all_points_update_all(apart, change):
+    found = []
+    for update in ("in-view", "all"):
+        trainer, state = apart(replace(QUIET, update=update, **change))
+        list(trainer.run(state))
+        found.append(held(state.points))
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+
+
+def test_a_view_that_shows_no_point(begin):
+    trainer, state = begin(replace(QUIET, losses={"l1": L1()}))
+    state.points.params["means"] = state.points.params["means"] + 100
+    before = held(state.points)
+    done = list(trainer.run(state))
+    assert all(step.losses["l1"] > 0 for step in done)
+    assert all(torch.equal(value, before[name]) for name, value in state.points.params.items())
+
+
+def test_training_raises_psnr_as_with_all_points(begin):
+    from .test_stage import scored
+
+    scores = []
+    for update in ("in-view", "all"):
+        trainer, state = begin(replace(QUIET, steps=60, update=update))
+        before = scored(trainer, state)
+        list(trainer.run(state))
+        scores.append(scored(trainer, state) - before)
+    assert scores[0] > 3 and scores[0] == pytest.approx(scores[1], abs=1.0)
+
+
+def test_it_densifies_trims_and_goes_on_from_a_checkpoint(apart, tmp_path):
+    """With the same bits, on any number of threads."""
+    densify = ADC(start=1, until=9, every=2, threshold=1e-9)
+    stage = replace(QUIET, steps=9, densify=densify, prune=(Trim(ratio=0.2, start=4, until=9, every=3, recovery=0),))
+    path, ends = tmp_path / "c.safetensors", []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        trainer, state = apart(stage)
+        for done in trainer.run(state):
+            if done.index == 5:
+                checkpoint.save(path, state)
+        ends.append(state.points)
+    again = checkpoint.load(path)
+    list(trainer.run(again))
+    ends.append(again.points)
+    assert ends[0].stats[UPDATED].unique().numel() > 2 and len(ends[0]) != 40
+    for other in ends[1:]:
+        for group in ("params", "exp_avg", "exp_avg_sq", "stats"):
+            one, two = getattr(ends[0], group), getattr(other, group)
+            assert one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one), group
+
+
+def test_frozen_points_teach_the_others_the_same(apart):
+    """Of these too, only those in view are drawn."""
+    trainer, whole = apart(QUIET)
+    rows = torch.arange(40) >= 25
+    _, part = apart(QUIET)
+    columns = part.points.params
+    part.points = Points.fresh({name: value[~rows].clone() for name, value in columns.items()})
+    part.frozen = {name: value[rows].clone() for name, value in columns.items()}
+    note = Noted()
+    replace(trainer, stage=replace(trainer.stage, prune=(note,))).step(part)
+    trainer.step(whole)
+    for name, value in part.points.params.items():
+        assert torch.equal(value, whole.points.params[name][~rows]), name
+    assert len(note.steps[0].splats) == 25 and len(note.steps[0].views.contributions().mean) == 25
