@@ -36,7 +36,8 @@ def may_touch(splats: Splats, camera: Camera, near: float) -> Tensor:
     right, bottom = camera.width + MARGIN_PX - camera.cx, camera.height + MARGIN_PX - camera.cy
     # Planes through the camera and the sides of the image, pointing away, and then the depth.
     away = [[-camera.fx, 0, left], [camera.fx, 0, -right], [0, -camera.fy, top], [0, camera.fy, -bottom]]
-    planes = torch.tensor([[value / math.hypot(*plane) for value in plane] for plane in away] + [[0.0, 0.0, 1.0]]).to(pose)
+    planes = torch.tensor([*([value / math.hypot(*plane) for value in plane] for plane in away), [0.0, 0.0, 1.0]])
+    planes = planes.to(pose)
     beyond = torch.addmm(planes @ pose[:3, 3], splats.means, (planes @ pose[:3, :3]).T)
     return (beyond[:, :4] <= reach[:, None]).all(1) & (beyond[:, 4] > (1 - ROUNDING) * near)
 

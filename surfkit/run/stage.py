@@ -269,7 +269,8 @@ def live_drawing(job: StageJob, trainer: Trainer, state: StageState) -> Callable
 
     def draw(view: View, geometry: bool) -> Maps:
         with job.meter.adding("pictures"):
-            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), state.sh_degree), state.sh_degree)
+            degree = state.sh_degree
+            splats = trainer.drawn(state, at.primitive.activate(at.stage.finished(state), degree), degree)
             return trainer.draws.render(splats, view.camera, at.stage.near, geometry, distortion=False).maps
 
     return draw

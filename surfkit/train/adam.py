@@ -27,9 +27,9 @@ def adam_step(
 ) -> None:
     """Take a step of Adam on every column that has a gradient, in place.
 
-    With `rows`, the other points keep values and moments. The second moments of a point fade in the steps in which it is
-    not among these too, as if its gradient were 0 then, so that a gradient moves a point that few views show as far as
-    in steps for all points. Only what momentum adds between is left out; it comes with the next gradients.
+    With `rows`, the other points keep values and moments. The second moments of a point fade in the steps in which it
+    is not among these too, as if its gradient were 0 then, so that a gradient moves a point that few views show as far
+    as in steps for all points. Only what momentum adds between is left out; it comes with the next gradients.
 
     Args:
         points: N of them.
@@ -96,9 +96,8 @@ def update_rows(
         return
     if native.module() is not None and all(_plain(t) for t in tensors):
         rate, correction = _corrected(rate, index)
-        native.module().adam_rows(
-            value, rows, kept, grad, exp_avg, exp_avg_sq, rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
-        )
+        numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
+        native.module().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
     some = [tensor[rows] for tensor in (value, exp_avg, exp_avg_sq)]
     some[2] *= kept.view(-1, *[1] * (value.dim() - 1))

@@ -26,7 +26,7 @@ from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by, refuse_wrong_maps
 from surfkit.primitives.edit import OBSERVED_EVERY, Edit, apply, fitted, merge, observe, sound, withheld
 from surfkit.primitives.points import Columns, Points
-from surfkit.raster.api import Gradients, Maps, Rasterizer, Render, Splats
+from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
@@ -259,7 +259,7 @@ class Trainer:
         return InView.of(self.primitive, state.points.params, camera, self.rasterizer, stage.near)
 
     def drawn(self, state: StageState, shape: Splats, degree: int, camera: Camera | None = None) -> Splats:
-        """The splats of a state, detached, and then those that are frozen; with a camera, the frozen ones in its view."""
+        """The splats of a state, detached, and then those that are frozen; of these, with a camera, those in view."""
         splats, frozen = shape.detached(), state.frozen
         if not frozen:
             return splats

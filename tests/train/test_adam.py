@@ -122,7 +122,7 @@ def copied(points: Points) -> dict[str, torch.Tensor]:
 
 
 def test_a_gradient_moves_a_point_as_far_as_a_whole_step_does():
-    """With gradients of one size, every tenth step: what each way has moved a point by, but for a few steps of momentum."""
+    """With gradients of one size, every tenth step: the same, but for a few steps of momentum."""
     ways = [Points.fresh({"means": torch.zeros(1, 3)}) for _ in range(2)]
     for index in range(1, 4001):
         shown = index % 10 == 0

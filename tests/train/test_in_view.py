@@ -7,9 +7,9 @@ import torch
 
 from surfkit.densify import ADC, Trim
 from surfkit.densify.base import Prune
-from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.photometric import L1
 from surfkit.losses.regularizers import MeanOpacity
+from surfkit.losses.reprojection import Reprojection
 from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.train import checkpoint
