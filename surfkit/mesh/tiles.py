@@ -12,8 +12,6 @@ from surfkit.raster.api import Splats
 
 GRID_BYTES = 1.05 * BLOCK_BYTES
 """Of a block, its place in the table included."""
-BLOCK_TRIANGLES = 60
-"""Of a block, about; and half as many vertices."""
 MESH_BYTES = 5_000
 """Most that these take while tiles are joined: everything twice, and the names of the vertices."""
 SHARE = 0.2
@@ -22,6 +20,8 @@ DENSE = 4
 """Splats in a cell from which it is taken for covered."""
 THICK = 3.0
 """Blocks for each that a surface passes through."""
+BLOCK_TRIANGLES = 2 * SIDE**2 / THICK
+"""Of a block that is counted, where the surface is flat; and half as many vertices."""
 
 
 @dataclass(frozen=True)

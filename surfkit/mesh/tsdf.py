@@ -151,7 +151,7 @@ class TSDF(Mesher):
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
         found = estimate(subject.splats, lengths.voxel, within)
-        most = min(AUTO_TRIANGLES // BLOCK_TRIANGLES, for_mesh(subject) // MESH_BYTES)
+        most = min(round(AUTO_TRIANGLES / BLOCK_TRIANGLES), for_mesh(subject) // MESH_BYTES)
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(

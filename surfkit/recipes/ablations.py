@@ -226,6 +226,8 @@ SURFACE = Table(
         Row("+ no normal consistency", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
         Row("+ fusion by agreement", {"mesh": surface.SURFACE.mesh}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
+        Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
+        Row("+ higher learning rates", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
