@@ -13,7 +13,7 @@ from surfkit.raster.api import Splats
 GRID_BYTES = 1.05 * BLOCK_BYTES
 """Of a block, its place in the table included."""
 MESH_BYTES = 5_000
-"""Most that these take while tiles are joined: everything twice, and the names of the vertices."""
+"""Most that the triangles of a block take while tiles are joined: everything twice, and the names of the vertices."""
 SHARE = 0.2
 """Of the memory budget that a grid may take; the rest is for the triangles, which are all there at the end."""
 DENSE = 4

@@ -303,7 +303,7 @@ class Rasterizer(Component):
     def in_view(self, splats: Splats, camera: Camera, near: float) -> Tensor:
         """(N,) bool, the splats that may touch a pixel: all that `render` would see, and more; by default all.
 
-        The picture is the same without the others. Only means and scales are looked at.
+        The picture is the same without the others. Opacities and colours are not looked at.
         """
         return torch.ones_like(splats.means[:, 0], dtype=torch.bool)
 

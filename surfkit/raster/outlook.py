@@ -1,4 +1,4 @@
-"""What a camera may show, told before anything is projected."""
+"""What a camera may show, told before anything is projected; `Outlook` of project.h is the same for the CPU."""
 
 from __future__ import annotations
 

@@ -232,6 +232,9 @@ class OnSimulatedGpu(Rasterizer):
     ) -> Render:
         return _SimulatedRender(self.inner.render(_here(splats), camera, near, geometry, distortion), splats)
 
+    def in_view(self, splats: Splats, camera: Camera, near: float) -> torch.Tensor:
+        return self.inner.in_view(_here(splats), camera, near).to(splats.means.device)
+
     def contribution(
         self, splats: Splats, camera: Camera, near: float, alpha_power: float, transmittance_power: float
     ) -> tuple[Tensor, Tensor]:

@@ -28,8 +28,9 @@ def adam_step(
     """Take a step of Adam on every column that has a gradient, in place.
 
     With `rows`, the other points keep values and moments. The second moments of a point fade in the steps in which it
-    is not among these too, as if its gradient were 0 then, so that a gradient moves a point that few views show as far
-    as in steps for all points. Only what momentum adds between is left out; it comes with the next gradients.
+    is not among these too, as if its gradient were 0 then, so that a gradient moves a point that few views show about
+    as far as in steps for all points. What momentum adds between is left out; it comes with the next gradients. From
+    one update to the next they fade no further than the first moments do: old momentum would move points ever faster.
 
     Args:
         points: N of them.
@@ -45,8 +46,10 @@ def adam_step(
         for name, grad in grads.items():
             update(values[name], grad, points.exp_avg[name], points.exp_avg_sq[name], rates[name], index)
         return
-    updated = points.stat(UPDATED)
-    kept = (BETA2 ** (index - 1 - updated[rows])).clamp_max(1)
+    if UPDATED not in points.stats:
+        points.stat(UPDATED).fill_(index - 1)
+    updated = points.stats[UPDATED]
+    kept = (BETA2 ** (index - 1 - updated[rows])).clamp(BETA1, 1)
     for name, grad in grads.items():
         moments = points.exp_avg[name], points.exp_avg_sq[name]
         update_rows(values[name], rows, kept, grad, *moments, rates[name], index)

@@ -32,7 +32,7 @@ from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
 from surfkit.train.cotangents import added, as_numbers, gradient, pulled, regularizer_terms
-from surfkit.train.faults import require_finite_losses, require_finite_values
+from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.in_view import InView
 from surfkit.train.look import Look, fresh_looks
 from surfkit.train.reads import maps_read
@@ -87,8 +87,8 @@ class Stage:
 
     update: Literal["all", "in-view"] = "all"
     """Points that a step updates: all, of which those out of view move on by momentum, as in 3DGS, or only those in
-    view, which takes less time, the more so the larger a scene is. Steps with regularizers or a second view, and
-    primitives that draw themselves or have parameters that belong to no point, always update all."""
+    view, which takes less time, the more so the larger a scene is. Stages with regularizers, steps with a second view,
+    and primitives that draw themselves or have parameters that belong to no point always update all."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MOST_STEPS:
@@ -241,9 +241,11 @@ class Trainer:
         facts = self.facts(state, found)
         edit = self.wanted(state.points, facts)
         grads = pulled(found.shape, found.gradients, found.leaves, list(terms.values()))
+        if found.some is not None:
+            require_finite_gradients(index, target.view.name, grads)
         adam_step(state.points, grads, facts.rates, index, found.some and found.some.rows)
-        # Of a finite gradient Adam makes a finite value.
-        require_finite_values(index, target.view.name, state.points.all_params() if found.some is None else grads)
+        if found.some is None:
+            require_finite_values(index, target.view.name, state.points.all_params())
         state.points = fitted(self.primitive, state.points)
         if edit is not None:
             state.points = sparing(state, self.uploads, lambda: self.edited(state, edit, index))
@@ -252,7 +254,7 @@ class Trainer:
     def in_view(self, state: StageState, camera: Camera) -> InView | None:
         """The points that a step is for; None where it is for all (`Stage.update`)."""
         stage, index = self.stage, state.index + 1
-        if stage.update == "all" or stage.regularizers or stage.is_paired(index):
+        if stage.update == "all" or stage.regularizers or stage.is_paired(index):  # these look at other points too
             return None
         if self.draws is not self.rasterizer or state.points.shared:
             return None

@@ -150,3 +150,28 @@ def test_a_step_for_all_after_one_for_some():
     adam_step(points, one, {"means": 0.1}, 4, torch.tensor([0]))
     wanted = torch.tensor([[1e-3 * 0.999**3 + 1e-3], [1e-3 * 0.999]])
     assert torch.allclose(points.exp_avg_sq["means"], wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("gap", [300, 667])
+def test_momentum_of_long_ago_does_not_run_away(gap):
+    """A point that few views show, of which nothing is left to see after its first gradients."""
+    ways = [Points.fresh({"means": torch.zeros(1, 1)}) for _ in range(2)]
+    for index in range(1, 20_001):
+        shown = index % gap == 0
+        grad = {"means": torch.full((1, 1), float(shown and index <= 8 * gap))}
+        adam_step(ways[0], grad, {"means": 1.0}, index)
+        if shown:
+            adam_step(ways[1], grad, {"means": 1.0}, index, torch.tensor([0]))
+    whole, rows = (float(way.params["means"]) for way in ways)
+    assert whole < -100 and 1.5 * whole < rows < 0.3 * whole
+
+
+def test_some_rows_after_steps_for_all():
+    """What all have had is not taken for steps that were missed."""
+    ways = [Points.fresh({"means": torch.zeros(3, 1)}) for _ in range(2)]
+    for index in range(1, 400):
+        for way in ways:
+            adam_step(way, {"means": torch.ones(3, 1)}, {"means": 1.0}, index)
+    adam_step(ways[0], {"means": torch.ones(3, 1)}, {"means": 1.0}, 400)
+    adam_step(ways[1], {"means": torch.ones(3, 1)}, {"means": 1.0}, 400, torch.arange(3))
+    assert torch.equal(ways[0].params["means"], ways[1].params["means"])

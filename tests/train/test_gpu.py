@@ -75,9 +75,10 @@ def places(state):
     return [is_there(value) for group in groups for value in group.values()]
 
 
-def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path):
+@pytest.mark.parametrize("update", ["all", "in-view"])
+def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path, update):
     losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
-    stage = Stage(steps=20, losses=losses, densify=EDITS)
+    stage = Stage(steps=20, losses=losses, densify=EDITS, update=update)
     _, here = trained(begin, stage, tiny.rasterizer, tiny)
     with simulated_gpu() as gpu:
         _, there = trained(begin, stage, OnSimulatedGpu(tiny.rasterizer), tiny)
@@ -92,12 +93,15 @@ def test_same_points_as_on_the_cpu_with_few_waits(tiny, begin, tmp_path):
     assert torch.equal(loaded.points.params["means"], there.points.params["means"])
     waits = {name: count for name, count in gpu.waits.items() if name != "to cpu"}  # those are the rasterizer's
     assert waits.pop("tolist") == 2 * 20, "a step waits once for its losses and once for whether all is finite"
-    assert sum(waits.values()) < 60, "edits wait for the numbers of their points, steps do not"
+    in_view = 20 if update == "in-view" else 0
+    assert waits.get("nonzero", 0) >= in_view, "a step waits for the number of points in view"
+    assert sum(waits.values()) < 60 + in_view, "edits wait for the numbers of their points, steps do not"
 
 
-def test_with_the_kernels(tiny, begin):
+@pytest.mark.parametrize("update", ["all", "in-view"])
+def test_with_the_kernels(tiny, begin, update):
     losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
-    stage = Stage(steps=4, losses=losses, densify=replace(EDITS, start=1, every=2))
+    stage = Stage(steps=4, losses=losses, densify=replace(EDITS, start=1, every=2), update=update)
     _, here = trained(begin, stage, tiny.rasterizer, tiny)
     with simulated_gpu():
         _, there = trained(begin, stage, EmulatedGpu(), tiny)

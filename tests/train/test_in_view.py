@@ -14,6 +14,7 @@ from surfkit.primitives import Flat3D, Gaussian3D, Surfel2D
 from surfkit.primitives.points import Points
 from surfkit.train import checkpoint
 from surfkit.train.adam import UPDATED
+from surfkit.train.faults import Diverged
 from surfkit.train.in_view import InView
 from surfkit.train.stage import Stage
 
@@ -166,3 +167,19 @@ def test_frozen_points_teach_the_others_the_same(apart):
     for name, value in part.points.params.items():
         assert torch.equal(value, whole.points.params[name][~rows]), name
     assert len(note.steps[0].splats) == 25 and len(note.steps[0].views.contributions().mean) == 25
+
+
+@dataclass(frozen=True)
+class Steep(L1):
+    """So steep that the squares of gradients are infinite."""
+
+    def __call__(self, maps, sample):
+        return maps.color.sum() * 1e25
+
+
+def test_gradients_that_are_too_large_name_step_and_view(begin):
+    trainer, state = begin(replace(QUIET, losses={"l1": Steep()}))
+    before = held(state.points)
+    with pytest.raises(Diverged, match=r"step 1, view \d.png: the gradients of the .* are not finite, or too large"):
+        trainer.step(state)
+    assert all(torch.equal(value, before[name]) for name, value in state.points.params.items())

@@ -129,8 +129,8 @@ void add_raster(nb::module_& m) {
             self.probe(points.data(), (int64_t)points.shape(0), opacity.data(), threads);
         });
 
-    m.def("in_view", [](bool surfel, int geometry, Array means, Array scales, std::vector<double> pose, std::vector<double> lens,
-                        int width, int height, double near, Flags found, int threads) {
+    m.def("in_view", [](bool surfel, int geometry, Array means, Array scales, std::vector<double> pose,
+                        std::vector<double> lens, int width, int height, double near, Flags found, int threads) {
         const SplatArrays s{(int64_t)means.shape(0), 0, means.data(), nullptr, scales.data(), nullptr, nullptr};
         const auto c = camera(pose, lens, width, height, near);
         nb::gil_scoped_release free;
