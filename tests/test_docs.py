@@ -146,6 +146,7 @@ def recipe_settings():
     """Names of all settings, of recipes and of their parts, as options have them."""
     page = (ROOT / "docs" / "components.md").read_text()
     plain = set(re.findall(r"^\| `(\w+)`", page, re.M)) | set(vars(recipes()["2dgs"]))
+    plain |= set(vars(recipes()["2dgs"].pretrain))
     return [name.replace("_", "-") for name in plain] + ["VARIABLE", "NAME", "help", "version", "context"]
 
 

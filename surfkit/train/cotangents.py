@@ -9,9 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.losses.base import Regularizer, RegularizerInput
+from surfkit.densify.base import Signal
+from surfkit.losses.base import Loss, Regularizer, RegularizerInput, Target, ignoring
 from surfkit.primitives.points import Columns
 from surfkit.raster.api import Gradients, Maps, Splats
+from surfkit.train.look import Look
 
 
 def gradient(losses: list[Tensor], leaves: Columns, shared: bool = False) -> Maps:
@@ -32,6 +34,32 @@ def added(a: Maps, b: Maps) -> Maps:
     for name, value in b.present().items():
         sums[name] = sums[name] + value if name in sums else value
     return Maps(**sums)
+
+
+def cotangents(
+    losses: Mapping[str, Loss],
+    signal: Signal,
+    active: Mapping[str, float],
+    maps: Maps,
+    target: Target,
+    look: Look | None,
+) -> tuple[dict[str, float], Maps, Maps | None, Tensor | None]:
+    """The weighted losses; their gradient by the maps, that of those that `Signal.terms` names, and by the look."""
+    terms = signal.terms
+    leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
+    leafy = Maps(**leaves)
+    compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
+    compared, target = ignoring(compared, target)
+    values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
+    numbers = as_numbers(values)
+    by_look = None if look is None else look.gradient(list(values.values()))
+    if terms is None:
+        total = gradient(list(values.values()), leaves)
+        return numbers, total, total if signal.absolute else None, by_look
+    shared = look is not None or target.mask is not None  # what shows or hides pixels is before all losses
+    chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
+    others = gradient([value for name, value in values.items() if name not in terms], leaves)
+    return numbers, added(chosen, others), chosen, by_look
 
 
 def regularizer_terms(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated, Literal
@@ -20,7 +20,7 @@ from surfkit.cuda.memory import peak_gpu_bytes
 from surfkit.densify.adc import ADC
 from surfkit.densify.base import Densify, Policy, Prune, Signal, Step
 from surfkit.densify.signal import LossGradient
-from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target, ignoring
+from surfkit.losses.base import Loss, Neighbour, Regularizer, RegularizerInput, Target
 from surfkit.losses.photometric import L1, SSIM
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.drawing import drawn_by, refuse_wrong_maps
@@ -31,7 +31,7 @@ from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.train.adam import adam_step
-from surfkit.train.cotangents import added, as_numbers, gradient, pulled, regularizer_terms
+from surfkit.train.cotangents import as_numbers, cotangents, pulled, regularizer_terms
 from surfkit.train.faults import require_finite_gradients, require_finite_losses, require_finite_values
 from surfkit.train.in_view import InView
 from surfkit.train.look import Look, fresh_looks
@@ -222,7 +222,7 @@ class Trainer:
         second = self.neighbour(state, splats, shown, render.maps) if paired else None
         compared = replace(target, neighbour=second)
         look = self.look(state, shown)
-        losses, total, chosen, by_look = self.cotangents(active, render.maps, compared, look)
+        losses, total, chosen, by_look = cotangents(stage.losses, stage.signal, active, render.maps, compared, look)
         gradients = render.backward(total, chosen, stage.signal.absolute, len(shape))
         return Seen(target, some, leaves, shape, splats, render, losses, gradients, look and (look, by_look))
 
@@ -334,26 +334,6 @@ class Trainer:
             shape = replace(drawn, color=None, distortion=None)
             return Neighbour(self.views[at], shown.in_floats(), shape, shown.mask)
         return None
-
-    def cotangents(
-        self, active: Mapping[str, float], maps: Maps, target: Target, look: Look | None
-    ) -> tuple[dict[str, float], Maps, Maps | None, Tensor | None]:
-        """The weighted losses; their gradient by the maps, that of those that `Signal.terms` names, and by the look."""
-        losses, terms = self.stage.losses, self.stage.signal.terms
-        leaves = {name: value.detach().requires_grad_() for name, value in maps.present().items()}
-        leafy = Maps(**leaves)
-        compared = leafy if look is None else replace(leafy, color=look.shown(leafy.color))
-        compared, target = ignoring(compared, target)
-        values = {name: weight * losses[name](compared, target) for name, weight in active.items()}
-        numbers = as_numbers(values)
-        by_look = None if look is None else look.gradient(list(values.values()))
-        if terms is None:
-            total = gradient(list(values.values()), leaves)
-            return numbers, total, total if self.stage.signal.absolute else None, by_look
-        shared = look is not None or target.mask is not None  # what shows or hides pixels is before all losses
-        chosen = gradient([value for name, value in values.items() if name in terms], leaves, shared)
-        others = gradient([value for name, value in values.items() if name not in terms], leaves)
-        return numbers, added(chosen, others), chosen, by_look
 
     def look(self, state: StageState, shown: int) -> Look | None:
         """The look of a photograph, if the stage learns any."""

@@ -39,7 +39,7 @@ def raster(name: str, kind: int = rasterizer.SURFEL) -> Source:
 
 
 SHIPPED: tuple[tuple[Source, dict[str, tuple[int, ...]]], ...] = (
-    (adam.SOURCE, {"adam": (40, 0)}),
+    (adam.SOURCE, {"adam": (40, 0), "adam_rows": (64, 0)}),
     (ssim.SOURCE, {"ssim_forward": (64, 23_000), "ssim_backward": (64, 24_000)}),
     (grid.SOURCE, {"reach": (40, 0), "fuse": (48, 100)}),
     (passes.SOURCES[16], {"improve": (128, 0, 1000)}),

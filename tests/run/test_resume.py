@@ -359,8 +359,8 @@ def test_out_of_memory_lowers_the_cache_first(finished, recipe, tmp_path, monkey
     (data, whole), out, update = finished, tmp_path / "run", stage.adam_step
     kept = []
 
-    def short(points, grads, rates, index):
-        update(points, grads, rates, index)
+    def short(points, grads, rates, index, rows=None):
+        update(points, grads, rates, index, rows)
         kept.append(given[0].photos.bytes)
         if index == 13 and kept[-1] > photographs * 40 * 30 * 3:
             raise MemoryError
