@@ -19,7 +19,7 @@ class Seen:
 
     Attributes:
         target: The view and its photograph.
-        some: The points in view, where a step is for these alone.
+        in_view: The points in view, where a step is for these alone; None where it is for all.
         leaves: Raw parameters of these points, or of all, that gradients can be taken by.
         shape: The splats made of them.
         splats: The same, detached, and the frozen ones.
@@ -30,7 +30,7 @@ class Seen:
     """
 
     target: Target
-    some: InView | None
+    in_view: InView | None
     leaves: Columns
     shape: Splats
     splats: Splats

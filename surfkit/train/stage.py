@@ -241,10 +241,10 @@ class Trainer:
         facts = self.facts(state, found)
         edit = self.wanted(state.points, facts)
         grads = pulled(found.shape, found.gradients, found.leaves, list(terms.values()))
-        if found.some is not None:
+        if found.in_view is not None:
             require_finite_gradients(index, target.view.name, grads)
-        adam_step(state.points, grads, facts.rates, index, found.some and found.some.rows)
-        if found.some is None:
+        adam_step(state.points, grads, facts.rates, index, found.in_view and found.in_view.rows)
+        if found.in_view is None:
             require_finite_values(index, target.view.name, state.points.all_params())
         state.points = fitted(self.primitive, state.points)
         if edit is not None:
@@ -345,10 +345,10 @@ class Trainer:
     def facts(self, state: StageState, found: Seen) -> Step:
         """What the policies are told about a step, and nothing about frozen points."""
         index, count, render, gradients = state.index + 1, len(found.shape), found.render, found.gradients
-        signal, among_all = self.stage.signal, found.some.among_all if found.some else (lambda values: values)
+        signal, among_all = self.stage.signal, found.in_view.among_all if found.in_view else (lambda values: values)
         chosen = gradients.signal if gradients.chosen is None else gradients.chosen
         camera = found.target.view.camera
-        drawn = found.splats if found.some is None else self.drawn(state, found.some.splats, 0)
+        drawn = found.splats if found.in_view is None else self.drawn(state, found.in_view.splats, 0)
         return Step(
             index=index,
             steps=self.stage.steps,
