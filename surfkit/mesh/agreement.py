@@ -44,6 +44,10 @@ class Agreement(Trust):
     alone: float = 0.25
     """Weight of pixels that no other view can confirm or contradict, as a share of the full one."""
 
+    covered_by: int = 0
+    """Number of the compared views that must have a place in their picture, with some depth there: places that fewer
+    look at, as at the rim of a survey, are left out. With fewer compared views, all of them."""
+
     opaque: float = 0.5
     """Minimum alpha of a pixel that counts."""
 
@@ -68,6 +72,11 @@ class Agreement(Trust):
         if self.neighbours < 1 or not 0 < self.enough < float("inf"):
             raise BadInput(
                 f"mesh.trust.neighbours is {self.neighbours} and enough {self.enough:g}; give 1 or more and more than 0"
+            )
+        if not 0 <= self.covered_by <= self.neighbours:
+            raise BadInput(
+                f"mesh.trust.covered_by is {self.covered_by}; it must be from 0 to {self.neighbours}, the number of "
+                "compared views (mesh.trust.neighbours)"
             )
 
     @property
@@ -96,18 +105,24 @@ class Agreement(Trust):
         """See `Trust.among`."""
         camera, depth = depths.cameras[at], depths.read(at)
         agreeing, against = torch.zeros_like(depth), torch.zeros_like(depth)
-        for other in overlapping(at, depths, self.neighbours, self.angle):
-            close, apart = compare(camera, depth, depths.cameras[other], depths.read(other), self.tolerance)
+        looking = torch.zeros_like(depth)
+        others = overlapping(at, depths, self.neighbours, self.angle)
+        for other in others:
+            close, apart, looks = compare(camera, depth, depths.cameras[other], depths.read(other), self.tolerance)
             agreeing += close
             against += apart
+            looking += looks
         share = agreeing / (agreeing + against).clamp_min(1e-6)
         confirmed = (agreeing / self.enough).clamp_max(1) * share
         unknown = (agreeing == 0) & (against == 0)
-        return torch.where(depth > 0, torch.where(unknown, self.alone, confirmed), 0.0)
+        counts = (depth > 0) & (looking >= min(self.covered_by, len(others)))
+        return torch.where(counts, torch.where(unknown, self.alone, confirmed), 0.0)
 
 
-def compare(camera: Camera, depth: Tensor, there: Camera, other: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """How well another view's depth agrees with each pixel, and whether it contradicts.
+def compare(
+    camera: Camera, depth: Tensor, there: Camera, other: Tensor, tolerance: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How well another view's depth agrees with each pixel, whether it contradicts, and whether it looks there.
 
     The point that a pixel shows is carried into the other view. If what is seen there is as far, they agree; if it is
     further, the other view sees through the point. If it is nearer, it hides the point, unless this view in turn sees
@@ -121,7 +136,8 @@ def compare(camera: Camera, depth: Tensor, there: Camera, other: Tensor, toleran
         tolerance: Share of the depth.
 
     Returns:
-        (H, W) agreement from 0 to 1, and (H, W) 1 where the other view contradicts, else 0.
+        (H, W) agreement from 0 to 1, (H, W) 1 where the other view contradicts, else 0, and (H, W) 1 where it has some
+        depth in the direction of the place, else 0.
     """
     a, b = ray_map(camera, there, depth.device)
     inverse = 1 / depth.clamp_min(1e-20)
@@ -140,7 +156,7 @@ def compare(camera: Camera, depth: Tensor, there: Camera, other: Tensor, toleran
     p, q, r = (eye[i] + (rays[i] * depth - eye[i]) * ratio for i in range(3))
     beyond = _taken(depth, p / r * camera.fx + camera.cx, q / r * camera.fy + camera.cy, hidden & (r > 0))
     looked_through = (beyond > 0) & (beyond > r * (1 + tolerance))
-    return agreement, (seen_through | looked_through).to(depth.dtype)
+    return agreement, (seen_through | looked_through).to(depth.dtype), known.to(depth.dtype)
 
 
 def _taken(values: Tensor, x: Tensor, y: Tensor, where: Tensor) -> Tensor:

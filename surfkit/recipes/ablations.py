@@ -21,6 +21,7 @@ from surfkit.losses.photometric import L1, SSIM
 from surfkit.losses.reprojection import Reprojection
 from surfkit.losses.surface import NormalConsistency
 from surfkit.losses.warped_patches import WarpedPatches
+from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition.airspace import Airspace
 from surfkit.partition.assign import SSIMDifference
@@ -212,6 +213,7 @@ GRADIENT = Table(
 )
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
+CONFIRMED = replace(surface.SURFACE.mesh, least_views=0.1, trust=Agreement(alone=0.1))
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; it has no splats, and so no PSNR.
 SURFACE = Table(
@@ -224,10 +226,11 @@ SURFACE = Table(
         Row("+ dense start", {"start": StereoStart(), "pretrain.densify": surface.SURFACE.pretrain.densify}),
         Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
         Row("+ no normal consistency", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
-        Row("+ fusion by agreement", {"mesh": surface.SURFACE.mesh}),
+        Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
         Row("+ higher learning rates", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
+        Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),

@@ -42,15 +42,17 @@ def facing(count=4, shape=wall):
 
 def test_exact_views_agree_and_wrong_depths_are_contradicted():
     (one, other, *_), (depth, there, *_) = facing()
-    agreement, against = compare(one, depth, other, there, 0.01)
+    agreement, against, looks = compare(one, depth, other, there, 0.01)
     x = one.rays(torch.float64)[0] * 2  # where each pixel hits the wall, across
     u = other.fx * (x - 0.35) / 2 + other.cx
     covered = (u > 1) & (u < 95)
+    near = (u - 96 * (u > 48)).abs() < 1  # the rim of the picture, within rounding
+    assert torch.equal(looks.bool() | near, ((u >= 0) & (u < 96)) | near) and 0.5 < looks.mean() < 1
     turned = (other.fx * (x + 0.35) / 2 + other.cx > 1) & (other.fx * (x + 0.35) / 2 + other.cx < 95)
     assert (agreement[covered] > 0.99).all() or (agreement[turned] > 0.99).all()
     assert 0.5 < (agreement > 0.99).float().mean() < 1 and not against.any()
     for wrong in (0.7, 1.4):  # before the wall the other sees through it; behind it, this one sees through the wall
-        agreement, against = compare(one, wrong * depth, other, there, 0.01)
+        agreement, against, _ = compare(one, wrong * depth, other, there, 0.01)
         assert not agreement.any() and against.float().mean() > 0.4, wrong
 
 
@@ -58,12 +60,13 @@ def test_what_something_hides_is_not_contradicted():
     """The foot of a wall behind which another view stands: nothing speaks against it."""
     one, other = look_at((0.9, 0.0, 2.0), (0.4, 0.0, 0.0)), look_at((-0.9, 0.0, 2.0), (0.0, 0.0, 0.2))
     depth, there = (torch.from_numpy(seen(camera, box)[0]).float() for camera in (one, other))
-    agreement, against = compare(one, depth, other, there, 0.01)
+    agreement, against, looks = compare(one, depth, other, there, 0.01)
     points = one.rays(torch.float64) * depth.double()
     pose = one.world_to_camera
     world = torch.einsum("ji,jhw->ihw", pose[:3, :3], points - pose[:3, 3][:, None, None])
     hidden = (world[0] > 0.31) & (world[0] < 0.38) & (world[1].abs() < 0.2) & (world[2].abs() < 0.05)
     assert hidden.sum() > 20 and not against[hidden].any() and not agreement[hidden].any()
+    assert looks[hidden].all(), "and yet the other view looks that way"
     assert against.float().mean() < 0.02 and agreement.float().mean() > 0.3
 
 
@@ -112,6 +115,25 @@ def test_what_nobody_else_sees_keeps_a_low_weight_and_what_is_contradicted_none(
     assert not trust[32:38, 44:56].any() and (trust[:20] > 0).all()
     depths_at[1] = torch.zeros(72, 96)
     assert not TRUST.among(1, Depths([*cameras, far], depths_at.__getitem__)).any()
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_places_in_the_pictures_of_too_few_views_are_left_out(count):
+    """By where each pixel hits the wall, and which pictures show that; two views compare with one."""
+    cameras, depths = facing(count)
+    found = replace(TRUST, covered_by=2).among(0, Depths(cameras, depths.__getitem__))
+    pose, rays = cameras[0].world_to_camera, cameras[0].rays(torch.float64)
+    ways = torch.einsum("ji,jhw->ihw", pose[:3, :3], rays)
+    hits = (cameras[0].centre[:, None, None] - ways * (cameras[0].centre[2] / ways[2])).reshape(3, -1).T
+    shown, rim = torch.zeros(len(hits)), torch.zeros(len(hits), dtype=torch.bool)
+    for other in cameras[1:]:
+        u, v, _ = other.project(hits).unbind(1)
+        shown += (u >= 0) & (u < 96) & (v >= 0) & (v < 72)
+        rim |= (u.abs() < 1) | ((u - 96).abs() < 1) | (v.abs() < 1) | ((v - 72).abs() < 1)
+    kept = (found > 0).reshape(-1)
+    assert torch.equal(kept[~rim], (shown >= min(2, count - 1))[~rim]) and 0.3 < kept.float().mean() < 0.95
+    alone = replace(TRUST, covered_by=2).among(0, Depths(cameras[:1], depths.__getitem__))
+    assert (alone == TRUST.alone).all(), "a single view has nobody to compare with"
 
 
 def test_neighbours_look_from_the_wanted_angle_and_see_the_same():

@@ -20,8 +20,9 @@ def triangles(count=300, seed=0):
 
 
 @needs_native
-def test_compiled_and_numpy_agree():
-    vertices, faces = triangles()
+@pytest.mark.parametrize("count", [300, 70_000])  # the second takes more than one piece of work
+def test_compiled_and_numpy_agree(count):
+    vertices, faces = triangles(count)
     vertices[5, 2] = -1
     vertices[9, 0] = np.nan
     depth, face = draw_faces(vertices, faces, 100, 70)
