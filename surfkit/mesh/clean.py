@@ -110,8 +110,10 @@ def clusters(mesh: Mesh, gap: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     ends = np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), near])
     links = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(int(node.max()) + 1,) * 2)
     _, parts = connected_components(links, directed=False)
-    _, labels, sizes = np.unique(parts[a], return_inverse=True, return_counts=True)
-    return labels, sizes
+    part = parts[a]
+    counts = np.bincount(part)
+    used = counts > 0
+    return (np.cumsum(used) - 1)[part], counts[used]
 
 
 def _cells(mesh: Mesh, gap: float) -> tuple[np.ndarray, np.ndarray]:

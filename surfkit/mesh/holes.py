@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from surfkit.mesh.base import Mesh
-from surfkit.scene.sets import distinct, is_among
+from surfkit.scene.sets import is_among
 
 RIM = 0.25
 """Share of the area of a connected part from which what would fill a ring shows that the ring is no hole."""
@@ -23,12 +23,11 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
         most: Edges of a hole; longer rings stay open. So does the rim of a part that is open on one side: what would
             fill it is more than `RIM` of the part.
     """
-    sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
-    known = distinct(sides[:, 0] << 32 | sides[:, 1])
+    known, free = edges(mesh)
     parts = _parts(mesh)
     areas = np.bincount(parts[mesh.faces[:, 0]], _areas(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
     made = []
-    for ring in rings(mesh):
+    for ring in rings(free):
         if 3 <= len(ring) <= most:
             faces = fill(mesh.vertices[ring].astype(np.float64), ring)
             if _areas(mesh.vertices, faces).sum() < RIM * areas[parts[ring[0]]] and not _across(faces, ring, known):
@@ -38,25 +37,48 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
     return replace(mesh, faces=np.concatenate([mesh.faces, *made]).astype(np.int32)), len(made)
 
 
-def rings(mesh: Mesh) -> list[np.ndarray]:
+def edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of a mesh, and those with triangles on one side only.
+
+    Returns:
+        (E,) int64 lower vertex << 32 | higher one, each once and in order; and (B, 2) int64 the vertices of an edge as
+        a triangle passes it, of all triangles of edges that none passes the other way; in the order of the edges.
+    """
+    start, end = mesh.faces[:, [0, 1, 2]].ravel().astype(np.int64), mesh.faces[:, [1, 2, 0]].ravel().astype(np.int64)
+    # One sort for both: the direction is the last bit, and vertices are less than 2^30.
+    passed = np.sort(np.minimum(start, end) << 33 | np.maximum(start, end) << 1 | (start > end))
+    names = passed >> 1
+    first = np.flatnonzero(np.diff(names, prepend=-1))
+    last = np.append(first[1:], len(names)) - 1
+    one_way = (passed[first] & 1) == (passed[last] & 1)
+    counts = last - first + 1
+    found = passed[np.repeat(one_way, counts)]
+    ends = np.stack([found >> 33, found >> 1 & 0xFFFFFFFF], 1)
+    back = (found & 1).astype(bool)
+    ends[back] = ends[back, ::-1]
+    return names[first], ends
+
+
+def rings(free: np.ndarray) -> list[np.ndarray]:
     """Vertices of each closed chain of edges that have one triangle, in the order in which what fills it passes them.
 
     Chains through a vertex where several meet are left out.
+
+    Args:
+        free: (B, 2) such edges, as a triangle passes them.
     """
-    sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    names, back = sides[:, 0] << 32 | sides[:, 1], sides[:, 1] << 32 | sides[:, 0]
-    free = sides[~is_among(names, back)]
     _, at, counts = np.unique(free, return_inverse=True, return_counts=True)
     once = (counts[at.reshape(-1, 2)] == 2).all(1)  # one edge comes, one goes
     return _rings({b: a for a, b in free[once].tolist()})
 
 
 def _across(faces: np.ndarray, ring: np.ndarray, known: np.ndarray) -> bool:
-    """Whether new triangles have an edge, beside those of the ring, that is among the sorted edges of the mesh."""
+    """Whether new triangles have an edge, beside those of the ring, that is among the edges of the mesh, in order."""
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     around = np.sort(np.stack([ring, np.roll(ring, -1)], 1), axis=1)
     names, own = (pairs[:, 0] << 32 | pairs[:, 1] for pairs in (sides, around))
-    return bool(is_among(names[~is_among(names, own)], known).any())
+    names = names[~is_among(names, own)]
+    return bool((known[np.searchsorted(known, names).clip(max=len(known) - 1)] == names).any())
 
 
 def _rings(follows: dict[int, int]) -> list[np.ndarray]:

@@ -5,14 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def distinct(values: np.ndarray) -> np.ndarray:
-    """(D,) the values of an array of any shape, each once, in order."""
-    ordered = np.sort(values, axis=None)
-    first = np.ones(len(ordered), bool)
-    np.not_equal(ordered[1:], ordered[:-1], out=first[1:])
-    return ordered[first]
-
-
 def is_among(values: np.ndarray, others: np.ndarray) -> np.ndarray:
     """(N,) bool, which of (N,) values are among (M,) others."""
     order, ordered = np.argsort(values), np.sort(others)

@@ -7,7 +7,7 @@ from needs import needs
 
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clean
-from surfkit.mesh.holes import close_holes, fill
+from surfkit.mesh.holes import close_holes, edges, fill
 
 trimesh = needs("trimesh")
 
@@ -26,6 +26,16 @@ def sheet(side, hole=()):
     cells = [(i, j) for i in range(side) for j in range(side) if (i, j) not in hole]
     faces = [t for i, j in cells for t in ([at[i, j], at[i + 1, j], at[i + 1, j + 1]], [at[i, j], at[i + 1, j + 1], at[i, j + 1]])]  # fmt: skip  # noqa: E501
     return Mesh(np.stack([x, y, 0 * x], 2).reshape(-1, 3).astype(np.float32), np.array(faces, np.int32))
+
+
+def test_edges_are_those_that_triangles_pass_and_free_where_none_passes_them_back():
+    """Also edges of three triangles, and of two that pass them the same way; by sets of pairs."""
+    faces = np.random.default_rng(0).permuted(np.tile(np.arange(9, dtype=np.int32), (40, 1)), axis=1)[:, :3]
+    passed = [(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)]
+    known, free = edges(Mesh(np.zeros((9, 3), np.float32), faces))
+    assert known.tolist() == sorted({min(pair) << 32 | max(pair) for pair in passed})
+    wanted = sorted(pair for pair in passed if pair[::-1] not in passed)
+    assert sorted(map(tuple, free.tolist())) == wanted and len(set(wanted)) < len(wanted)
 
 
 def area(mesh):
