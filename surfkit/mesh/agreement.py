@@ -46,7 +46,8 @@ class Agreement(Trust):
 
     covered_by: int = 0
     """Number of the compared views that must have a place in their picture, with some depth there: places that fewer
-    look at, as at the rim of a survey, are left out. With fewer compared views, all of them."""
+    look at, as at the rim of a survey, are left out. No more than half of those that look at most of a view, so that
+    photographs with little overlap keep their surface."""
 
     opaque: float = 0.5
     """Minimum alpha of a pixel that counts."""
@@ -106,8 +107,7 @@ class Agreement(Trust):
         camera, depth = depths.cameras[at], depths.read(at)
         agreeing, against = torch.zeros_like(depth), torch.zeros_like(depth)
         looking = torch.zeros_like(depth)
-        others = overlapping(at, depths, self.neighbours, self.angle)
-        for other in others:
+        for other in overlapping(at, depths, self.neighbours, self.angle):
             close, apart, looks = compare(camera, depth, depths.cameras[other], depths.read(other), self.tolerance)
             agreeing += close
             against += apart
@@ -115,8 +115,12 @@ class Agreement(Trust):
         share = agreeing / (agreeing + against).clamp_min(1e-6)
         confirmed = (agreeing / self.enough).clamp_max(1) * share
         unknown = (agreeing == 0) & (against == 0)
-        counts = (depth > 0) & (looking >= min(self.covered_by, len(others)))
+        counts = (depth > 0) & (looking >= self._least_looking(looking[depth > 0]))
         return torch.where(counts, torch.where(unknown, self.alone, confirmed), 0.0)
+
+    def _least_looking(self, looking: Tensor) -> float:
+        """How many views must look at a place of a view, from the (P,) numbers of those that do."""
+        return min(self.covered_by, float((looking.median() / 2).ceil())) if len(looking) else 0
 
 
 def compare(

@@ -117,9 +117,10 @@ def test_what_nobody_else_sees_keeps_a_low_weight_and_what_is_contradicted_none(
     assert not TRUST.among(1, Depths([*cameras, far], depths_at.__getitem__)).any()
 
 
-@pytest.mark.parametrize("count", [2, 4])
-def test_places_in_the_pictures_of_too_few_views_are_left_out(count):
-    """By where each pixel hits the wall, and which pictures show that; two views compare with one."""
+@pytest.mark.parametrize(("count", "least"), [(2, 1), (3, 1), (5, 2)])
+def test_places_in_the_pictures_of_too_few_views_are_left_out(count, least):
+    """By where each pixel hits the wall, and which pictures show that; of views that show little in common, all stays
+    that one other view shows."""
     cameras, depths = facing(count)
     found = replace(TRUST, covered_by=2).among(0, Depths(cameras, depths.__getitem__))
     pose, rays = cameras[0].world_to_camera, cameras[0].rays(torch.float64)
@@ -131,7 +132,7 @@ def test_places_in_the_pictures_of_too_few_views_are_left_out(count):
         shown += (u >= 0) & (u < 96) & (v >= 0) & (v < 72)
         rim |= (u.abs() < 1) | ((u - 96).abs() < 1) | (v.abs() < 1) | ((v - 72).abs() < 1)
     kept = (found > 0).reshape(-1)
-    assert torch.equal(kept[~rim], (shown >= min(2, count - 1))[~rim]) and 0.3 < kept.float().mean() < 0.95
+    assert torch.equal(kept[~rim], (shown >= least)[~rim]) and 0.3 < kept.float().mean() < 0.95
     alone = replace(TRUST, covered_by=2).among(0, Depths(cameras[:1], depths.__getitem__))
     assert (alone == TRUST.alone).all(), "a single view has nobody to compare with"
 
