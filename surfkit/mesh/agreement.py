@@ -45,9 +45,9 @@ class Agreement(Trust):
     """Weight of pixels that no other view can confirm or contradict, as a share of the full one."""
 
     covered_by: int = 0
-    """Number of the compared views on whose pictures a place must fall, hidden or not: places that fewer look at, as at
-    the rim of a survey, are left out. No more than half of those that look at most of a view, so that photographs with
-    little overlap keep their surface."""
+    """Number of the compared views that must have a place in their picture, with some depth there: places that fewer
+    look at, as at the rim of a survey, are left out. No more than half of those that look at most of a view, so that
+    photographs with little overlap keep their surface."""
 
     opaque: float = 0.5
     """Minimum alpha of a pixel that counts."""
@@ -126,7 +126,7 @@ class Agreement(Trust):
 def compare(
     camera: Camera, depth: Tensor, there: Camera, other: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How well another view's depth agrees with each pixel, whether it contradicts, and whether the place falls on it.
+    """How well another view's depth agrees with each pixel, whether it contradicts, and whether it looks there.
 
     The point that a pixel shows is carried into the other view. If what is seen there is as far, they agree; if it is
     further, the other view sees through the point. If it is nearer, it hides the point, unless this view in turn sees
@@ -140,14 +140,13 @@ def compare(
         tolerance: Share of the depth.
 
     Returns:
-        (H, W) agreement from 0 to 1, (H, W) 1 where the other view contradicts, else 0, and (H, W) 1 where the
-        place falls on its picture, hidden or not, else 0.
+        (H, W) agreement from 0 to 1, (H, W) 1 where the other view contradicts, else 0, and (H, W) 1 where it has some
+        depth in the direction of the place, else 0.
     """
     a, b = ray_map(camera, there, depth.device)
     inverse = 1 / depth.clamp_min(1e-20)
     x, y, z = (a[i] + inverse * b[i] for i in range(3))
-    inside = (depth > 0) & (z > 0) & _on_picture(other, x / z, y / z)
-    found = _taken(other, x / z, y / z, inside)
+    found = _taken(other, x / z, y / z, (depth > 0) & (z > 0))
     ratio = found / (z * depth)  # of what is seen there to where the point lies there
     known = found > 0
     off = ((ratio - 1) / tolerance) ** 2
@@ -161,17 +160,12 @@ def compare(
     p, q, r = (eye[i] + (rays[i] * depth - eye[i]) * ratio for i in range(3))
     beyond = _taken(depth, p / r * camera.fx + camera.cx, q / r * camera.fy + camera.cy, hidden & (r > 0))
     looked_through = (beyond > 0) & (beyond > r * (1 + tolerance))
-    return agreement, (seen_through | looked_through).to(depth.dtype), inside.to(depth.dtype)
+    return agreement, (seen_through | looked_through).to(depth.dtype), known.to(depth.dtype)
 
 
 def _taken(values: Tensor, x: Tensor, y: Tensor, where: Tensor) -> Tensor:
     """The values of the pixels that positions fall on; 0 outside of the picture, and where it is not wanted."""
-    inside = where & _on_picture(values, x, y)
+    height, width = values.shape
+    inside = where & (x >= 0) & (x < width) & (y >= 0) & (y < height)
     rows, columns = (torch.where(inside, at, 0.0).long() for at in (y, x))
     return torch.where(inside, values[rows, columns], 0.0)
-
-
-def _on_picture(values: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Which positions, in pixels, lie on a picture."""
-    height, width = values.shape
-    return (x >= 0) & (x < width) & (y >= 0) & (y < height)
