@@ -47,7 +47,7 @@ class Agreement(Trust):
     covered_by: int = 0
     """Number of the compared views that must have a place in their picture, with some depth there: places that fewer
     look at, as at the rim of a survey, are left out. No more than half of those that look at most of a view, so that
-    photographs with little overlap keep their surface."""
+    photographs with little overlap keep their surface. Not for depth with holes, as of stereo alone."""
 
     opaque: float = 0.5
     """Minimum alpha of a pixel that counts."""
