@@ -53,11 +53,11 @@ SURFACE = Recipe(
     mesh=TSDF(truncation_voxels=2.5, least_views=0.05, largest_px=64.0, trust=Agreement(alone=0.5, covered_by=2)),
 )
 
-# The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where nobody
-# would seem to look, and no discs at the rim: the mesh does not end there.
+# The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where
+# nobody would seem to look, and no discs at the rim: the mesh does not end there.
 STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, trust=Agreement(alone=0.5))
 STEREO = Recipe(
-    about="Stereo depth maps alone, fused as recipe:surface fuses but for the rim: no splats, the baseline of any surface",
+    about="Stereo depth maps alone, fused as recipe:surface fuses but for rims: no splats, the baseline of any surface",
     method=StereoFusion(mesher=Stereo(fusion=STEREO_FUSION)),
     depth=SURFACE.depth,
 )
