@@ -55,7 +55,7 @@ SURFACE = Recipe(
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where
 # nobody would seem to look, and no discs at the rim: the mesh does not end there.
-STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, trust=Agreement(alone=0.5))
+STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, trust=replace(SURFACE.mesh.trust, covered_by=0))
 STEREO = Recipe(
     about="Stereo depth maps alone, fused as recipe:surface fuses but for rims: no splats, the baseline of any surface",
     method=StereoFusion(mesher=Stereo(fusion=STEREO_FUSION)),
