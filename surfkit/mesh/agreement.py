@@ -74,11 +74,8 @@ class Agreement(Trust):
             raise BadInput(
                 f"mesh.trust.neighbours is {self.neighbours} and enough {self.enough:g}; give 1 or more and more than 0"
             )
-        if not 0 <= self.covered_by <= self.neighbours:
-            raise BadInput(
-                f"mesh.trust.covered_by is {self.covered_by}; it must be from 0 to {self.neighbours}, the number of "
-                "compared views (mesh.trust.neighbours)"
-            )
+        if self.covered_by < 0:
+            raise BadInput(f"mesh.trust.covered_by is {self.covered_by}; it must be 0 or more, and 0 leaves nothing out")
 
     @property
     def needs_prior(self) -> bool:

@@ -48,6 +48,7 @@ def test_exact_views_agree_and_wrong_depths_are_contradicted():
     covered = (u > 1) & (u < 95)
     near = (u - 96 * (u > 48)).abs() < 1  # the rim of the picture, within rounding
     assert torch.equal(looks.bool() | near, ((u >= 0) & (u < 96)) | near) and 0.5 < looks.mean() < 1
+    assert not compare(one, depth, other, 0 * there, 0.01)[2].any(), "without depth a view does not count"
     turned = (other.fx * (x + 0.35) / 2 + other.cx > 1) & (other.fx * (x + 0.35) / 2 + other.cx < 95)
     assert (agreement[covered] > 0.99).all() or (agreement[turned] > 0.99).all()
     assert 0.5 < (agreement > 0.99).float().mean() < 1 and not against.any()
@@ -228,7 +229,7 @@ def test_every_view_is_drawn_once(tmp_path):
 def test_settings_that_cannot_be_are_refused():
     for wrong in (
         {"tolerance": 0.0}, {"angle": 50.0}, {"alone": 1.5}, {"opaque": -0.1}, {"spread": 2.0}, {"confirmed": 0.5},
-        {"neighbours": 0}, {"enough": 0.0}, {"enough": float("inf")},
+        {"neighbours": 0}, {"enough": 0.0}, {"enough": float("inf")}, {"covered_by": -1},
     ):  # fmt: skip
         with pytest.raises(BadInput, match=f"{next(iter(wrong))} .*(must be|give)"):
             Agreement(**wrong)
