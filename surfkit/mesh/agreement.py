@@ -75,7 +75,7 @@ class Agreement(Trust):
                 f"mesh.trust.neighbours is {self.neighbours} and enough {self.enough:g}; give 1 or more and more than 0"
             )
         if self.covered_by < 0:
-            raise BadInput(f"mesh.trust.covered_by is {self.covered_by}; it must be 0 or more, and 0 leaves nothing out")
+            raise BadInput(f"mesh.trust.covered_by is {self.covered_by}; it must be 0 or more")
 
     @property
     def needs_prior(self) -> bool:

@@ -9,7 +9,7 @@
 namespace surfkit {
 namespace {
 
-constexpr int kBand = 32;          // rows of the picture in one piece of work
+constexpr int kBand = 32;            // rows of the picture in one piece of work
 constexpr int64_t kPiece = 1 << 16;  // faces
 
 // The first pixel whose centre lies at `at` or beyond, and one past the last whose centre lies before it, in [low, high].
