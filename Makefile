@@ -12,9 +12,10 @@ WORKERS ?= logical
 demo: $(VENV)/.installed
 	$(VENV)/bin/surfkit train recipe:surface --scale $(SCALE) --steps $(STEPS) --out $(OUT)
 
-# In a process for each core, four at most, as each takes 1 GB of memory; `WORKERS=0` is in this one.
+# In a process for each core, four at most, as each takes 1 GB of memory; `WORKERS=0` is in this one. One that dies
+# ends the run: pytest-xdist would begin its test again in another, and may wait for ever.
 test: $(VENV)/.installed
-	$(PY) -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile
+	$(PY) -m pytest -n $(WORKERS) --maxprocesses 4 --max-worker-restart 0 --dist loadfile
 
 lint: $(VENV)/.installed
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
