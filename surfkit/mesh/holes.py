@@ -23,14 +23,16 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
         most: Edges of a hole; longer rings stay open. So does the rim of a part that is open on one side: what would
             fill it is more than `RIM` of the part.
     """
+    if most < 3:
+        return mesh, 0
     known, free = edges(mesh)
     parts = _parts(mesh)
-    areas = np.bincount(parts[mesh.faces[:, 0]], _areas(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
+    areas = np.bincount(parts[mesh.faces[:, 0]], areas_of(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
     made = []
     for ring in rings(free):
         if 3 <= len(ring) <= most:
             faces = fill(mesh.vertices[ring].astype(np.float64), ring)
-            if _areas(mesh.vertices, faces).sum() < RIM * areas[parts[ring[0]]] and not _across(faces, ring, known):
+            if areas_of(mesh.vertices, faces).sum() < RIM * areas[parts[ring[0]]] and not _across(faces, ring, known):
                 made.append(faces)
     if not made:
         return mesh, 0
@@ -105,10 +107,11 @@ def _parts(mesh: Mesh) -> np.ndarray:
     return connected_components(links, directed=False)[1]
 
 
-def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) areas."""
-    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+def areas_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) float64 areas, axis by axis: numpy's cross product of rows takes three times as long."""
+    a, b, c = (np.ascontiguousarray(corners) for corners in faces.T)
+    (ux, vx), (uy, vy), (uz, vz) = ((x[b] - x[a], x[c] - x[a]) for x in vertices.T.astype(np.float64, "C"))
+    return np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2) / 2
 
 
 def fill(ring: np.ndarray, names: np.ndarray) -> np.ndarray:

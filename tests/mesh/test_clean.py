@@ -102,6 +102,21 @@ def test_broken_triangles_and_duplicate_vertices_go():
     assert trimesh.Trimesh(kept.vertices, kept.faces, process=False).is_watertight
 
 
+def test_vertices_in_one_place_become_the_first_of_them(rng=np.random.default_rng(7)):
+    soup = rng.integers(-2, 3, (400, 3, 3)).astype(np.float32) * np.float32(0.1)  # few places, so many share one
+    soup[soup == 0] *= rng.choice([-1, 1], (soup == 0).sum()).astype(np.float32)
+    colors = rng.integers(0, 256, (1200, 3)).astype(np.uint8)
+    mesh, _ = clean(Mesh(soup.reshape(-1, 3), np.arange(1200, dtype=np.int32).reshape(-1, 3), colors), 50, 1)
+    first = {}
+    for place, color in zip(soup.reshape(-1, 3).tolist(), colors.tolist(), strict=True):
+        first.setdefault(tuple(place), color)  # 0 and -0 are equal
+    assert len(mesh.vertices) <= len(first) < 200
+    assert len({tuple(place) for place in mesh.vertices.tolist()}) == len(mesh.vertices)
+    assert mesh.colors.tolist() == [first[tuple(place)] for place in mesh.vertices.tolist()]
+    flat = np.linalg.norm(np.cross(soup[:, 1] - soup[:, 0], soup[:, 2] - soup[:, 0]), axis=1) < 1e-6
+    assert np.array_equal(mesh.vertices[mesh.faces], soup[~flat])
+
+
 def test_holes_are_reported():
     vertices, faces = ball()
     assert boundaries(Mesh(vertices, faces)) == (0, 0.0, 0.0)

@@ -1,11 +1,11 @@
 import numpy as np
 
-from surfkit.scene.sets import is_among
+from surfkit.scene.sets import FEW, is_among
 
 
 def test_as_the_sets_of_python() -> None:
     draw = np.random.default_rng(0)
-    for size in (0, 1, 2, 50, 1000):
-        values, others = draw.integers(-20, 20, size), draw.integers(0, 40, size // 2)
+    for size in (0, 1, 2, 50, 1000, 4 * FEW):
+        values, others = draw.integers(-size, size, size), draw.integers(0, size + 1, size // 2)
         assert is_among(values, others).tolist() == [value in set(others.tolist()) for value in values.tolist()]
         assert is_among(others, values).tolist() == [value in set(values.tolist()) for value in others.tolist()]
