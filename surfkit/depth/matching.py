@@ -76,11 +76,16 @@ def ray_map(here: Camera, there: Camera, device: torch.device) -> tuple[Tensor, 
 
     The first two components over the third are pixels there, and the third over c is the depth there.
     """
+    turn, b = ray_way(here, there)
+    a = torch.einsum("ij,jhw->ihw", turn, here.rays(torch.float64))
+    return a.to(device, torch.float32), b.to(device, torch.float32)
+
+
+def ray_way(here: Camera, there: Camera) -> tuple[Tensor, Tensor]:
+    """(3, 3) A and (3,) b, float64: a of `ray_map` is A r for the ray r of a pixel, as `Camera.rays` has it."""
     turn = there.world_to_camera @ torch.linalg.inv(here.world_to_camera)
     lens = torch.tensor([[there.fx, 0, there.cx], [0, there.fy, there.cy], [0, 0, 1]], dtype=torch.float64)
-    rays = here.rays(torch.float64)
-    a = torch.einsum("ij,jhw->ihw", lens @ turn[:3, :3], rays)
-    return a.to(device, torch.float32), (lens @ turn[:3, 3]).to(device, torch.float32)
+    return lens @ turn[:3, :3], lens @ turn[:3, 3]
 
 
 def _warp(here: Camera, other: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:

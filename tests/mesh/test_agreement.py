@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.mesh import native, tsdf
-from surfkit.mesh.agreement import Agreement, compare
+from surfkit.mesh.agreement import Agreement, compare, compare_in_torch
 from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
@@ -69,6 +70,26 @@ def test_what_something_hides_is_not_contradicted():
     assert hidden.sum() > 20 and not against[hidden].any() and not agreement[hidden].any()
     assert looks[hidden].all(), "and yet the other view looks that way"
     assert against.float().mean() < 0.02 and agreement.float().mean() > 0.3
+
+
+@needs_native
+@pytest.mark.parametrize("tolerance", [0.01, 0.1])
+def test_compiled_comparison_is_that_in_torch(tolerance, rng=np.random.default_rng(3)):
+    cameras = [look_at((0.9, 0.0, 2.0), (0.4, 0.0, 0.0)), look_at((-0.9, 0.3, 2.0), (0.0, 0.0, 0.2))]
+    cameras += [replace(cameras[1].resized(50, 41), cy=30.0), look_at((0.4, 0.0, -1.0), (0.4, 0.1, 0.0))]  # from below
+    depths = [torch.from_numpy(seen(camera, box)[0]).float() for camera in cameras]
+    for depth in depths:
+        depth *= torch.from_numpy(rng.choice([0, 0.7, 0.95, 1, 1, 1.02, 1.5], depth.shape)).float()
+    found = [
+        (compare(one, depth, other, there, tolerance), compare_in_torch(one, depth, other, there, tolerance))
+        for one, depth in zip(cameras, depths, strict=True)
+        for other, there in zip(cameras, depths, strict=True)
+    ]
+    ours, expected = (
+        torch.cat([torch.stack(each).flatten(1) for each in all_of], 1) for all_of in zip(*found, strict=True)
+    )
+    assert (expected > 0).float().mean(1).min() > 0.02 and (expected == 0).float().mean(1).min() > 0.3
+    assert ((ours - expected).abs() < 1e-4).all(0).float().mean() > 0.999, "but where rounding takes another pixel"
 
 
 def with_maps(cameras, depths):

@@ -11,6 +11,7 @@
 #include <string>
 
 #include "../../native/pool.h"
+#include "agree.h"
 #include "grid.h"
 #include "shade.h"
 
@@ -25,6 +26,7 @@ using Table = nb::ndarray<const int8_t, nb::c_contig, nb::device::cpu>;
 using Whole = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
 using Keys = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
 using Bytes = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
+using Made = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 
 template <class T>
 nb::ndarray<nb::numpy, T> given(std::vector<T>&& values, std::vector<size_t> shape) {
@@ -46,6 +48,10 @@ Pose pose_of(const std::vector<double>& m) {  // 4 x 4 by rows
             {m.at(3), m.at(7), m.at(11)}};
 }
 
+Lens lens_of(const Floats& depth, const std::vector<double>& l) {
+    return {(int)depth.shape(1), (int)depth.shape(0), (float)l.at(0), (float)l.at(1), (float)l.at(2), (float)l.at(3)};
+}
+
 }  // namespace
 
 void add_mesh(nb::module_& m) {
@@ -59,8 +65,7 @@ void add_mesh(nb::module_& m) {
                  FuseJob job;
                  job.depth = depth.data();
                  job.shade = shade.data();
-                 job.lens = {(int)depth.shape(1), (int)depth.shape(0), (float)lens.at(0),
-                             (float)lens.at(1),   (float)lens.at(2),   (float)lens.at(3)};
+                 job.lens = lens_of(depth, lens);
                  std::memcpy(job.offsets, offsets.data(), sizeof job.offsets);
                  job.band = {(float)lengths.at(0), (float)lengths.at(1), (float)lengths.at(2)};
                  const Pose p = pose_of(pose);
@@ -121,12 +126,24 @@ void add_mesh(nb::module_& m) {
         },
         nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
         nb::arg("shade"), nb::arg("kernels"), nb::arg("threads"));
-    m.def("draw_faces", [](Floats vertices, Whole faces, nb::ndarray<float, nb::c_contig, nb::device::cpu> depth,
+    m.def("draw_faces", [](Floats vertices, Whole faces, Made depth,
                            nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
         FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),
                     (int)depth.shape(1), (int)depth.shape(0)};
         nb::gil_scoped_release free;
         draw_faces(job, threads);
+    });
+    m.def("compare_depths", [](Floats depth, Floats other, std::vector<double> lens, std::vector<double> way,
+                               std::vector<double> eye, double tolerance, Made agreement, Made against, Made looks,
+                               int threads) {
+        AgreeJob job{depth.data(), other.data(), (int)other.shape(1), (int)other.shape(0)};
+        job.lens = lens_of(depth, lens);
+        for (int i = 0; i < 3; i++) job.eye[i] = (float)eye.at(i);
+        job.tolerance = (float)tolerance;
+        job.agreement = agreement.data(), job.against = against.data(), job.looks = looks.data();
+        for (int i = 0; i < 12; i++) job.way[i] = way.at(i);
+        nb::gil_scoped_release free;
+        parallel(job.lens.height, threads, [&](int64_t row) { agree(job, (int)row); });
     });
 }
 
