@@ -28,7 +28,7 @@ from surfkit.scene.camera import Camera
 
 TILES = ".tiles-*"
 """Pattern of the names of folders with the depth maps of the views."""
-PIXEL_BYTES = 8
+PIXEL_BYTES = 12
 """Bytes per pixel of a view on disk."""
 Made = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices, faces, colours."""
@@ -202,12 +202,12 @@ def spooled(task: Task) -> Iterator[Task]:
         for at in range(len(task.cameras)):
             seen = task.see(at)
             with (folder / f"{at}.npy").open("wb") as file:
-                write_array(file, np.stack([seen.depth.view(np.uint32), seen.shade]))
+                write_array(file, np.stack([seen.depth.view(np.uint32), seen.shade, seen.slants.view(np.uint32)]))
             emit(Progress("drawing views", at + 1, len(task.cameras)))
 
         def read(at: int) -> Picture:
-            depth, shade = np.load(folder / f"{at}.npy")
-            return Picture(depth.view(np.float32), shade, task.cameras[at])
+            depth, shade, slant = np.load(folder / f"{at}.npy")
+            return Picture(depth.view(np.float32), shade, task.cameras[at], slant.view(np.float32))
 
         if task.compare is not None:
             compare(task, folder)

@@ -16,6 +16,8 @@ FULL = 32
 """Weight of a pixel that looks straight at a surface and is no larger than a voxel."""
 REACH = 1.5
 """Blocks are made where a surface is nearer than this, in voxels, along any axis: cells around it must be whole."""
+LEAST_SLANT = 0.6
+"""Least slant of a pixel: where it shows a surface from the side, its normal says little about what lies behind."""
 JUMP = 2.0
 """Depths of neighbouring pixels further apart than this, in voxels, do not belong to one surface."""
 FADE = 1.0
@@ -66,11 +68,19 @@ class Picture:
         shade: (H, W) uint32, from the lowest byte up red, green, blue and a weight of up to `FULL`, or more where
             it is trusted more.
         camera: Of the view.
+        slant: (H, W) float32 distance from the plane that a pixel shows, for each unit of depth before or behind it:
+            less than 1 where the surface is seen at an angle. None: 1.
     """
 
     depth: np.ndarray
     shade: np.ndarray
     camera: Camera
+    slant: np.ndarray | None = None
+
+    @property
+    def slants(self) -> np.ndarray:
+        """The slant of every pixel."""
+        return np.ones(self.depth.shape, np.float32) if self.slant is None else self.slant
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ PIXELS = 1.0
 """Automatic voxels are this many pixels wide, at the median depth of the median view, or larger: see tsdf.py."""
 DEPTHS = 2.0
 """Automatic limit of the depth, in median depths."""
+LEAST_CUT = 1.75
+"""Least truncation, voxels: the corners of a cell lie up to the root of three from a plane through it."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,10 @@ def resolve(
         given[2] = given[2] or DEPTHS * depth
     size, cut, far = given
     cut = cut or truncation_voxels * size
-    if cut < 2 * size:
+    if cut < LEAST_CUT * size:
         raise BadInput(
             f"mesh.truncation is {with_unit(cut, subject.frame)} with voxels of {with_unit(size, subject.frame)}; "
-            "it must be at least two voxels"
+            f"it must be at least {LEAST_CUT:g} voxels"
         )
     return Lengths(size, cut, far)
 

@@ -32,6 +32,7 @@ class NativeGrid(HostGrid):
         camera = picture.camera
         return self.native.fuse(
             np.ascontiguousarray(picture.depth, np.float32),
+            np.ascontiguousarray(picture.slants, np.float32),
             np.ascontiguousarray(picture.shade, np.uint32),
             camera.world_to_camera.flatten().tolist(),
             [camera.fx, camera.fy, camera.cx, camera.cy],

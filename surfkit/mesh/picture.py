@@ -1,4 +1,4 @@
-"""From the maps of a view to what is fused: one depth a pixel, a colour, and how far both are to be trusted."""
+"""From the maps of a view to what is fused: depth, slant and colour of each pixel, and how far they are trusted."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.mesh.lattice import FULL, Picture
+from surfkit.mesh.lattice import FULL, LEAST_SLANT, Picture
 from surfkit.native import module
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -42,34 +42,38 @@ def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float) -> Picture:
     planes = [None if plane is None else plane.float().contiguous().numpy() for plane in (maps.color, maps.normal)]
     near, plain = voxel * min(camera.fx, camera.fy), depth.float().contiguous().numpy()
     if module() is None:
-        return Picture(plain, shade(plain, planes[0], planes[1], camera, near), camera)
-    made = np.empty(plain.shape, np.uint32)
+        made, slant = shade(plain, planes[0], planes[1], camera, near)
+        return Picture(plain, made, camera, slant)
+    made, slant = np.empty(plain.shape, np.uint32), np.empty(plain.shape, F)
     lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-    module().shade(plain, *planes, lens, near, made, module().kernels_in_use(), torch.get_num_threads())
-    return Picture(plain, made, camera)
+    module().shade(plain, *planes, lens, near, made, slant, module().kernels_in_use(), torch.get_num_threads())
+    return Picture(plain, made, camera, slant)
 
 
-def shade(depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camera: Camera, near: float) -> np.ndarray:
-    """(H, W) uint32 colours and weights in numpy, with the bits of surfkit/mesh/cpu.
+def shade(
+    depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camera: Camera, near: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) uint32 colours and weights, and (H, W) float32 slants, in numpy, with the bits of surfkit/mesh/cpu.
 
     `near` is the depth at which a pixel is as large as a voxel.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         share = F(near) / np.maximum(depth, F(1e-20))
         size = np.minimum(share, F(1))
-        upright = F(1)
+        upright, slant = F(1), np.ones_like(depth)
         if normal is not None:
             x = (np.arange(depth.shape[1], dtype=F) + F(0.5) - F(camera.cx)) / F(camera.fx)
             y = ((np.arange(depth.shape[0], dtype=F) + F(0.5) - F(camera.cy)) / F(camera.fy))[:, None]
             along = -(normal[0] * x + normal[1] * y + normal[2])
             squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+            slant = np.fmax(along / np.fmax(np.sqrt(squares), F(1e-10)), F(LEAST_SLANT))
             length = np.sqrt(squares * (x * x + y * y + F(1)))
             upright = np.fmax(np.fmin(along / np.fmax(length, F(1e-10)), F(1)), F(0))
         weight = size * size * upright
         whole = np.maximum((weight * F(FULL) + F(0.5)).astype(np.uint32), 1)
         planes = (np.fmin(np.fmax(color, F(0)), F(1)) * F(255) + F(0.5)).astype(np.uint32)
     counted = np.where((weight > 0) & (depth > 0), whole, 0).astype(np.uint32)
-    return planes[0] | planes[1] << np.uint32(8) | planes[2] << np.uint32(16) | counted << np.uint32(24)
+    return planes[0] | planes[1] << np.uint32(8) | planes[2] << np.uint32(16) | counted << np.uint32(24), slant
 
 
 def weighed(shade: np.ndarray, trust: np.ndarray) -> np.ndarray:

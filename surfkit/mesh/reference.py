@@ -92,7 +92,7 @@ class ReferenceGrid(HostGrid):
         u, v = np.where(inside, u, F(0)), np.where(inside, v, F(0))
         here = v.astype(np.int32), u.astype(np.int32)
         depth, shade = sample(picture.depth, u, v, jump), picture.shade[here]
-        sdf = depth - z
+        sdf = (depth - z) * picture.slants[here]
         fall = (truncation + sdf) * (F(1) / (truncation - fade))
         trust = np.where(inside & (depth > 0) & (sdf > -truncation), np.where(sdf < -fade, fall, F(1)), F(0))
         added = ((shade >> 24).astype(F) * trust + F(0.5)).astype(np.int32).astype(F)

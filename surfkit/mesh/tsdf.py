@@ -16,7 +16,7 @@ from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.cuda import grid as gpu
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import Lengths, resolve, with_unit
+from surfkit.mesh.lengths import LEAST_CUT, Lengths, resolve, with_unit
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
@@ -32,7 +32,11 @@ AUTO_TRIANGLES = 15_000_000
 
 @dataclass(frozen=True)
 class TSDF(Mesher):
-    """Fuse the depth of every training view into a grid of signed distances (Curless and Levoy 1996; KinectFusion)."""
+    """Fuse the depth of every training view into a grid of signed distances (Curless and Levoy 1996; KinectFusion).
+
+    Distances are to the plane that a pixel shows, by its normal (projective point-to-plane, Bylow et al. 2013): along
+    the ray, a surface seen from the side would be a thin shell with holes.
+    """
 
     voxel: Length = "auto"
     """Voxel size, metres; auto is the size of one pixel at the median depth, larger where there would be more than
@@ -73,8 +77,10 @@ class TSDF(Mesher):
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
             check_length(f"mesh.{name}", getattr(self, name))
-        if not 2 <= self.truncation_voxels <= 100:
-            raise BadInput(f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from 2 to 100")
+        if not LEAST_CUT <= self.truncation_voxels <= 100:
+            raise BadInput(
+                f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from {LEAST_CUT:g} to 100"
+            )
         if not 0 <= self.largest_px < float("inf"):
             raise BadInput(f"mesh.largest_px is {self.largest_px:g}; it must be 0 or more")
         if not 0 <= self.floaters <= 1000:
@@ -162,7 +168,7 @@ class TSDF(Mesher):
         while self.voxel == "auto" and found.total > most:
             coarser = lengths.voxel * max(1.05, (found.total / most) ** 0.5)
             auto = self.truncation == "auto"
-            cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, 2 * coarser)
+            cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, LEAST_CUT * coarser)
             lengths = Lengths(coarser, cut, lengths.limit)
             found = estimate(subject.splats, coarser, within)
         refuse_too_fine(lengths, subject, np.abs(within).max())

@@ -50,11 +50,14 @@ inline Place place(const Lens& lens, float x, float y, float z) {
 }
 
 // Whether a voxel that sees `depth` may lie before the end of the band, and whether in it. Interpolation changes a depth
-// by no more than the jump, so it moves nothing that lies further in front of or behind the band.
-inline int may_count(const Band& band, float depth, float z) {
-    return (depth > 0 ? 1 : 0) & (depth - z > -(band.truncation + band.jump) ? 1 : 0);
+// by no more than the jump, so it moves nothing that lies further in front of or behind the band. `slant`: distance from
+// the plane of the pixel for each unit of depth.
+inline int may_count(const Band& band, float depth, float z, float slant) {
+    return (depth > 0 ? 1 : 0) & ((depth - z + band.jump) * slant > -band.truncation ? 1 : 0);
 }
-inline int may_be_near(const Band& band, float depth, float z) { return depth - z < band.truncation + band.jump ? 1 : 0; }
+inline int may_be_near(const Band& band, float depth, float z, float slant) {
+    return (depth - z - band.jump) * slant < band.truncation ? 1 : 0;
+}
 
 // The depth between four pixels; `own`, that of the nearest one, where they do not lie on one surface.
 inline float between(const Band& band, float a, float b, float c, float d, float at_x, float at_y, float own) {
@@ -67,17 +70,17 @@ inline float between(const Band& band, float a, float b, float c, float d, float
 }
 
 // The weight that a view adds: that of its shade, less behind the surface, and none beyond the band.
-inline float added_weight(const Band& band, int inside, float depth, float z, unsigned shade) {
-    const float sdf = depth - z;
+inline float added_weight(const Band& band, int inside, float depth, float z, float slant, unsigned shade) {
+    const float sdf = (depth - z) * slant;
     const float fall = (band.truncation + sdf) * (1.0f / (band.truncation - band.fade));
     const float trust = sdf < -band.fade ? fall : 1.0f;
     const int near = inside & (depth > 0) & (sdf > -band.truncation);
     return (float)(int)((float)(int)(shade >> 24) * (near ? trust : 0.0f) + 0.5f);
 }
 
-// The distance that a view sees, in 1/32767 of the truncation.
-inline float seen_distance(const Band& band, float depth, float z) {
-    const float scaled = (depth - z) * (1.0f / band.truncation);
+// The distance from the plane that a view sees, in 1/32767 of the truncation.
+inline float seen_distance(const Band& band, float depth, float z, float slant) {
+    const float scaled = (depth - z) * slant * (1.0f / band.truncation);
     return (scaled < 1.0f ? scaled : 1.0f) * kSteps;
 }
 

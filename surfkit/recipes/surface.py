@@ -47,10 +47,11 @@ SURFACE = Recipe(
         rates=RATES,
         update="in-view",
     ),
-    # Depth that other views confirm is averaged over less: neither side of a wall takes from the other. Splats begin
-    # two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh ends where
-    # fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right than not.
-    mesh=TSDF(truncation_voxels=2.5, least_views=0.05, largest_px=64.0, trust=Agreement(alone=0.5, covered_by=2)),
+    # Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
+    # Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
+    # ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
+    # than not.
+    mesh=TSDF(truncation_voxels=1.75, least_views=0.05, largest_px=64.0, trust=Agreement(alone=0.5, covered_by=2)),
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where

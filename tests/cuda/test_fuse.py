@@ -29,7 +29,8 @@ def pictures(cameras, shape, seed=0):
     for camera in cameras:
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
-        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera)
+        slant = draw.uniform(0.5, 1.3, depth.shape).astype(np.float32)
+        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 
 def contents(grid):
@@ -194,7 +195,7 @@ MISTAKES = {
     "no barrier": ("__syncthreads();", "", 0, "of the block has written|with no barrier"),
     "one voxel too many": ("voxel < kVoxels", "voxel <= kVoxels", 0, "wrong|index .* which has|another block"),
     "outside of the picture": ("if (!p.inside) continue;", "", 0, "wrong"),
-    "no neighbours": ("if (may_be_near(view.band, d, p.z))", "if (false)", 0, "wrong"),
+    "no neighbours": ("if (may_be_near(view.band, d, p.z, steep))", "if (false)", 0, "wrong"),
     "blocks of another chunk": ("row - begin", "row", 0, "index .* which has"),
     "colours of another block": ("(3 * block + channel)", "(block + channel)", 0, "another block|wrong"),
 }

@@ -23,7 +23,8 @@ def pictures(cameras, shape, seed=0):
     for camera in cameras:
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
-        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera)
+        slant = draw.uniform(0.5, 1.3, depth.shape).astype(np.float32)
+        yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 
 def fused(kind, views, carve=False, **lattice):

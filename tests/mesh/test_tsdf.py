@@ -11,11 +11,15 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh import fusion, native, tsdf
+from surfkit.mesh.lattice import Lattice
+from surfkit.mesh.lengths import LEAST_CUT
+from surfkit.mesh.picture import depth_of, picture
+from surfkit.mesh.reference import ReferenceGrid, unpack
 from surfkit.mesh.tiles import Box
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
 
-from .shapes import around, maps_of, slope, sphere, subject, torus
+from .shapes import around, look_at, maps_of, slope, sphere, subject, torus
 
 trimesh = needs("trimesh")
 
@@ -92,8 +96,6 @@ def test_values_that_are_not_finite_are_no_depth():
 
 
 def test_a_pixel_counts_by_its_angle_and_its_size():
-    from surfkit.mesh.picture import depth_of, picture
-
     camera = around(1)[0]
     depth = torch.full((72, 96), 2.0)
     toward = -torch.nn.functional.normalize(camera.rays(), dim=0)
@@ -195,7 +197,7 @@ def test_what_cannot_be_meshed_is_said():
         TSDF(voxel=0.003).mesh(replace(given, budget_bytes=200_000_000))
     with pytest.raises(BadInput, match="too small for a scene of .* m; give .* m or more"):
         TSDF(voxel=1e-5, depth_limit=100.0).mesh(given)
-    with pytest.raises(BadInput, match="truncation is 1 m with voxels of 1 m.*two voxels"):
+    with pytest.raises(BadInput, match="truncation is 1 m with voxels of 1 m.*1.75 voxels"):
         TSDF(voxel=1.0, truncation=1.0).mesh(given)
     with pytest.raises(BadInput, match="1 MB are too little"):
         TSDF().mesh(replace(given, budget_bytes=1_000_000))
@@ -212,19 +214,55 @@ def test_what_cannot_be_meshed_is_said():
             TSDF(**wrong)
 
 
+def test_distances_are_to_the_plane_that_a_pixel_shows():
+    """The ground z = 0 seen at 45 degrees: along the rays it would be up to 1.8 times as far."""
+    camera = look_at((1.0, 0.1, 1.0), (0.0, 0.1001, 0.0))
+    maps = maps_of(camera, lambda points: points[..., 2])
+    found = picture(maps.median, maps, camera, 0.02)
+    off = []
+    for some in (found, replace(found, slant=None)):
+        grid = ReferenceGrid(Lattice(0.02, 0.08))
+        assert grid.fuse(some, True)
+        at = np.indices((8, 8, 8)).reshape(3, -1)[::-1].T + 8 * unpack(grid.keys)[:, None]
+        height, distance = 0.02 * at[..., 2], grid.distance / 32767 * 0.08
+        beside = np.linalg.norm(0.02 * at[..., :2] - [0, 0.1], axis=-1)
+        sure = (grid.weight > 0) & (np.abs(height) < 0.05) & (beside < 0.2)
+        assert sure.sum() > 1000 and (height[sure] < -0.03).any()
+        off.append(np.abs(distance - height)[sure])
+    assert off[0].max() < 0.0008 and np.median(off[1]) > 0.004
+
+
+def test_a_surface_seen_from_the_side_has_no_holes():
+    """With the least truncation, the shell behind the ground is thinner along the rays than a cell is wide."""
+    camera = look_at((1.6, 0.1, 1.0), (0.0, 0.1001, 0.0))
+    maps = maps_of(camera, lambda points: points[..., 2])
+    found, places = picture(maps.median, maps, camera, 0.03), []
+    for some in (found, replace(found, slant=None)):
+        grid = ReferenceGrid(Lattice(0.03, LEAST_CUT * 0.03))
+        assert grid.fuse(some, True)
+        piece = grid.surface(1)
+        middles = piece.vertices[piece.faces].mean(1)
+        near = np.linalg.norm(middles[:, :2] - [0, 0.1], axis=1) < 0.3
+        corners = piece.vertices[piece.faces[near]].astype(np.float64)
+        places.append(
+            np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+        )
+    assert places[0] == pytest.approx(np.pi * 0.3**2, rel=0.03) and places[1] < 0.9 * places[0]
+
+
 @needs_native
 def test_compiled_shades_are_those_of_numpy(monkeypatch):
-    from surfkit.mesh import picture
-
     maps, camera = maps_of(around(1)[0], sphere), around(1)[0]
     noisy = replace(maps, color=maps.color + torch.randn(3, 72, 96), normal=maps.normal + 0.3 * torch.randn(3, 72, 96))
     noisy.color[0, 3, 4], noisy.normal[:, 36, 50] = torch.nan, 0
     for some in (noisy, replace(noisy, normal=None)):
-        one = picture.picture(maps.depth, some, camera, 0.015).shade
-        monkeypatch.setattr(picture, "module", lambda: None)
-        other = picture.picture(maps.depth, some, camera, 0.015).shade
+        one = picture(maps.depth, some, camera, 0.015)
+        monkeypatch.setattr("surfkit.mesh.picture.module", lambda: None)
+        other = picture(maps.depth, some, camera, 0.015)
         monkeypatch.undo()
-        assert np.array_equal(one, other) and len(np.unique(one >> 24)) > 5
+        assert np.array_equal(one.shade, other.shade) and len(np.unique(one.shade >> 24)) > 5
+        assert np.array_equal(one.slants, other.slants) and one.slants.dtype == np.float32
+        assert (one.slants == 1).all() if some.normal is None else 0.6 == pytest.approx(one.slants.min())
 
 
 def test_one_view_alone_counts_if_it_may():

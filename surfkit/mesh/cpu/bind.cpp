@@ -60,10 +60,11 @@ void add_mesh(nb::module_& m) {
              [](Grid* self, double voxel, double reach, std::vector<int64_t> low, std::vector<int64_t> high,
                 int64_t most_blocks) { new (self) Grid(voxel, reach, &low.at(0), &high.at(0), most_blocks); })
         .def("fuse",
-             [](Grid& self, Floats depth, Words shade, std::vector<double> pose, std::vector<double> lens,
+             [](Grid& self, Floats depth, Floats slant, Words shade, std::vector<double> pose, std::vector<double> lens,
                 Floats offsets, std::vector<double> lengths, bool carve, const std::string& kernels, int threads) {
                  FuseJob job;
                  job.depth = depth.data();
+                 job.slant = slant.data();
                  job.shade = shade.data();
                  job.lens = lens_of(depth, lens);
                  std::memcpy(job.offsets, offsets.data(), sizeof job.offsets);
@@ -110,22 +111,23 @@ void add_mesh(nb::module_& m) {
     m.def(
         "shade",
         [](Floats depth, Floats color, std::optional<Floats> normal, std::vector<double> lens, double near,
-           nb::ndarray<uint32_t, nb::c_contig, nb::device::cpu> shade, const std::string& kernels, int threads) {
+           nb::ndarray<uint32_t, nb::c_contig, nb::device::cpu> shade, Made slant, const std::string& kernels, int threads) {
             ShadeJob job{depth.data(),         color.data(),          normal ? normal->data() : nullptr,
                          (int)depth.shape(1),  (int)depth.shape(0),   (float)lens.at(0),
                          (float)lens.at(1),    (float)lens.at(2),     (float)lens.at(3),
                          (float)near};
             uint32_t* out = shade.data();
+            float* slants = slant.data();
             const FuseKernels& k = named(kernels);
             const int rows = 16;
             nb::gil_scoped_release free;
             parallel((job.height + rows - 1) / rows, threads, [&](int64_t piece) {
                 for (int row = (int)piece * rows; row < std::min(job.height, (int)(piece + 1) * rows); row++)
-                    k.shade(job, row, out + (int64_t)row * job.width);
+                    k.shade(job, row, out + (int64_t)row * job.width, slants + (int64_t)row * job.width);
             });
         },
         nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
-        nb::arg("shade"), nb::arg("kernels"), nb::arg("threads"));
+        nb::arg("shade"), nb::arg("slant"), nb::arg("kernels"), nb::arg("threads"));
     m.def("draw_faces", [](Floats vertices, Whole faces, Made depth,
                            nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
         FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),

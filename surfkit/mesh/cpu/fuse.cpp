@@ -13,7 +13,7 @@ namespace {
 constexpr int kLayer = kSide * kSide;
 
 struct Samples {
-    alignas(64) float z[kLayer], at_x[kLayer], at_y[kLayer], depth[kLayer];
+    alignas(64) float z[kLayer], at_x[kLayer], at_y[kLayer], depth[kLayer], slant[kLayer];
     alignas(64) float corner[4][kLayer];
     alignas(64) int32_t pixel[kLayer], left[kLayer], right[kLayer], above[kLayer], below[kLayer];
     alignas(64) uint32_t shade[kLayer];
@@ -44,12 +44,13 @@ inline bool project(const FuseJob& job, const float* first, int layer, Samples& 
 // The depth of the pixel that each voxel falls on. Neighbours are asked only where they can matter.
 inline void gather(const FuseJob& job, Samples& s, bool& some, bool& close) {
     for (int i = 0; i < kLayer; i++) s.depth[i] = job.depth[s.pixel[i]];
+    for (int i = 0; i < kLayer; i++) s.slant[i] = job.slant[s.pixel[i]];
     int32_t before = 0, near = 0;
     for (int i = 0; i < kLayer; i++) {
-        const int32_t counts = s.inside[i] & may_count(job.band, s.depth[i], s.z[i]);
+        const int32_t counts = s.inside[i] & may_count(job.band, s.depth[i], s.z[i], s.slant[i]);
         s.inside[i] = counts;
         before |= counts;
-        near |= counts & may_be_near(job.band, s.depth[i], s.z[i]);
+        near |= counts & may_be_near(job.band, s.depth[i], s.z[i], s.slant[i]);
     }
     some = before != 0;
     close = near != 0;
@@ -87,10 +88,10 @@ void fuse_block(const FuseJob& job, const float* first, uint32_t seed, Block& bl
         uint16_t* const w = block.weight + layer * kLayer;
         for (int i = 0; i < kLayer; i++) {
             const float before = (float)w[i];
-            const float added = added_weight(job.band, s.inside[i], s.depth[i], s.z[i], s.shade[i]);
+            const float added = added_weight(job.band, s.inside[i], s.depth[i], s.z[i], s.slant[i], s.shade[i]);
             const Shares shared = shares(before, added);
             changed[i] = added > 0 ? 1 : 0;
-            distance[i] = seen_distance(job.band, s.depth[i], s.z[i]);
+            distance[i] = seen_distance(job.band, s.depth[i], s.z[i], s.slant[i]);
             share[i] = shared.distance;
             color_share[i] = shared.color;
             weight[i] = shared.weight;
@@ -150,7 +151,7 @@ inline uint32_t byte_of(float x) {
     return (uint32_t)(int32_t)(clamped * 255.0f + 0.5f);
 }
 
-void shade_row(const ShadeJob& job, int row, uint32_t* shade) {
+void shade_row(const ShadeJob& job, int row, uint32_t* shade, float* slant) {
     const int64_t plane = (int64_t)job.width * job.height, from = (int64_t)row * job.width;
     const float *d = job.depth + from, *r = job.color + from, *g = r + plane, *b = g + plane;
     const float ray_y = ((float)row + 0.5f - job.cy) / job.fy;
@@ -160,7 +161,10 @@ void shade_row(const ShadeJob& job, int row, uint32_t* shade) {
         const float share = job.near / (d[i] > 1e-20f ? d[i] : 1e-20f), size = share < 1 ? share : 1.0f;
         const float ray_x = ((float)i + 0.5f - job.cx) / job.fx;
         const float along = -(nx[i] * ray_x + ny[i] * ray_y + nz[i]);
-        const float square = (nx[i] * nx[i] + ny[i] * ny[i] + nz[i] * nz[i]) * (ray_x * ray_x + ray_y * ray_y + 1.0f);
+        const float normal = nx[i] * nx[i] + ny[i] * ny[i] + nz[i] * nz[i], unit = __builtin_sqrtf(normal);
+        const float steep = along / (unit > 1e-10f ? unit : 1e-10f);
+        slant[i] = turned ? (steep > kLeastSlant ? steep : kLeastSlant) : 1.0f;
+        const float square = normal * (ray_x * ray_x + ray_y * ray_y + 1.0f);
         const float length = __builtin_sqrtf(square), cosine = along / (length > 1e-10f ? length : 1e-10f);
         const float upright = turned ? (cosine < 1 ? cosine : 1.0f) : 1.0f;
         const float weight = size * size * (upright > 0 ? upright : 0.0f);

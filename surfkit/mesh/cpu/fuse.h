@@ -17,6 +17,7 @@ struct alignas(64) Block {
 
 struct FuseJob {
     const float* depth;      // (height, width) camera z, 0 for none
+    const float* slant;      // (height, width) distance from the plane of the surface for each unit of depth
     const uint32_t* shade;   // (height, width) red, green, blue, weight from the lowest byte up
     Lens lens;
     float offsets[3][kVoxels];  // camera coordinates of each voxel less those of the first
@@ -36,8 +37,9 @@ struct RowJob {
 };
 
 constexpr float kFullWeight = 32;
+constexpr float kLeastSlant = 0.6f;
 
-// The maps of a view, from which the shade of its pixels is made.
+// The maps of a view, from which the shade and the slant of its pixels are made.
 struct ShadeJob {
     const float *depth, *color, *normal;  // (height, width), (3, height, width), the same or null
     int width, height;
@@ -49,8 +51,8 @@ struct FuseKernels {
     void (*block)(const FuseJob& job, const float* first, uint32_t seed, Block& block);
     // Keys of the first and the last block within reach of what each pixel shows; kNoKey for none.
     void (*row)(const RowJob& job, uint64_t* low, uint64_t* high);
-    // Colour and weight of a row of pixels.
-    void (*shade)(const ShadeJob& job, int row, uint32_t* shade);
+    // Colour and weight, and the slant, of a row of pixels.
+    void (*shade)(const ShadeJob& job, int row, uint32_t* shade, float* slant);
 };
 
 const FuseKernels& fuse_kernels_baseline();

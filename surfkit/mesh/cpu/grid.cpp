@@ -168,7 +168,7 @@ std::vector<int64_t> Grid::in_sight(const FuseJob& job, const Pose& pose, int th
                 at[row] = r[0] * world[0] + r[1] * world[1] + r[2] * world[2] + pose.shift[row];
             }
             const float most = coarse.under(job, at, radius);
-            if (most > 0 && at[2] - radius < most + job.band.truncation) found[at_piece].push_back(index);
+            if (most > 0 && at[2] - radius < most + job.band.truncation / kLeastSlant) found[at_piece].push_back(index);
         }
     });
     std::vector<int64_t> joined;

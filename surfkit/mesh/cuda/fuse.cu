@@ -43,8 +43,8 @@ reach(View view, Buffer<const float> depth, Buffer<const unsigned> shade, Buffer
 // block at place `begin` come first in `distance`, `weight` and `color`.
 KERNEL(kThreads)
 fuse(View view, Buffer<const long long> keys, Buffer<const long long> rows, long long begin,
-     Buffer<const float> offsets, Buffer<const float> depth, Buffer<const unsigned> shade, Buffer<short> distance,
-     Buffer<unsigned short> weight, Buffer<unsigned char> color) {
+     Buffer<const float> offsets, Buffer<const float> depth, Buffer<const float> slant, Buffer<const unsigned> shade,
+     Buffer<short> distance, Buffer<unsigned short> weight, Buffer<unsigned char> color) {
     SHARED(float, corner, 3);  // camera coordinates of the first voxel
     const long long row = rows[blockIdx.x];
     const Key key = (Key)(long long)keys[row];
@@ -61,20 +61,22 @@ fuse(View view, Buffer<const long long> keys, Buffer<const long long> rows, long
         const Place p = place(view.lens, corner[0] + offsets[voxel], corner[1] + offsets[kVoxels + voxel],
                               corner[2] + offsets[2 * kVoxels + voxel]);
         if (!p.inside) continue;
+        const float steep = slant[p.pixel];
         float d = depth[p.pixel];
-        if (!may_count(view.band, d, p.z)) continue;
-        if (may_be_near(view.band, d, p.z))
+        if (!may_count(view.band, d, p.z, steep)) continue;
+        if (may_be_near(view.band, d, p.z, steep))
             d = between(view.band, depth[p.above + p.left], depth[p.above + p.right], depth[p.below + p.left],
                         depth[p.below + p.right], p.at_x, p.at_y, d);
         const unsigned seen = shade[p.pixel];
-        const float added = added_weight(view.band, 1, d, p.z, seen);
+        const float added = added_weight(view.band, 1, d, p.z, steep, seen);
         if (!(added > 0)) continue;
         const long long at = block * kVoxels + voxel;
         const float before = (float)weight[at];
         const Shares shared = shares(before, added);
         const unsigned noise = dither(seed, voxel, before);
         weight[at] = (unsigned short)(int)shared.weight;
-        distance[at] = (short)mean_distance((float)distance[at], seen_distance(view.band, d, p.z), shared.distance, noise);
+        const float now = seen_distance(view.band, d, p.z, steep);
+        distance[at] = (short)mean_distance((float)distance[at], now, shared.distance, noise);
         for (int channel = 0; channel < 3; channel++) {
             const long long c = (3 * block + channel) * kVoxels + voxel;
             color[c] = (unsigned char)mean_color((float)color[c], seen, channel, shared.color, noise);

@@ -72,6 +72,7 @@ class GpuGrid(Grid):
     def fuse(self, picture: Picture, carve: bool) -> bool:
         view = view_of(self.lattice, picture.camera)
         depth = self._uploaded(np.ascontiguousarray(picture.depth, np.float32))
+        slant = self._uploaded(np.ascontiguousarray(picture.slants, np.float32))
         shade = self._uploaded(np.ascontiguousarray(picture.shade, np.uint32).view(np.int32))
         offsets = self._uploaded(self.lattice.offsets(picture.camera))
         seen = self._seen_by(view, depth, shade)
@@ -84,8 +85,9 @@ class GpuGrid(Grid):
         rows = torch.cat([rows, torch.arange(before, after, device=self.device)])
         self.keys = torch.cat([self.keys, fresh])
         self.sorted, self.order = self.keys.sort()
+        seen = offsets, depth, slant, shade
         for begin, some, chunk in self._by_chunk(rows, carve):
-            self.on.launch("fuse", len(some), THREADS, view, self.keys, some, begin, offsets, depth, shade, *chunk)
+            self.on.launch("fuse", len(some), THREADS, view, self.keys, some, begin, *seen, *chunk)
         return True
 
     def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
