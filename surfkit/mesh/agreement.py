@@ -147,8 +147,7 @@ def compare(
     turn = camera.world_to_camera @ torch.linalg.inv(there.world_to_camera)
     made = [np.empty(depth.shape, np.float32) for _ in range(3)]
     module().compare_depths(
-        depth.numpy(),
-        other.numpy(),
+        *(np.ascontiguousarray(some.numpy(), np.float32) for some in (depth, other)),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         [part for array in ray_way(camera, there) for part in array.flatten().tolist()],
         turn[:3, 3].tolist(),
@@ -163,7 +162,7 @@ def compare(
 def compare_in_torch(
     camera: Camera, depth: Tensor, there: Camera, other: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in torch, ten times slower: where surfkit has no compiled part, and to check that."""
+    """The same in torch, several times slower: where surfkit has no compiled part, and to check that."""
     a, b = ray_map(camera, there, depth.device)
     inverse = 1 / depth.clamp_min(1e-20)
     x, y, z = (a[i] + inverse * b[i] for i in range(3))

@@ -14,6 +14,7 @@ from surfkit.mesh.holes import areas_of, close_holes
 from surfkit.scene.sets import is_among
 
 HASH = np.uint64(0x9E3779B97F4A7C15)
+"""An odd number whose product scatters the bits of a coordinate."""
 
 
 @dataclass(frozen=True)

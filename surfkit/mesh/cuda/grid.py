@@ -85,9 +85,9 @@ class GpuGrid(Grid):
         rows = torch.cat([rows, torch.arange(before, after, device=self.device)])
         self.keys = torch.cat([self.keys, fresh])
         self.sorted, self.order = self.keys.sort()
-        seen = offsets, depth, slant, shade
+        maps = offsets, depth, slant, shade
         for begin, some, chunk in self._by_chunk(rows, carve):
-            self.on.launch("fuse", len(some), THREADS, view, self.keys, some, begin, *seen, *chunk)
+            self.on.launch("fuse", len(some), THREADS, view, self.keys, some, begin, *maps, *chunk)
         return True
 
     def surface(self, least_weight: int, end: Corner = (MOST,) * 3, with_edges: bool = False) -> Pieces:
