@@ -108,7 +108,7 @@ def _parts(mesh: Mesh) -> np.ndarray:
 
 
 def areas_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) float64 areas, axis by axis: numpy's cross product of rows takes three times as long."""
+    """(F,) float64 areas, axis by axis: with numpy's cross product of rows it takes more than twice as long."""
     a, b, c = (np.ascontiguousarray(corners) for corners in faces.T)
     (ux, vx), (uy, vy), (uz, vz) = ((x[b] - x[a], x[c] - x[a]) for x in vertices.T.astype(np.float64, "C"))
     return np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2) / 2

@@ -20,6 +20,7 @@ from surfkit.core.stages import kept_parts, key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.mesh.base import Mesh
+from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length
@@ -146,7 +147,7 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
 def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
     """What texture.json says of a textured mesh."""
     mesh, atlas, gains = made.paint.mesh, made.paint.atlas, made.paint.gains
-    seen, areas = atlas.view != NONE, _areas(mesh)
+    seen, areas = atlas.view != NONE, areas_of(mesh.vertices, mesh.faces)
     return {
         "mesh": str(subject.surface.path),
         "crs": subject.frame.crs,
@@ -285,7 +286,7 @@ def reduced(views: Sequence[View], sizes: np.ndarray, texel: float) -> list[View
 
 def prepared(mesh: Mesh, settings: TextureSettings, texel: float) -> Mesh:
     """The mesh with as many triangles as wanted, none of them too large; `texel` in local units."""
-    area = float(_areas(mesh).sum())
+    area = float(areas_of(mesh.vertices, mesh.faces).sum())
     wanted = settings.triangles if settings.triangles != "auto" else max(LEAST, int(area / texel**2 / TEXELS))
     if wanted < len(mesh.faces):
         emit(Progress("simplifying", 0, 1))
@@ -347,9 +348,3 @@ def lay_out(
     where = middles(mesh)
     region = region or divide(where, texels_of(chosen, places), FULL * size**2)
     return make_atlas(chosen, places, region.of(where), beyond, size), region
-
-
-def _areas(mesh: Mesh) -> np.ndarray:
-    """(F,) float64."""
-    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh import fusion, native, tsdf
-from surfkit.mesh.lattice import Lattice
+from surfkit.mesh.lattice import LEAST_SLANT, SIDE, Lattice
 from surfkit.mesh.lengths import LEAST_CUT
 from surfkit.mesh.picture import depth_of, picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
@@ -230,6 +230,15 @@ def test_distances_are_to_the_plane_that_a_pixel_shows():
         assert sure.sum() > 1000 and (height[sure] < -0.03).any()
         off.append(np.abs(distance - height)[sure])
     assert off[0].max() < 0.0008 and np.median(off[1]) > 0.004
+
+
+def test_a_tile_gets_all_views_that_reach_into_it():
+    """A pixel seen from the side reaches further behind its surface, along the ray, than the truncation."""
+    lattice = Lattice(0.01, 0.4)
+    camera = look_at((0, 0, 2.0), (0, 0.0001, 0.0))
+    task = fusion.Task(lattice, (camera,), lambda at: None, 1.0, True, 1, None)
+    lowest = 2.0 - 1.0 - lattice.truncation / LEAST_SLANT
+    assert fusion.in_sight(camera, task).low[2] * SIDE * lattice.voxel <= lowest
 
 
 def test_a_surface_seen_from_the_side_has_no_holes():

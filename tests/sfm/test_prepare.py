@@ -147,7 +147,7 @@ def same_images(scene, other):
 
 
 def assert_same_model(scene, other):
-    """The same cameras and points but for rounding: sums in pycolmap depend on where in memory the numbers lie."""
+    """The same cameras and points but for rounding: once they were not the same to the bit, as pycolmap may add up."""
     assert files(scene).keys() == files(other).keys()
     ours, theirs = read(Data(scene)), read(Data(other))
     assert cameras(ours).keys() == cameras(theirs).keys()
