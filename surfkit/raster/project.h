@@ -13,7 +13,6 @@ using splat::Gaussian;
 using splat::Posed;
 using splat::SplatGrad;
 using splat::SplatIn;
-using splat::Surfel;
 using splat::Vec;
 
 SPLAT_FN int scale_columns(Kind kind) { return kind == kSurfel ? 2 : 3; }
@@ -57,10 +56,9 @@ SPLAT_FN Shade shade(const Arrays& s, long long i, const SplatIn<double>& in, co
     o.direction = (1 / splat::largest(o.length, 1e-300)) * d;
     splat::sh_basis(o.direction, s.coefficients, o.basis);
     const long long row = 3LL * s.coefficients * i;
-    for (int c = 0; c < 3; c++) {
-        o.rgb[c] = 0.5;
-        for (int k = 0; k < s.coefficients; k++) o.rgb[c] += o.basis[k] * s.sh[row + 3 * k + c];
-    }
+    for (int c = 0; c < 3; c++) o.rgb[c] = 0.5;
+    for (int k = 0; k < s.coefficients; k++)
+        for (int c = 0; c < 3; c++) o.rgb[c] += o.basis[k] * s.sh[row + 3 * k + c];
     return o;
 }
 // `out_sh` has the layout of s.sh.
@@ -120,12 +118,7 @@ SPLAT_FN void fill_look(Record& r, double opacity, const Shade& look, Vec<double
     r.normal[2] = (float)normal.z;
 }
 
-SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, const splat::GaussianForm&,
-                          SurfelRecord& r, Bound<double>& bound) {
-    const Posed<double> p = splat::pose(in, cam);
-    Surfel<double> s;
-    if (!splat::surfel_project(in, p, cam, [](double x) { return round_down(x); }, s)) return false;
-    bound = s.bound;
+SPLAT_FN void fill_record(SurfelRecord& r, double opacity, const splat::SurfelView<double>& s) {
     r.ax = (float)s.ax;
     r.ay = (float)s.ay;
     const Vec<double> m[3] = {s.a, s.b, s.c};
@@ -138,10 +131,16 @@ SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& 
     r.det = (float)s.det;
     r.z_low = (float)s.z_low;
     r.z_high = (float)s.z_high;
-    fill_look(r, in.opacity, Shade{}, s.flip * p.axes.c2);
-    const splat::SignalRow<double> row = splat::surfel_signal(cam, s);
-    for (int k = 0; k < 6; k++) r.signal_x[k] = (float)row.x[k];
-    for (int k = 0; k < 3; k++) r.signal_y[k] = (float)row.y[k == 2 ? 4 : 2 * k + 1];
+    fill_look(r, opacity, Shade{}, s.normal);
+    for (int k = 0; k < 6; k++) r.signal_x[k] = (float)s.signal.x[k];
+    for (int k = 0; k < 3; k++) r.signal_y[k] = (float)s.signal.y[k == 2 ? 4 : 2 * k + 1];
+}
+SPLAT_FN bool project_one(const SplatIn<double>& in, const CameraModel<double>& cam, const splat::GaussianForm&,
+                          SurfelRecord& r, Bound<double>& bound) {
+    splat::SurfelView<double> s;
+    if (!splat::surfel_view(in, cam, s)) return false;
+    bound = s.bound;
+    fill_record(r, in.opacity, s);
     return true;
 }
 // What both records of gaussians have.
@@ -284,13 +283,11 @@ SPLAT_FN splat::RaySums<double> ray_sums(const double* s) {
 // dL/d(splat) but for its color, from the sums over its pixels.
 SPLAT_FN SplatGrad<double> splat_backward(Kind kind, const SplatIn<double>& in, const CameraModel<double>& cam,
                                           const splat::GaussianForm& form, const double* s) {
-    const Posed<double> p = splat::pose(in, cam);
     SplatGrad<double> g;
     if (kind == kSurfel) {
-        Surfel<double> o;
-        splat::surfel_project(in, p, cam, [](double x) { return round_down(x); }, o);
-        splat::surfel_backward(in, p, cam, o, surfel_sums(s), g);
+        splat::surfel_gradient(in, cam, surfel_sums(s), g);
     } else {
+        const Posed<double> p = splat::pose(in, cam);
         Gaussian<double> o;
         splat::gaussian_project(in, p, cam, form, o);
         const splat::RaySums<double> ray = ray_sums(s);

@@ -1,10 +1,11 @@
 // The formulas of splatting, once, for every backend. Plain C++17, no includes: the CPU backend instantiates them with
-// double (per splat) and SIMD vectors (per pixel); a CUDA backend can instantiate them with float.
+// double or vectors of them (per splat) and SIMD vectors (per pixel); a CUDA backend can instantiate them with float.
 //
 // Per pixel, V is a float or a vector of floats and the including file provides, for V and its mask type:
 //   madd(a, b, c) = a b + c rounded once where the machine can, reciprocal(a), lesser(a, b), less_equal(a, b),
 //   select(mask, a, b), operator& on masks.
-// Per splat, R is float or double and `square_root`, `natural_log` are given for it.
+// Per splat, R is a double or, for surfels on the CPU, several, and the including file provides `square_root`,
+// `natural_log` and `round_down` for it.
 #pragma once
 
 #ifndef SPLAT_FN
@@ -66,6 +67,11 @@ SPLAT_FN R smallest(R a, R b) {
 template <class R>
 SPLAT_FN R magnitude(R a) {
     return a < 0 ? -a : a;
+}
+// Without a branch, so that R may be several numbers.
+template <class R>
+SPLAT_FN R either(bool yes, R a, R b) {
+    return yes ? a : b;
 }
 
 // A 3 x 3 matrix by columns.
@@ -249,22 +255,21 @@ SPLAT_FN Homography<R> homography(const SplatIn<R>& s, const Posed<R>& p, const 
             {a.z, b.z, c.z}};
 }
 
-// The box of the k-sigma contour: its centre, and f with centre = (f.(Tu Tw), f.(Tv Tw)). False if it meets the camera
-// plane.
+// The box of the k-sigma contour: its centre, and f with centre = (f.(Tu Tw), f.(Tv Tw)). False, and the rest means
+// nothing, if it meets the camera plane.
 template <class R>
 struct Contour {
     Vec<R> t, f;
     R d, x, y;
 };
 template <class R>
-SPLAT_FN bool contour(const Homography<R>& h, R k_squared, Contour<R>& out) {
+SPLAT_FN auto contour(const Homography<R>& h, R k_squared, Contour<R>& out) {
     out.t = {k_squared, k_squared, R(-1)};
     out.d = dot(out.t, times(h.w, h.w));
-    if (!(out.d < 0)) return false;
     out.f = (1 / out.d) * out.t;
     out.x = dot(out.f, times(h.u, h.w));
     out.y = dot(out.f, times(h.v, h.w));
-    return true;
+    return out.d < R(0);
 }
 
 template <class R>
@@ -279,16 +284,15 @@ struct Surfel {
     Bound<R> bound;
 };
 
-// Project a surfel; false if nothing of it can be drawn. `whole(x)` rounds down.
-template <class R, class Floor>
-SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, Floor whole,
-                             Surfel<R>& o) {
-    if (!(p.c.z > cam.near) || !(s.opacity > R(kAlphaMin))) return false;
+// Project a surfel; false, and the rest means nothing, if nothing of it can be drawn.
+template <class R>
+SPLAT_FN auto surfel_project(const SplatIn<R>& s, const Posed<R>& p, const CameraModel<R>& cam, Surfel<R>& o) {
     o.h = homography(s, p, cam);
     Contour<R> edge;
-    if (!contour(o.h, R(kCutoffSquared), edge) || !contour(o.h, R(9), o.low)) return false;
+    const auto in_front = (p.c.z > cam.near) & (s.opacity > R(kAlphaMin)) & contour(o.h, R(kCutoffSquared), edge) &
+                          contour(o.h, R(9), o.low);
     const R k2 = smallest(2 * natural_log(s.opacity / R(kAlphaMin)) * R(1.00001) + R(1e-5), R(kCutoffSquared));
-    if (!contour(o.h, k2, edge)) return false;
+    const auto bounded = contour(o.h, k2, edge);
     o.bound = {edge.x,
                edge.y,
                edge.x * edge.x - dot(edge.f, times(o.h.u, o.h.u)),
@@ -298,32 +302,31 @@ SPLAT_FN bool surfel_project(const SplatIn<R>& s, const Posed<R>& p, const Camer
                o.low.y,
                k2 / 2};
     const R limit = R(1 << 22);
-    o.ax = whole(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
-    o.ay = whole(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
+    o.ax = round_down(smallest(largest(o.low.x, -limit), limit)) + R(0.5);
+    o.ay = round_down(smallest(largest(o.low.y, -limit), limit)) + R(0.5);
     const Vec<R> u = o.h.u - o.ax * o.h.w, v = o.h.v - o.ay * o.h.w;
     const Vec<R> a = cross(v, o.h.w), b = cross(o.h.w, u), c = cross(u, v);
     R size = 0;
     const Vec<R> columns[3] = {a, b, c};
     for (const Vec<R>& q : columns)
         size = largest(size, largest(magnitude(q.x), largest(magnitude(q.y), magnitude(q.z))));
-    if (!(size > 0)) return false;
     o.unit = size;
     o.a = (1 / size) * a;
     o.b = (1 / size) * b;
     o.c = (1 / size) * c;
     o.det = dot(u, a) / size;
     // Seen edge-on, rays and disc share a plane and do not meet in a point: only the low-pass filter draws.
-    const R lean = dot(p.axes.c2, p.c);
-    if (lean * lean < R(kEdgeOn * kEdgeOn) * dot(p.c, p.c)) {
-        o.a = o.b = {0, 0, 0};
-        o.c = {1, 1, 0};
-        o.det = 0;
-    }
+    const R lean = dot(p.axes.c2, p.c), none = R(0), one = R(1);
+    const auto edge_on = lean * lean < R(kEdgeOn * kEdgeOn) * dot(p.c, p.c);
+    o.a = {either(edge_on, none, o.a.x), either(edge_on, none, o.a.y), either(edge_on, none, o.a.z)};
+    o.b = {either(edge_on, none, o.b.x), either(edge_on, none, o.b.y), either(edge_on, none, o.b.z)};
+    o.c = {either(edge_on, one, o.c.x), either(edge_on, one, o.c.y), either(edge_on, none, o.c.z)};
+    o.det = either(edge_on, none, o.det);
     const R reach = square_root(R(kCutoffSquared) * (o.h.w.x * o.h.w.x + o.h.w.y * o.h.w.y));
     o.z_low = largest(p.c.z - reach, cam.near);
     o.z_high = p.c.z + reach;
-    o.flip = dot(p.axes.c2, p.c) > 0 ? R(-1) : R(1);
-    return true;
+    o.flip = either(lean > none, R(-1), one);
+    return in_front & bounded & (size > none);
 }
 
 // How what one pixel hands back becomes its share of the screen-space gradient, in both directions: factors of q0 Y
@@ -340,6 +343,24 @@ SPLAT_FN SignalRow<R> surfel_signal(const CameraModel<R>& cam, const Surfel<R>& 
     const R fx = half_w / o.unit, fy = half_h / o.unit, low = R(-2) * o.low.f.z * w.z;
     return {{fx * w.y, -fx * v.y, -fx * w.x, fx * v.x, fx * (v.x * w.y - v.y * w.x), half_w * low},
             {-fy * w.y, fy * u.y, fy * w.x, -fy * u.x, fy * (w.x * u.y - w.y * u.x), half_h * low}};
+}
+
+// What is drawn of a surfel: of Surfel and SignalRow what the pixels need, and the normal towards the camera.
+template <class R>
+struct SurfelView {
+    Bound<R> bound;
+    Vec<R> a, b, c;
+    R det, z_low, z_high, ax, ay;
+    Vec<R> normal;
+    SignalRow<R> signal;
+};
+template <class R>
+SPLAT_FN auto surfel_view(const SplatIn<R>& s, const CameraModel<R>& cam, SurfelView<R>& o) {
+    const Posed<R> p = pose(s, cam);
+    Surfel<R> q;
+    const auto drawn = surfel_project(s, p, cam, q);
+    o = {q.bound, q.a, q.b, q.c, q.det, q.z_low, q.z_high, q.ax, q.ay, q.flip * p.axes.c2, surfel_signal(cam, q)};
+    return drawn;
 }
 
 // What the pixels hand back for a surfel: cotangents of a, b, c, det, the low-pass centre, colour, normal, opacity.
@@ -379,6 +400,15 @@ SPLAT_FN void surfel_backward(const SplatIn<R>& s, const Posed<R>& p, const Came
     out.scale[2] = 0;
     out.opacity = g.opacity;
     pose_backward(s, cam, p.length, dc, Mat<R>{s.scale[0] * da, s.scale[1] * db, o.flip * g.normal}, out);
+}
+
+// dL/d(surfel) but for its colour, from what its pixels hand back; of one that is drawn.
+template <class R>
+SPLAT_FN void surfel_gradient(const SplatIn<R>& s, const CameraModel<R>& cam, const SurfelSums<R>& g, SplatGrad<R>& out) {
+    const Posed<R> p = pose(s, cam);
+    Surfel<R> o;
+    surfel_project(s, p, cam, o);
+    surfel_backward(s, p, cam, o, g, out);
 }
 
 // ---- gaussians

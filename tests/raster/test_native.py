@@ -409,3 +409,32 @@ def test_near_hides_what_is_closer(kind):
     assert not render.seen[z <= near].any() and render.seen[z > near].any()
     clear = ~draw(double(shown), view, near).near_threshold
     assert not different_maps(render.maps, true.maps, clear)
+
+
+@pytest.mark.parametrize("compiled", native.module().kernels() if native.module() else [])
+@pytest.mark.parametrize("count", [1, 3, 33, 550])
+def test_surfels_do_not_depend_on_those_beside_them(count, compiled, kernels):
+    """Several are computed at once: in another order, beside others and beside some that are not drawn, they are the
+    same to the bit."""
+    kernels(compiled)
+    shown, view = crowd("surfel")
+    moved = 1e-3 * torch.randn(len(shown), 3, generator=torch.Generator().manual_seed(1))
+    shown = replace(shown, means=shown.means + moved)  # no two at one depth
+    splats = shown.take(NativeRasterizer().render(shown, view, NEAR).seen.nonzero()[:count, 0])
+    count = len(splats)
+    faint = replace(splats.take(torch.arange(min(count, 5))), opacities=torch.full((min(count, 5),), 0.5 * ALPHA_MIN))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
+    other = joined(faint, splats.take(order))
+    plain, mixed = (NativeRasterizer().render(some, view, NEAR) for some in (splats, other))
+    total = Maps(color=plain.maps.color - 0.5, median=plain.maps.median - 0.5)
+    assert plain.seen.any() and not mixed.seen[: len(faint)].any()
+    assert torch.equal(mixed.radii[len(faint) :], plain.radii[order])
+    back = mixed.backward(total).tensors()
+    for name, value in plain.backward(total).tensors().items():
+        found = back[name]
+        assert torch.equal(found[len(faint) :], value[order]), name
+        assert not found[: len(faint)].any(), name
+
+
+def joined(*parts: Splats) -> Splats:
+    return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in STANDARD})

@@ -5,10 +5,11 @@
 // footprint tell which blocks it can touch; blocks whose rays have all ended are left out.
 #include "../../native/simd.h"
 
-#define SPLAT_FN static inline
+#define SPLAT_FN static SURFKIT_INLINE
 #include "../pixels.h"
 #include "kernels.h"
 #include "images.h"
+#include "surfels.h"
 
 namespace surfkit {
 namespace {
@@ -455,6 +456,8 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                ssim_rows,
                                ssim_gradient_rows,
                                normal_rows,
+                               project_surfels,
+                               surfels_backward,
                                adam};
     return table;
 }

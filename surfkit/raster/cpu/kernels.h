@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "../records.h"
+#include "../splat_math.h"
 
 namespace surfkit {
 
@@ -24,6 +25,13 @@ struct Saved {
     int32_t* middle;           // the same of the median depth
     float *m_shift, *m1, *m2;  // inverse depth of the first splat, and moments about it
     uint64_t* blocks;          // per entry, the blocks of the tile that it was blended into; zero to begin with
+};
+
+// Activated values of N splats, as in raster/api.py; `scales` has 2 or 3 columns by the kind.
+struct SplatArrays {
+    int64_t count;
+    int coefficients;  // of spherical harmonics, per channel
+    const float *means, *quats, *scales, *opacities, *sh;
 };
 
 struct Job {
@@ -81,6 +89,12 @@ struct Kernels {
                                const float* d_cross, int width, int height, int y0, int y1, float scale, float* out);
     // Sum of 1 - alpha (normal . normal of the depth) over the inner pixels of rows [y0, y1) that have one.
     double (*normal_rows)(const NormalJob&, int y0, int y1);
+    // The surfels of some rows: what a view shows of each that it draws at all; and the way back from their sums, `stride`
+    // numbers apart.
+    void (*project_surfels)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
+                            splat::SurfelView<double>* out, bool* drawn);
+    void (*surfels_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
+                             const double* sums, int stride, splat::SplatGrad<double>* out);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
                  float share1, float share2, float second_correction, float epsilon);
 };

@@ -11,6 +11,7 @@ namespace surfkit {
 namespace {
 
 constexpr int64_t kChunk = 512;  // splats projected as one piece of work
+constexpr int64_t kGroup = 32;   // of these, splats whose values stay in the fastest cache
 
 int64_t chunks_of(int64_t count, int64_t size) { return (count + size - 1) / size; }
 
@@ -34,6 +35,42 @@ std::vector<uint32_t> order_of(const std::vector<float>& keys) {
         order.swap(order2);
     }
     return order;
+}
+
+// Rows of the splats of a chunk that may touch a pixel; their number. The first that is not valid is told.
+int64_t may_touch(Kind kind, const SplatArrays& splats, int64_t from, const Outlook& outlook, int64_t* rows,
+                  int64_t& invalid, bool* seen, float* radii) {
+    const int columns = scale_columns(kind);
+    int64_t count = 0;
+    for (int64_t i = from; i < std::min(splats.count, from + kChunk); i++) {
+        seen[i] = false;
+        radii[i] = 0;
+        const SplatIn<double> in = read_splat(splats, i, columns);
+        if (!valid(in, columns)) {
+            if (invalid < 0) invalid = i;
+        } else if (!outlook.misses(kind, in, splat::mul(outlook.cam.turn, in.mean) + outlook.cam.shift)) {
+            rows[count++] = i;
+        }
+    }
+    return count;
+}
+
+template <class Record>
+void project_some(const SplatArrays& splats, const int64_t* rows, int64_t count, const CameraModel<double>& camera,
+                  const splat::GaussianForm& form, Record* records, Bound<double>* bounds, bool* drawn) {
+    for (int64_t k = 0; k < count; k++)
+        drawn[k] = project_one(read_splat(splats, rows[k], 3), camera, form, records[k], bounds[k]);
+}
+
+void project_some(const SplatArrays& splats, const int64_t* rows, int64_t count, const CameraModel<double>& camera,
+                  const splat::GaussianForm&, SurfelRecord* records, Bound<double>* bounds, bool* drawn) {
+    splat::SurfelView<double> views[kGroup];
+    kernels().project_surfels(splats, rows, count, camera, views, drawn);
+    for (int64_t k = 0; k < count; k++) {
+        if (!drawn[k]) continue;
+        fill_record(records[k], splats.opacities[rows[k]], views[k]);
+        bounds[k] = views[k].bound;
+    }
 }
 
 }  // namespace
@@ -77,19 +114,19 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
     parallel(chunks, threads, [&](int64_t c) {
         int64_t at = c * kChunk;
         std::vector<uint32_t> touched;  // moved at the end: neighbours in tiles_of_ share cache lines between threads
-        for (int64_t i = c * kChunk; i < std::min(n, (c + 1) * kChunk); i++) {
-            seen[i] = false;
-            radii[i] = 0;
-            const SplatIn<double> in = read_splat(splats, i, columns);
-            if (!valid(in, columns)) {
-                if (invalid[c] < 0) invalid[c] = i;
-                continue;
-            }
-            const Vec<double> centre = splat::mul(camera_.turn, in.mean) + camera_.shift;
-            if (outlook.misses(kind_, in, centre)) continue;
-            Record r;
-            Bound<double> b;
-            if (!project_one(in, camera_, form_, r, b)) continue;
+        int64_t rows[kChunk];
+        const int64_t candidates = may_touch(kind_, splats, c * kChunk, outlook, rows, invalid[c], seen, radii);
+        Record group[kGroup];
+        Bound<double> bounds[kGroup];
+        bool drawn[kGroup];
+        for (int64_t k = 0; k < candidates; k++) {
+            const int64_t in_group = k % kGroup;
+            if (!in_group)
+                project_some(splats, rows + k, std::min(kGroup, candidates - k), camera_, form_, group, bounds, drawn);
+            if (!drawn[in_group]) continue;
+            const int64_t i = rows[k];
+            Record& r = group[in_group];
+            Bound<double> b = bounds[in_group];
             const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
             b = widened(b);
             fill_bound(r, b);
@@ -97,12 +134,14 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
             each_tile(b, tiles_x_, tiles_y_, rim_, [&](uint32_t tile) { touched.push_back(tile); });
             const uint32_t tiles = (uint32_t)(touched.size() - before);
             if (!tiles) continue;
+            const SplatIn<double> in = read_splat(splats, i, columns);
             const Shade look = shade(splats, i, in, camera_);
-            if (!std::isfinite(look.rgb[0] + look.rgb[1] + look.rgb[2]) && invalid[c] < 0) invalid[c] = i;
-            for (int k = 0; k < 3; k++) r.color[k] = (float)std::max(look.rgb[k], 0.0);
+            if (!std::isfinite(look.rgb[0] + look.rgb[1] + look.rgb[2]) && !(invalid[c] >= 0 && invalid[c] < i))
+                invalid[c] = i;
+            for (int q = 0; q < 3; q++) r.color[q] = (float)std::max(look.rgb[q], 0.0);
             records[at] = r;
             index_[at] = i;
-            depth_[at] = (float)centre.z;
+            depth_[at] = (float)(splat::mul(camera_.turn, in.mean) + camera_.shift).z;
             tiles_[at] = tiles;
             seen[i] = true;
             radii[i] = (float)radius;
@@ -214,6 +253,15 @@ Layout layout(Kind kind) {
     }
 }
 
+// dL/d(splat) but for its colour of some rows, from their sums, `stride` numbers apart.
+void gradients_of(Kind kind, const SplatArrays& splats, const int64_t* rows, int64_t count,
+                  const CameraModel<double>& camera, const splat::GaussianForm& form, const double* sums, int stride,
+                  SplatGrad<double>* out) {
+    if (kind == kSurfel) return kernels().surfels_backward(splats, rows, count, camera, sums, stride, out);
+    for (int64_t k = 0; k < count; k++)
+        out[k] = splat_backward(kind, read_splat(splats, rows[k], 3), camera, form, sums + k * stride);
+}
+
 }  // namespace
 
 void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute, int64_t rows,
@@ -241,30 +289,43 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         k.backward(kind_, level, what, work, tile, total, part, kept, sums.get(), touched.data());
     });
     const int columns = scale_columns(kind_);
-    each_seen(threads, [&](int64_t r) {
-        double s[kRaySumsChosen] = {};
-        bool hit = false;
-        for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) {
-            if (!touched[slot]) continue;
-            hit = true;
-            const float* row = sums.get() + (size_t)slot * width;
-            for (int i = 0; i < width; i++) s[i] += row[i];
+    const auto group = [&](int64_t from, int64_t end) {
+        int64_t rows[kGroup], hit = 0;
+        double all[kGroup * kRaySumsChosen] = {};
+        for (int64_t r = from; r < end; r++) {
+            double* const s = all + hit * width;
+            bool some = false;
+            for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) {
+                if (!touched[slot]) continue;
+                const float* row = sums.get() + (size_t)slot * width;
+                for (int i = 0; i < width; i++) s[i] += row[i];
+                some = true;
+            }
+            if (some) rows[hit++] = index_[r];
         }
-        if (!hit) return;
-        const int64_t i = index_[r];
-        const SplatIn<double> in = read_splat(splats, i, columns);
-        SplatGrad<double> g = splat_backward(kind_, in, camera_, form_, s);
-        shade_backward(splats, i, shade(splats, i, in, camera_), s + color_at, g, out.sh);
-        out.means[3 * i] = (float)g.mean.x;
-        out.means[3 * i + 1] = (float)g.mean.y;
-        out.means[3 * i + 2] = (float)g.mean.z;
-        for (int q = 0; q < 4; q++) out.quats[4 * i + q] = (float)g.quat[q];
-        for (int q = 0; q < columns; q++) out.scales[columns * i + q] = (float)g.scale[q];
-        out.opacities[i] = (float)g.opacity;
-        for (int q = 0; q < 2; q++) {
-            out.signal[2 * i + q] = (float)g.signal[q];
-            if (out.chosen) out.chosen[2 * i + q] = (float)s[chosen_at + q];
+        SplatGrad<double> gradients[kGroup];
+        gradients_of(kind_, splats, rows, hit, camera_, form_, all, width, gradients);
+        for (int64_t k = 0; k < hit; k++) {
+            const int64_t i = rows[k];
+            const double* s = all + k * width;
+            SplatGrad<double>& g = gradients[k];
+            const SplatIn<double> in = read_splat(splats, i, columns);
+            shade_backward(splats, i, shade(splats, i, in, camera_), s + color_at, g, out.sh);
+            out.means[3 * i] = (float)g.mean.x;
+            out.means[3 * i + 1] = (float)g.mean.y;
+            out.means[3 * i + 2] = (float)g.mean.z;
+            for (int q = 0; q < 4; q++) out.quats[4 * i + q] = (float)g.quat[q];
+            for (int q = 0; q < columns; q++) out.scales[columns * i + q] = (float)g.scale[q];
+            out.opacities[i] = (float)g.opacity;
+            for (int q = 0; q < 2; q++) {
+                out.signal[2 * i + q] = (float)g.signal[q];
+                if (out.chosen) out.chosen[2 * i + q] = (float)s[chosen_at + q];
+            }
         }
+    };
+    parallel((int64_t)seen_in_.size(), threads, [&](int64_t c) {
+        const int64_t end = c * kChunk + seen_in_[c];
+        for (int64_t r = c * kChunk; r < end; r += kGroup) group(r, std::min(end, r + kGroup));
     });
 }
 

@@ -14,13 +14,6 @@ static inline double round_down(double x) { return std::floor(x); }
 
 namespace surfkit {
 
-// Activated values of N splats, as in raster/api.py; `scales` has 2 or 3 columns by the kind.
-struct SplatArrays {
-    int64_t count;
-    int coefficients;  // of spherical harmonics, per channel
-    const float *means, *quats, *scales, *opacities, *sh;
-};
-
 struct GradientArrays {
     float *means, *quats, *scales, *opacities, *sh, *signal, *chosen;  // chosen may be null
 };
