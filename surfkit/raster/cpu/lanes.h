@@ -60,14 +60,17 @@ SURFKIT_INLINE static Wide round_down(Wide a) {
 }
 SURFKIT_INLINE static Wide natural_log(Wide a) { return of_each<std::log>(a); }
 
-// One lane of a struct of numbers, `From` the same of Wide: its numbers, one after another.
+// The first `count` lanes of a struct of numbers; `From` is the same of Wide as `To` of doubles.
 template <class To, class From>
-SURFKIT_INLINE void take_lane(const From& from, int lane, To& to) {
+SURFKIT_INLINE void take_lanes(const From& from, int count, To* to) {
     static_assert(sizeof(From) == kWide * sizeof(To), "the same numbers");
-    double all[sizeof(From) / sizeof(double)], one[sizeof(To) / sizeof(double)];
+    constexpr int numbers = sizeof(To) / sizeof(double);
+    double all[numbers][kWide], one[numbers];
     std::memcpy(all, &from, sizeof from);
-    for (size_t i = 0; i < sizeof one / sizeof *one; i++) one[i] = all[i * kWide + lane];
-    std::memcpy(&to, one, sizeof to);
+    for (int lane = 0; lane < count; lane++) {
+        for (int i = 0; i < numbers; i++) one[i] = all[i][lane];
+        std::memcpy(to + lane, one, sizeof one);
+    }
 }
 
 }  // namespace

@@ -45,10 +45,8 @@ void project_surfels(const SplatArrays& splats, const int64_t* rows, int64_t cou
         const int some = (int)std::min<int64_t>(kWide, count - at);
         splat::SurfelView<Wide> view;
         const WideMask there = splat::surfel_view(read_some(splats, rows + at, some), cam, view);
-        for (int lane = 0; lane < some; lane++) {
-            drawn[at + lane] = there.m[lane] != 0;
-            take_lane(view, lane, out[at + lane]);
-        }
+        for (int lane = 0; lane < some; lane++) drawn[at + lane] = there.m[lane] != 0;
+        take_lanes(view, some, out + at);
     }
 }
 
@@ -67,7 +65,7 @@ void surfels_backward(const SplatArrays& splats, const int64_t* rows, int64_t co
         const splat::SplatIn<Wide> in = read_some(splats, rows + at, some);
         splat::SplatGrad<Wide> gradient;
         splat::surfel_gradient(in, cam, given, gradient);
-        for (int lane = 0; lane < some; lane++) take_lane(gradient, lane, out[at + lane]);
+        take_lanes(gradient, some, out + at);
     }
 }
 
