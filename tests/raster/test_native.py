@@ -275,10 +275,13 @@ def true_gradients(name: str, kind: str) -> Gradients:
 def test_compilations_agree_on_a_larger_view(kind, kernels):
     """The scenes above compare each with the reference; this one adds tiles cut by the border and long lists."""
     shown, view = crowd(kind)
-    made = []
+    made, radii = [], []
     for compiled in native.module().kernels():
         kernels(compiled)
-        made.append(NativeRasterizer().render(shown, view, NEAR).maps.present())
+        render = NativeRasterizer().render(shown, view, NEAR)
+        made.append(render.maps.present())
+        radii.append(render.radii)
+    assert all(torch.equal(radii[0], other) for other in radii[1:])
     assert made[0]["alpha"].mean() > 0.5
     for key, value in made[0].items():
         for other in made[1:]:

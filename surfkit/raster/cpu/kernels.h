@@ -89,8 +89,8 @@ struct Kernels {
                                const float* d_cross, int width, int height, int y0, int y1, float scale, float* out);
     // Sum of 1 - alpha (normal . normal of the depth) over the inner pixels of rows [y0, y1) that have one.
     double (*normal_rows)(const NormalJob&, int y0, int y1);
-    // The surfels of some rows: what a view shows of each that it draws at all; and the way back from their sums, `stride`
-    // numbers apart.
+    // Project the surfels of some rows; `drawn` tells which of `out` mean something. And the gradients of surfels that are
+    // drawn but for their colours, from the sums over their pixels, `stride` numbers apart.
     void (*project_surfels)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
                             splat::SurfelView<double>* out, bool* drawn);
     void (*surfels_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,

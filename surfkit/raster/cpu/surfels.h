@@ -1,4 +1,4 @@
-// Surfels, several at once: from their values to what a view shows of them, and the way back. Part of kernels.cpp.
+// Projection of surfels, several at once, and its gradients. Part of kernels.cpp.
 #pragma once
 
 #include <algorithm>
