@@ -25,7 +25,16 @@ constexpr int kLanes = 4;
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Ints __attribute__((vector_size(4 * kLanes)));
 
-static inline Floats broadcast(float x) { return Floats{} + x; }
+// Not as a sum with zero, which is computed, as it makes 0 of -0.
+static inline Floats broadcast(float x) {
+#if defined(__AVX512F__)
+    return (Floats)_mm512_set1_ps(x);
+#elif defined(__AVX2__)
+    return (Floats)_mm256_set1_ps(x);
+#else
+    return Floats{x, x, x, x};
+#endif
+}
 static inline Floats load(const float* p) {
     Floats v;
     std::memcpy(&v, p, sizeof v);

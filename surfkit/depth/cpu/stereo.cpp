@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "../../native/simd.h"
 
@@ -97,8 +98,6 @@ SURFKIT_INLINE Ints between(const StereoSource& s, Ints x, Ints y) {
 struct Trials {
     alignas(64) float w[kTrials], gx[kTrials], gy[kTrials];
     alignas(64) float cost[kTrials];  // of all views so far
-    alignas(64) float u[kTrials], v[kTrials], ux[kTrials], uy[kTrials], vx[kTrials], vy[kTrials];  // in one view
-    alignas(64) float match[kTrials];
     int count = 0;
 
     void add(const Plane& p) { w[count] = p.w, gx[count] = p.gx, gy[count] = p.gy, count++; }
@@ -110,14 +109,25 @@ struct Trials {
     }
 };
 
-// Where the middle of the window falls in a view, and what a step in the window moves it by: across a window, the map to a
-// view is taken as affine. `match` is 0, or kNothing where the view does not show the middle, or shows it many times larger.
-SURFKIT_INLINE void project(const StereoJob& job, const StereoSource& s, float x, float y, Trials& trials) {
+// Windows on planes as some views see them, one view after the other without gaps, so that few lanes are idle and the work
+// on one view does not wait for that on another. Room for what vectors write beyond the last one.
+struct Sights {
+    static constexpr int kRoom = kMostViews * kTrials + kLanes;
+    float u[kRoom], v[kRoom], ux[kRoom], uy[kRoom], vx[kRoom], vy[kRoom];  // fixed-point
+    float match[kRoom];
+};
+
+// Where the middle of the window falls in view number `n` of those that are looked at, and what a step in the window moves it
+// by: across a window, the map to a view is taken as affine. `match` is 0, or kNothing where the view does not show the
+// middle, or shows it many times larger.
+SURFKIT_INLINE void project(const StereoJob& job, const StereoSource& s, float x, float y, const Trials& trials, Sights& out,
+                            int n) {
     const float* t = s.way;
     const float from[3] = {t[0] * x + t[1] * y + t[2], t[3] * x + t[4] * y + t[5], t[6] * x + t[7] * y + t[8]};
     const float wide = (float)(s.width - 1), high = (float)(s.height - 1);
     const Floats zero{};
     for (int i = 0; i < trials.count; i += kLanes) {
+        const int to = n * trials.count + i;
         const Floats w = load(trials.w + i), gx = load(trials.gx + i), gy = load(trials.gy + i);
         const Floats z = madd(w, t[11], from[2]), turn = reciprocal(higher(z, broadcast(1e-20f)));
         const Floats u = madd(w, t[9], from[0]) * turn, v = madd(w, t[10], from[1]) * turn;
@@ -128,69 +138,84 @@ SURFKIT_INLINE void project(const StereoJob& job, const StereoSource& s, float x
                            less_equal(v, high) & less_equal(magnitude(ux) + magnitude(uy), job.stretch) &
                            less_equal(magnitude(vx) + magnitude(vy), job.stretch);
         const float one = (float)kOne, border = (float)kBorder * one + 0.5f;
-        store(trials.u + i, madd(keep(shown, u), one, border)), store(trials.v + i, madd(keep(shown, v), one, border));
-        store(trials.ux + i, keep(shown, ux) * one), store(trials.uy + i, keep(shown, uy) * one);
-        store(trials.vx + i, keep(shown, vx) * one), store(trials.vy + i, keep(shown, vy) * one);
-        store(trials.match + i, select(shown, zero, kNothing));
+        store(out.u + to, madd(keep(shown, u), one, border)), store(out.v + to, madd(keep(shown, v), one, border));
+        store(out.ux + to, keep(shown, ux) * one), store(out.uy + to, keep(shown, uy) * one);
+        store(out.vx + to, keep(shown, vx) * one), store(out.vy + to, keep(shown, vy) * one);
+        store(out.match + to, select(shown, zero, kNothing));
     }
 }
 
-// 1 - correlation of a window with what a view shows on each plane; kNothing where it does not show it.
-SURFKIT_INLINE void compare(const StereoJob& job, const Window& window, const StereoSource& s, float x, float y, Trials& trials) {
-    project(job, s, x, y, trials);
-    const int vectors = job.samples / kLanes;
-    Floats sums[3][kTrials];
-    for (int i = 0; i < trials.count; i++) {
-        const Floats u = broadcast(trials.u[i]), ux = broadcast(trials.ux[i]), uy = broadcast(trials.uy[i]);
-        const Floats v = broadcast(trials.v[i]), vx = broadcast(trials.vx[i]), vy = broadcast(trials.vy[i]);
-        Floats sum = {}, square = {}, both = {};
-        for (int j = 0; j < vectors; j++) {
-            const Floats dx = load(job.offset_x + j * kLanes), dy = load(job.offset_y + j * kLanes);
-            const Ints at_x = __builtin_convertvector(madd(ux, dx, madd(uy, dy, u)), Ints);
-            const Ints at_y = __builtin_convertvector(madd(vx, dx, madd(vy, dy, v)), Ints);
-            const Floats value = __builtin_convertvector(between(s, at_x, at_y), Floats);
-            const Floats weighed = window.weight[j] * value;
-            sum += weighed;
-            square = madd(weighed, value, square);
-            both = madd(window.centred[j], value, both);
-        }
-        sums[0][i] = sum, sums[1][i] = square, sums[2][i] = both;
+// What the correlation of a window with one sight of it is made of.
+struct Sums {
+    Floats value[kLanes], square[kLanes], both[kLanes];
+};
+
+SURFKIT_INLINE void add_up(const StereoJob& job, const StereoSource& s, const Window& window, const Sights& seen, int at,
+                           Sums& sums, int to) {
+    const Floats u = broadcast(seen.u[at]), ux = broadcast(seen.ux[at]), uy = broadcast(seen.uy[at]);
+    const Floats v = broadcast(seen.v[at]), vx = broadcast(seen.vx[at]), vy = broadcast(seen.vy[at]);
+    Floats sum = {}, square = {}, both = {};
+    for (int j = 0; j < job.samples / kLanes; j++) {
+        const Floats dx = load(job.offset_x + j * kLanes), dy = load(job.offset_y + j * kLanes);
+        const Ints at_x = __builtin_convertvector(madd(ux, dx, madd(uy, dy, u)), Ints);
+        const Ints at_y = __builtin_convertvector(madd(vx, dx, madd(vy, dy, v)), Ints);
+        const Floats value = __builtin_convertvector(between(s, at_x, at_y), Floats);
+        const Floats weighed = window.weight[j] * value;
+        sum += weighed;
+        square = madd(weighed, value, square);
+        both = madd(window.centred[j], value, both);
     }
-    for (int i = trials.count; i % 4; i++) sums[0][i] = sums[1][i] = sums[2][i] = Floats{};
+    sums.value[to] = sum, sums.square[to] = square, sums.both[to] = both;
+}
+
+// 1 - correlation of `count` sights, kLanes at most; kNothing stays.
+SURFKIT_INLINE void correlate(const Window& window, Sums& sums, int count, float* match) {
+    for (int i = count; i % 4; i++) sums.value[i] = sums.square[i] = sums.both[i] = Floats{};
     constexpr float kUnit = 1.0f / (kOne * kOne);
-    for (int i = 0; i < trials.count; i += kLanes) {
-        const int count = trials.count - i;
-        const Floats mean = sum_each(sums[0] + i, count) * kUnit, square = sum_each(sums[1] + i, count) * (kUnit * kUnit);
-        const Floats both = sum_each(sums[2] + i, count) * kUnit, zero{};
-        const Floats contrast = higher(zero, square - mean * mean) + kNoise;
-        const Floats off = 1.0f - both / root(contrast * window.contrast);
-        store(trials.match + i, higher(load(trials.match + i), lower(broadcast(1.0f), higher(zero, off))));
-    }
+    const Floats mean = sum_each(sums.value, count) * kUnit, square = sum_each(sums.square, count) * (kUnit * kUnit);
+    const Floats both = sum_each(sums.both, count) * kUnit, zero{};
+    const Floats contrast = higher(zero, square - mean * mean) + kNoise;
+    const Floats off = 1.0f - both / root(contrast * window.contrast);
+    store(match, higher(load(match), lower(broadcast(1.0f), higher(zero, off))));
 }
 
-// Add what the pixel misses itself by when it is carried to a view on each plane, and back by the depth found there (ACMM).
-SURFKIT_INLINE void add_reprojection(const StereoJob& job, const StereoSource& s, float x, float y, Trials& trials) {
+// `match` of all planes in these views, to which they have been projected.
+SURFKIT_INLINE void compare(const StereoJob& job, const Window& window, const int* views, int number, int planes,
+                            Sights& seen) {
+    Sums sums;
+    int at = 0, done = 0;
+    for (int n = 0; n < number; n++) {
+        for (int i = 0; i < planes; i++, at++) {
+            add_up(job, job.sources[views[n]], window, seen, at, sums, at - done);
+            if (at + 1 - done < kLanes) continue;
+            correlate(window, sums, kLanes, seen.match + done);
+            done = at + 1;
+        }
+    }
+    if (done < at) correlate(window, sums, at - done, seen.match + done);
+}
+
+// `match`, and what the pixel misses itself by when it is carried to a view on each plane, and back by the depth found there
+// (ACMM).
+SURFKIT_INLINE Floats with_reprojection(const StereoJob& job, const StereoSource& s, float x, float y, Floats u, Floats v,
+                                        Floats match) {
     const float* t = s.back;
     const Floats zero{}, wide = broadcast((float)s.inverse_width), high = broadcast((float)s.inverse_height);
-    for (int i = 0; i < trials.count; i += kLanes) {
-        const Floats u = load(trials.u + i) * (1.0f / kOne) - (kBorder + 0.5f / kOne);
-        const Floats v = load(trials.v + i) * (1.0f / kOne) - (kBorder + 0.5f / kOne);
-        const Floats at_x = (u + 0.5f) * s.to_inverse[0], at_y = (v + 0.5f) * s.to_inverse[1];
-        const Mask inside = less_equal(zero, at_x) & lesser(at_x, wide) & less_equal(zero, at_y) & lesser(at_y, high);
-        const Ints column = __builtin_convertvector(keep(inside, at_x), Ints);
-        const Ints row = __builtin_convertvector(keep(inside, at_y), Ints);
-        const Ints word = gather((const uint32_t*)s.inverse, row * s.inverse_width + column);
-        Floats found;
-        std::memcpy(&found, &word, sizeof found);
-        const Floats z = madd(u, t[6], madd(v, t[7], madd(found, t[11], broadcast(t[8]))));
-        const Floats turn = reciprocal(higher(z, broadcast(1e-20f)));
-        const Floats off_x = madd(u, t[0], madd(v, t[1], madd(found, t[9], broadcast(t[2])))) * turn - x;
-        const Floats off_y = madd(u, t[3], madd(v, t[4], madd(found, t[10], broadcast(t[5])))) * turn - y;
-        const Mask known = inside & lesser(zero, found) & lesser(zero, z);
-        const Floats miss = select(known, lower(broadcast(kMostError), root(madd(off_x, off_x, off_y * off_y))), kMostError);
-        const Floats match = load(trials.match + i);
-        store(trials.match + i, select(lesser(match, kNothing), madd(miss, job.consistency, match), match));
-    }
+    u = u * (1.0f / kOne) - (kBorder + 0.5f / kOne), v = v * (1.0f / kOne) - (kBorder + 0.5f / kOne);
+    const Floats at_x = (u + 0.5f) * s.to_inverse[0], at_y = (v + 0.5f) * s.to_inverse[1];
+    const Mask inside = less_equal(zero, at_x) & lesser(at_x, wide) & less_equal(zero, at_y) & lesser(at_y, high);
+    const Ints column = __builtin_convertvector(keep(inside, at_x), Ints);
+    const Ints row = __builtin_convertvector(keep(inside, at_y), Ints);
+    const Ints word = gather((const uint32_t*)s.inverse, row * s.inverse_width + column);
+    Floats found;
+    std::memcpy(&found, &word, sizeof found);
+    const Floats z = madd(u, t[6], madd(v, t[7], madd(found, t[11], broadcast(t[8]))));
+    const Floats turn = reciprocal(higher(z, broadcast(1e-20f)));
+    const Floats off_x = madd(u, t[0], madd(v, t[1], madd(found, t[9], broadcast(t[2])))) * turn - x;
+    const Floats off_y = madd(u, t[3], madd(v, t[4], madd(found, t[10], broadcast(t[5])))) * turn - y;
+    const Mask known = inside & lesser(zero, found) & lesser(zero, z);
+    const Floats miss = select(known, lower(broadcast(kMostError), root(madd(off_x, off_x, off_y * off_y))), kMostError);
+    return select(lesser(match, kNothing), madd(miss, job.consistency, match), match);
 }
 
 // Draws that depend on pixel and pass alone, so that no order of the work changes them.
@@ -250,26 +275,31 @@ struct Pixel {
         if (job.survey) {
             trials.add(plane);
             trials.fill();
-            for (int view = 0; view < job.views; view++) {
-                see(view);
-                here[view] = told(trials.match[0]);
-            }
+            int all[kMostViews];
+            std::iota(all, all + job.views, 0);
+            alignas(64) float match[kMostViews][kTrials];
+            see(all, job.views, match);
+            for (int view = 0; view < job.views; view++) here[view] = told(match[view][0]);
             trials.count = 0;
         }
-        int vote[kMostViews];
-        for (int view = 0; view < job.views; view++) {
-            vote[view] = 2 * here[view];
-            for (int i = 0; i < neighbours; i++) {
-                const int64_t there = (int64_t)(y + (int)offset[i][1]) * job.width + x + (int)offset[i][0];
-                vote[view] += job.each[there * job.views + view];
-            }
-            vote[view] = vote[view] * kMostViews + view;  // equal ones in their order
+        int16_t vote[kMostViews];  // the lowest match best
+        std::fill(vote, vote + kMostViews, INT16_MAX);
+        for (int view = 0; view < job.views; view++) vote[view] = (int16_t)(2 * here[view]);
+        for (int i = 0; i < neighbours; i++) {
+            const uint8_t* there = here + ((int)offset[i][1] * (int64_t)job.width + (int)offset[i][0]) * job.views;
+            for (int view = 0; view < job.views; view++) vote[view] = (int16_t)(vote[view] + there[view]);
         }
+        for (int view = 0; view < job.views; view++)
+            vote[view] = (int16_t)(vote[view] * kMostViews + view);  // equal ones in their order
         count = std::min(kLooked * job.best, job.views);
-        std::partial_sort(vote, vote + count, vote + job.views);
-        for (int i = 0; i < count; i++) chosen[i] = vote[i] % kMostViews;
+        int16_t before[kMostViews] = {};  // how many views match better
+        for (int view = 0; view < job.views; view++)
+            for (int other = 0; other < kMostViews; other++)
+                before[other] = (int16_t)(before[other] + (vote[view] < vote[other]));
+        for (int view = 0; view < job.views; view++)
+            if (before[view] < count) chosen[before[view]] = view;
         const int nothing = (2 + neighbours) * 255;  // views that show neither this pixel nor those around it say nothing
-        while (count > 1 && vote[count - 1] / kMostViews >= nothing) count--;
+        while (count > 1 && vote[chosen[count - 1]] / kMostViews >= nothing) count--;
     }
 
     // Keep the planes that cost least in the views looked at so far.
@@ -323,11 +353,21 @@ struct Pixel {
 
     static uint8_t told(float match) { return (uint8_t)(std::min(match, 1.0f) * 255.0f); }
 
-    // What a view says of all trials.
-    void see(int view) {
-        const StereoSource& s = job.sources[view];
-        compare(job, window, s, (float)x, (float)y, trials);
-        if (s.inverse) add_reprojection(job, s, (float)x, (float)y, trials);
+    // What views say of all trials.
+    void see(const int* views, int number, float (*match)[kTrials]) {
+        Sights seen;
+        for (int n = 0; n < number; n++) project(job, job.sources[views[n]], (float)x, (float)y, trials, seen, n);
+        compare(job, window, views, number, trials.count, seen);
+        for (int n = 0; n < number; n++) {
+            const StereoSource& s = job.sources[views[n]];
+            for (int i = 0; i < trials.count; i += kLanes) {
+                const int at = n * trials.count + i;
+                Floats found = load(seen.match + at);
+                if (s.inverse)
+                    found = with_reprojection(job, s, (float)x, (float)y, load(seen.u + at), load(seen.v + at), found);
+                store(match[n] + i, found);
+            }
+        }
     }
 
     // Costs of the trials before any view is looked at: how much they differ from what lies around, less where the picture
@@ -373,10 +413,11 @@ struct Pixel {
     void attempt(bool known) {
         screen(known);
         alignas(64) float match[kMostViews][kTrials];
-        for (int at = 0; at < count; at++) {
-            if (at == job.best) drop_worst(match, at);
-            see(chosen[at]);
-            std::copy(trials.match, trials.match + kTrials, match[at]);
+        const int few = std::min(job.best, count);
+        see(chosen, few, match);
+        if (few < count) {
+            drop_worst(match, few);
+            see(chosen + few, count - few, match + few);
         }
         add_least(match);
         int best = -1;
