@@ -102,7 +102,7 @@ def update_rows(
         numbers = rate, BETA1, BETA2, correction, EPSILON, torch.get_num_threads()
         native.module().adam_rows(value, rows, kept, grad, exp_avg, exp_avg_sq, *numbers)
         return
-    some = [tensor[rows] for tensor in (value, exp_avg, exp_avg_sq)]
+    some = [tensor.index_select(0, rows) for tensor in (value, exp_avg, exp_avg_sq)]
     some[2] *= kept.view(-1, *[1] * (value.dim() - 1))
     update(some[0], grad, *some[1:], rate, index)
     for tensor, part in zip((value, exp_avg, exp_avg_sq), some, strict=True):

@@ -34,7 +34,7 @@ class InView:
 
     def of_columns(self, columns: Columns) -> Columns:
         """(R, ...) of each of (N, ...)."""
-        return {name: value[self.rows] for name, value in columns.items()}
+        return {name: value.index_select(0, self.rows) for name, value in columns.items()}
 
     def among_all(self, values: Tensor) -> Tensor:
         """(N, ...) of (R, ...), 0 for the points that are not in view."""
