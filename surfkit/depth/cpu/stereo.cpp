@@ -282,6 +282,7 @@ struct Pixel {
             for (int view = 0; view < job.views; view++) here[view] = told(match[view][0]);
             trials.count = 0;
         }
+        static_assert((2 + 4) * 255 * kMostViews + kMostViews <= INT16_MAX, "votes are 16 bits wide");
         int16_t vote[kMostViews];  // the lowest match best
         std::fill(vote, vote + kMostViews, INT16_MAX);
         for (int view = 0; view < job.views; view++) vote[view] = (int16_t)(2 * here[view]);
