@@ -272,6 +272,22 @@ def test_the_reprojection_error_counts_up_to_its_limit():
     assert with_wrong.cost[12, 16] - plain.cost[12, 16] == pytest.approx(0.3, abs=1e-5)
 
 
+def test_those_views_are_looked_at_that_match_best_here_and_around():
+    """Twice as many as count; the pixel itself counts twice, each of its neighbours once."""
+    here = two_pictures(0)[0]
+    others = [two_pictures(seed)[1] for seed in range(1, 8)]
+    planes = Planes.at(np.full((24, 32), 0.5, np.float32), len(others))
+    planes.each[:] = np.random.default_rng(5).integers(0, 60, planes.each.shape)  # noise matches worse than that
+    before = planes.each.astype(int)
+    votes = 2 * before[1:-1, 1:-1] + before[:-2, 1:-1] + before[2:, 1:-1] + before[1:-1, :-2] + before[1:-1, 2:]
+    improve(here, others, planes, replace(STILL, best=2, survey=False), seed=0)
+    looked_at = np.zeros(votes.shape, bool)
+    np.put_along_axis(looked_at, np.argsort(votes, axis=-1, kind="stable")[..., :4], True, -1)
+    y, x = np.indices(votes.shape[:2])
+    first = (y + x) % 2 == 0  # the others know what these have found
+    np.testing.assert_array_equal((planes.each[1:-1, 1:-1] != before[1:-1, 1:-1])[first], looked_at[first])
+
+
 def test_a_plane_counts_in_the_views_that_match_it_best():
     """Half of the views show something nearer in front: what lies behind is found in the others, though all pixels
     begin in front, where the first half matches better."""
