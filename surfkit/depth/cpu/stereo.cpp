@@ -94,7 +94,7 @@ SURFKIT_INLINE Ints between(const StereoSource& s, Ints x, Ints y) {
 #endif
 }
 
-// Planes through one pixel that are tried together, so that none waits for another; in lanes, except for the samples.
+// Planes through one pixel that are tried together, so that none waits for another.
 struct Trials {
     alignas(64) float w[kTrials], gx[kTrials], gy[kTrials];
     alignas(64) float cost[kTrials];  // of all views so far
@@ -150,6 +150,7 @@ struct Sums {
     Floats value[kLanes], square[kLanes], both[kLanes];
 };
 
+// Those of sight `at`, put at `to`.
 SURFKIT_INLINE void add_up(const StereoJob& job, const StereoSource& s, const Window& window, const Sights& seen, int at,
                            Sums& sums, int to) {
     const Floats u = broadcast(seen.u[at]), ux = broadcast(seen.ux[at]), uy = broadcast(seen.uy[at]);

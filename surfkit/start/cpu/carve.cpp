@@ -75,7 +75,7 @@ void meet(const CarveGrid& grid, const uint8_t* solid, const double* from, const
             }
             const double step = kStep / std::sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]);
             for (double t = low + step / 2; t <= high; t += step) {
-                int64_t c[3];
+                int64_t c[3];  // the nearest voxel; within the grid, no position is below -0.5
                 for (int a = 0; a < 3; a++) c[a] = std::clamp((int)(from[a] + t * way[a] + 0.5), 0, grid.size[a] - 1);
                 if (!at(c[0], c[1], c[2])) continue;
                 lengths[ray] = (float)t;
