@@ -16,6 +16,13 @@ from surfkit.core.check import BadInput
 from surfkit.native import module
 from surfkit.scene.camera import Camera
 
+ENOUGH = 2000
+"""About so many pixels tell how bright a picture is."""
+MATCHING, FEWEST = 0.3, 50
+"""Cost of a match from which a pixel tells less about that, where more than so many cost less."""
+MOST_GAIN = 4.0
+"""Pictures that differ more in brightness are not made alike any further."""
+
 
 @dataclass(frozen=True, eq=False)
 class Grey:
@@ -90,6 +97,7 @@ class Terms:
         smoothness: Cost of a difference of one pixel of parallax from the neighbours.
         consistency: Cost of a reprojection error of one pixel.
         spread: Difference of grey values, of 255, at which a pixel of the window counts 1 / e.
+        brightness: Cost of a relative difference of brightness between the windows.
         samples: Pixels of a window that are compared; 16 or 32.
         best: Views that count for a pixel.
         window: Side of the windows compared, pixels; odd.
@@ -103,6 +111,7 @@ class Terms:
     smoothness: float
     consistency: float
     spread: float
+    brightness: float
     samples: int
     best: int
     window: int
@@ -135,11 +144,13 @@ def improve(
         pattern(terms.window),
         [other.packed for other in others],
         ways,
+        gains(here, others, planes),
         [None if inverse is None else inverse.numpy() for inverse in known or [None] * len(others)],
         planes.value,
         planes.cost,
         planes.each,
-        [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread],
+        [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency]
+        + [terms.spread, terms.brightness],
         terms.samples,
         terms.best,
         terms.survey,
@@ -185,6 +196,31 @@ def pattern(window: int) -> np.ndarray:
 def from_middle(at: tuple[int, int]) -> int:
     """Squared distance of a pixel of a window from the middle."""
     return at[0] ** 2 + at[1] ** 2
+
+
+def gains(here: Grey, others: Sequence[Grey], planes: Planes) -> list[float]:
+    """What the grey values of each other picture are to be multiplied with to be as bright as those of a picture.
+
+    The median of the ratios between pixels and what their planes show there; of about `ENOUGH` pixels, and of those
+    among them that match, if enough do.
+    """
+    height, width = here.value.shape
+    step = max(1, round((height * width / ENOUGH) ** 0.5))
+    y, x = (places.ravel() for places in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+    ours, found = here.value[y, x].astype(np.float64), []
+    for other, match in zip(others, planes.each[y, x].T, strict=True):
+        numbers = np.array(way(here.camera, other.camera))
+        at = numbers[:9].reshape(3, 3) @ np.stack([x, y, np.ones_like(x)])
+        at += numbers[9:, None] * planes.value[y, x, 0]
+        in_front = at[2] > 0
+        u, v = np.rint(at[:2] / np.where(in_front, at[2], 1))
+        shown = in_front & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
+        matching = shown & (match < 255 * MATCHING)
+        counts = matching if matching.sum() > FEWEST else shown
+        theirs = other.value[v[counts].astype(int), u[counts].astype(int)]
+        ratio = float(np.median((ours[counts] + 1) / (theirs + 1.0))) if counts.any() else 1.0
+        found.append(min(max(ratio, 1 / MOST_GAIN), MOST_GAIN))
+    return found
 
 
 def way(here: Camera, there: Camera) -> list[float]:

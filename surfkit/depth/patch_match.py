@@ -50,6 +50,7 @@ RANGES = {
     "window": (3, 17),
     "spread": (1e-4, 100),
     "smoothness": (0, 1000),
+    "brightness": (0, 1000),
     "passes": (1, 8),
     "consistency": (0, 1000),
     "rounds": (1, 8),
@@ -73,7 +74,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -97,6 +98,11 @@ class PatchMatch(DepthEstimator):
     spread: float = 0.06
     """Difference of grey values, in [0, 1], at which the weight of a pixel of the window falls to 1 / e: windows end at
     image edges."""
+
+    brightness: float = 2.5
+    """Cost of a difference of brightness between a window and what another photograph shows, as a share of both, up to
+    half of the cost of a wrong match. Photographs are made equally bright before. Windows without texture look alike
+    otherwise, on roofs and in shadow. 0 turns this off."""
 
     smoothness: float = 0.015
     """Cost of a difference of one pixel of parallax between the planes of neighbouring pixels of one grey value; 1 is
@@ -350,6 +356,7 @@ class Work:
             smoothness=settings.smoothness,
             consistency=0.0,
             spread=255 * settings.spread,
+            brightness=settings.brightness,
             samples=MANY,
             best=settings.best,
             window=settings.window,

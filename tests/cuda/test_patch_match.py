@@ -15,7 +15,7 @@ from surfkit.scene.camera import Camera
 from .sources import changed
 
 pytestmark = needs_native
-TERMS = Terms(0.2, 2, 14, 0.5, 0.015, 0.2, 15, samples=32, best=2, window=7, survey=False)
+TERMS = Terms(0.2, 2, 14, 0.5, 0.015, 0.2, 15, 2.5, samples=32, best=2, window=7, survey=False)
 
 
 def pictures(count: int, seed: int = 0) -> list[Grey]:
@@ -74,6 +74,7 @@ CASES = {
     "many": {},
     "all views first": {"survey": True},
     "no maps": {"consistency": 0.0},
+    "brightness does not count": {"brightness": 0.0},
     "one view counts": {"best": 1},
     "all views count": {"best": 5},
     "the largest window": {"window": 17},

@@ -22,7 +22,7 @@ from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 CPU = torch.device("cpu")
-STILL = Terms(0.1, 10, 1e-9, 0, 0, 0, 30, samples=32, best=1, window=5, survey=True)
+STILL = Terms(0.1, 10, 1e-9, 0, 0, 0, 30, 2.5, samples=32, best=1, window=5, survey=True)
 """No plane is worth trying: they differ by too few pixels."""
 
 
@@ -87,8 +87,8 @@ def two_pictures(seed: int) -> tuple[Grey, Grey]:
     return tuple(Grey(c, draw.integers(0, 256, (c.height, c.width)).astype(np.uint8)) for c in cameras)
 
 
-def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms: Terms) -> float:
-    """1 - the weighted correlation of a window with its picture through a plane, by loops."""
+def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms: Terms, gain: float = 1.0) -> float:
+    """1 - the weighted correlation of a window with its picture through a plane, and their brightness, by loops."""
     numbers = np.array(way(here.camera, there.camera))
     turn, shift = numbers[:9].reshape(3, 3), numbers[9:]
     height, width = here.value.shape
@@ -109,19 +109,35 @@ def slow_cost(here: Grey, there: Grey, x: int, y: int, plane: np.ndarray, terms:
         ours.append(value)
         theirs.append(upper * (1 - (v - above)) + under * (v - above))
     w, a, b = np.array(weights) / sum(weights), np.array(ours), np.array(theirs)
+    bright, seen = w @ a, gain * (w @ b)
+    unlike = min(0.5, terms.brightness * abs(bright - seen) / ((bright + seen) / 2 + 50))
     a, b = a - w @ a, b - w @ b
-    return float(np.clip(1 - (w * a) @ b / np.sqrt((w @ a**2 + 1) * (w @ b**2 + 1)), 0, 1))
+    return float(min(max(0, 1 - (w * a) @ b / np.sqrt((w @ a**2 + 1) * (w @ b**2 + 1))) + unlike, 1))
+
+
+def slow_gain(here: Grey, there: Grey, planes: np.ndarray) -> float:
+    """Median ratio of grey values of every eighth pixel and what its plane shows, by loops."""
+    numbers, ratios = np.array(way(here.camera, there.camera)), []
+    for y in range(4, here.camera.height, 8):
+        for x in range(4, here.camera.width, 8):
+            at = numbers[:9].reshape(3, 3) @ [x, y, 1] + numbers[9:] * planes[y, x, 0]
+            u, v = round(at[0] / at[2]), round(at[1] / at[2])
+            if 0 <= u < there.camera.width and 0 <= v < there.camera.height:
+                ratios.append((float(here.value[y, x]) + 1) / (float(there.value[v, u]) + 1))
+    return float(np.median(ratios))
 
 
 @pytest.mark.parametrize("samples", [16, 32])
-def test_the_kernel_is_the_weighted_correlation_of_windows(samples):
+def test_the_kernel_is_the_weighted_correlation_of_windows_and_their_brightness(samples):
     here, there = two_pictures(0)
     still = replace(STILL, samples=samples)
     planes = Planes.at(np.full((24, 32), 0.5, np.float32), 1)
     planes.value[..., 1], planes.value[..., 2] = 0.004, -0.006
+    gain = slow_gain(here, there, planes.value)
+    assert abs(gain - 1) > 0.02
     improve(here, [there], planes, still, seed=0)
     for x, y in ((16, 12), (10, 8), (20, 15), (1, 1)):
-        wanted = slow_cost(here, there, x, y, planes.value[y, x].astype(float), still)
+        wanted = slow_cost(here, there, x, y, planes.value[y, x].astype(float), still, gain)
         assert planes.cost[y, x] == pytest.approx(
             wanted, abs=8e-3
         )  # positions are rounded to a 64th of a pixel, in noise
@@ -152,7 +168,7 @@ def test_pictures_upside_down_match_as_well(window):
     pictures, found = two_pictures(3), []
     for here, there in (pictures, [turned(grey) for grey in pictures]):
         planes = Planes.at(np.full((24, 32), 0.5, np.float32), 1)
-        improve(here, [there], planes, replace(STILL, window=window, samples=16), seed=0)
+        improve(here, [there], planes, replace(STILL, window=window, samples=16, brightness=0.0), seed=0)
         found.append(planes.cost)
     inner = found[0] < 1  # the other view shows the pixel
     assert inner.mean() > 0.3
@@ -195,16 +211,47 @@ def test_a_plane_costs_the_soft_minimum_of_its_views():
     here, there = (grey.camera for grey in two_pictures(0))
     here, others = bright(here, 4), [bright(there, noise) for noise in (4, 10, 30)]
     planes = Planes.at(np.full((24, 32), 0.5, np.float32), 3)
-    terms = replace(STILL, best=3)
+    terms = replace(STILL, best=3, brightness=0.0)
     improve(here, others, planes, terms, seed=0)
     below = []
     for x, y in ((x, y) for x in range(8, 26, 3) for y in range(6, 20, 3)):
-        costs = np.array([slow_cost(here, there, x, y, planes.value[y, x].astype(float), terms) for there in others])
+        plane = planes.value[y, x].astype(float)
+        costs = np.array([slow_cost(here, there, x, y, plane, terms) for there in others])
         if costs.max() < 0.99:  # a view that shows nothing is left out
             wanted = -0.3 * np.log(np.exp(-costs / 0.3).mean())
             assert planes.cost[y, x] == pytest.approx(wanted, abs=6e-3)
             below.append(costs.mean() - wanted)
     assert len(below) > 5 and max(below) > 0.03
+
+
+def test_repeated_texture_is_told_apart_by_its_brightness():
+    """Waves on a surface that becomes brighter to the right: correlation takes each wave for any other."""
+    draw = np.random.default_rng(4)
+    shape, lens = (48, 64), (40.0, 40.0, 32.0, 24.0, 64, 48)
+
+    def seen(right: float, exposure: float) -> Grey:
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[0, 3] = -right
+        y, x = np.mgrid[:48, :64]
+        x = x + 40 * right * 0.5  # of inverse depth 0.5
+        shown = (
+            40 + 1.5 * x + 15 * np.sin(2 * np.pi * x / 8) + 15 * np.sin(2 * np.pi * y / 7) + draw.normal(0, 1, shape)
+        )
+        return Grey(Camera(pose, *lens), (exposure * shown).round().clip(0, 255).astype(np.uint8))
+
+    def right(brightness: float, exposure: float) -> float:
+        """Share of the pixels in the middle, which begin a wave off, whose planes are right after some passes."""
+        others = [seen(to, exposure) for to in (0.4, -0.4)]
+        planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
+        planes.value[12:-12, 22:-22, 0] = 1
+        terms = Terms(0.1, 1.2, 16, 1, 0.015, 0, 15, brightness, samples=32, best=2, window=7, survey=False)
+        for index in range(6):
+            improve(seen(0, 1), others, planes, replace(terms, survey=index == 0), seed=index)
+        return float((16 * np.abs(planes.value[14:-14, 24:-24, 0] - 0.5) < 1).mean())
+
+    alike, other, blind = right(2.5, 1), right(2.5, 0.7), right(0, 1)
+    assert alike > 0.9 > 0.1 > blind
+    assert other > 0.9  # photographs of another exposure
 
 
 def test_passes_do_not_lose_what_is_right_where_noise_is_all_that_differs():
@@ -220,7 +267,7 @@ def test_passes_do_not_lose_what_is_right_where_noise_is_all_that_differs():
         return Grey(Camera(pose, *lens), shown.round().astype(np.uint8))
 
     planes = Planes.at(np.full(shape, 0.5, np.float32), 4)
-    terms = Terms(0.1, 1, 20, 1, 0.015, 0, 15, samples=32, best=3, window=7, survey=False)
+    terms = Terms(0.1, 1, 20, 1, 0.015, 0, 15, 2.5, samples=32, best=3, window=7, survey=False)
     others = [seen(right) for right in (0.25, 0.5, -0.25, -0.5)]
     ours = seen(0)
     for index in range(8):
@@ -308,7 +355,7 @@ def test_a_plane_counts_in_the_views_that_match_it_best():
     planes = Planes.at(np.full(ours.shape, front, np.float32), 6)
     planes.each[..., :3], planes.each[..., 3:] = 60, 250
     planes.value[:, 30:34, 0] = behind
-    terms = Terms(0.1, 2, 14, 0, 0.001, 0, 30, samples=32, best=3, window=7, survey=False)
+    terms = Terms(0.1, 2, 14, 0, 0.001, 0, 30, 2.5, samples=32, best=3, window=7, survey=False)
     for index in range(6):
         improve(Grey(Camera(torch.eye(4, dtype=torch.float64), *lens), ours), others, planes, terms, seed=index)
     inner = planes.value[8:-8, 16:-16, 0]
@@ -373,7 +420,11 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
     grey = Grey(camera, np.full(shape, 128, np.uint8))  # and without texture
     planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
     improve(
-        grey, [grey, grey], planes, Terms(0.1, 2, 10, 1, 0.01, 0, 30, samples=16, best=1, window=7, survey=True), seed=1
+        grey,
+        [grey, grey],
+        planes,
+        Terms(0.1, 2, 10, 1, 0.01, 0, 30, 2.5, samples=16, best=1, window=7, survey=True),
+        seed=1,
     )
     assert np.isfinite(planes.value).all() and np.isfinite(planes.cost).all()
 

@@ -36,7 +36,7 @@ void add_stereo(nb::module_& m) {
     m.def(
         "patch_match",
         [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Words> pixels, std::vector<std::vector<double>> ways,
-           std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
+           std::vector<double> gains, std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
            nb::ndarray<float, nb::c_contig, nb::device::cpu> cost,
            nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int samples, int best, bool survey,
            uint32_t seed, const std::string& kernels, int threads) {
@@ -46,6 +46,7 @@ void add_stereo(nb::module_& m) {
                 s.pixels = pixels[i].data();
                 s.stride = (int)pixels[i].shape(1);
                 s.height = (int)pixels[i].shape(0) - 2 * kBorder;
+                s.gain = (float)gains.at(i);
                 s.width = s.stride - 2 * kBorder;
                 const std::vector<double>& way = ways.at(i);
                 for (int j = 0; j < 12; j++) s.way[j] = (float)way.at(j), s.back[j] = (float)way.at(12 + j);
@@ -73,6 +74,7 @@ void add_stereo(nb::module_& m) {
             job.smoothness = (float)settings.at(4);
             job.consistency = (float)settings.at(5);
             job.spread = (float)settings.at(6);
+            job.brightness = (float)settings.at(7);
             for (int i = 0; i < 256; i++) job.alike[i] = std::exp(-(float)i / job.spread);
             float reach = 1;
             for (int i = 0; i < 2 * kSamples; i++) reach = std::max(reach, std::abs(pattern.data()[i]));
@@ -90,7 +92,7 @@ void add_stereo(nb::module_& m) {
                         k.improve(job, row, colour);
                 });
         },
-        nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("inverse"), nb::arg("plane"),
+        nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("gains"), nb::arg("inverse"), nb::arg("plane"),
         nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("samples"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
         nb::arg("threads"));
     m.attr("STEREO_SAMPLES") = kSamples;

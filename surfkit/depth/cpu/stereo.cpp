@@ -22,7 +22,7 @@ constexpr int kTrials = 16;  // room for planes that are tried together
 
 struct Window {
     Floats weight[kVectors], centred[kVectors];  // weights that sum to 1; times the grey values less their mean
-    float contrast;
+    float contrast, mean;
 };
 
 struct Plane {
@@ -74,6 +74,7 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
         square = madd(out.centred[v], d, square);
     }
     out.contrast = total(square) + kNoise;
+    out.mean = m;
 }
 
 // Grey values between pixels, times 64 * 64, at fixed-point positions of which six bits are fractions. The four bytes of a
@@ -114,7 +115,7 @@ struct Trials {
 struct Sights {
     static constexpr int kRoom = kMostViews * kTrials + kLanes;
     float u[kRoom], v[kRoom], ux[kRoom], uy[kRoom], vx[kRoom], vy[kRoom];  // fixed-point
-    float match[kRoom];
+    float match[kRoom], gain[kRoom];
 };
 
 // Where the middle of the window falls in view number `n` of those that are looked at, and what a step in the window moves it
@@ -141,7 +142,7 @@ SURFKIT_INLINE void project(const StereoJob& job, const StereoSource& s, float x
         store(out.u + to, madd(keep(shown, u), one, border)), store(out.v + to, madd(keep(shown, v), one, border));
         store(out.ux + to, keep(shown, ux) * one), store(out.uy + to, keep(shown, uy) * one);
         store(out.vx + to, keep(shown, vx) * one), store(out.vy + to, keep(shown, vy) * one);
-        store(out.match + to, select(shown, zero, kNothing));
+        store(out.match + to, select(shown, zero, kNothing)), store(out.gain + to, broadcast(s.gain));
     }
 }
 
@@ -169,15 +170,20 @@ SURFKIT_INLINE void add_up(const StereoJob& job, const StereoSource& s, const Wi
     sums.value[to] = sum, sums.square[to] = square, sums.both[to] = both;
 }
 
-// 1 - correlation of `count` sights, kLanes at most; kNothing stays.
-SURFKIT_INLINE void correlate(const Window& window, Sums& sums, int count, float* match) {
+// 1 - correlation of `count` sights, kLanes at most, and what their brightness differs by: correlation alone takes anything
+// faint for like another. kNothing stays.
+SURFKIT_INLINE void correlate(const StereoJob& job, const Window& window, Sums& sums, int count, const float* gain,
+                              float* match) {
     for (int i = count; i % 4; i++) sums.value[i] = sums.square[i] = sums.both[i] = Floats{};
     constexpr float kUnit = 1.0f / (kOne * kOne);
     const Floats mean = sum_each(sums.value, count) * kUnit, square = sum_each(sums.square, count) * (kUnit * kUnit);
     const Floats both = sum_each(sums.both, count) * kUnit, zero{};
     const Floats contrast = higher(zero, square - mean * mean) + kNoise;
     const Floats off = 1.0f - both / root(contrast * window.contrast);
-    store(match, higher(load(match), lower(broadcast(1.0f), higher(zero, off))));
+    const Floats bright = mean * load(gain), both_bright = (bright + window.mean) * 0.5f + kDark;
+    const Floats unlike = magnitude(bright - window.mean) / both_bright * job.brightness;
+    const Floats all = higher(zero, off) + lower(broadcast(kUnlike), unlike);
+    store(match, higher(load(match), lower(broadcast(1.0f), all)));
 }
 
 // `match` of all planes in these views, to which they have been projected.
@@ -189,11 +195,11 @@ SURFKIT_INLINE void compare(const StereoJob& job, const Window& window, const in
         for (int i = 0; i < planes; i++, at++) {
             add_up(job, job.sources[views[n]], window, seen, at, sums, at - done);
             if (at + 1 - done < kLanes) continue;
-            correlate(window, sums, kLanes, seen.match + done);
+            correlate(job, window, sums, kLanes, seen.gain + done, seen.match + done);
             done = at + 1;
         }
     }
-    if (done < at) correlate(window, sums, at - done, seen.match + done);
+    if (done < at) correlate(job, window, sums, at - done, seen.gain + done, seen.match + done);
 }
 
 // `match`, and what the pixel misses itself by when it is carried to a view on each plane, and back by the depth found there

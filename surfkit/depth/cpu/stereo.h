@@ -13,6 +13,7 @@ struct StereoSource {
     // Four bytes: a grey value, and those to the right, below, and below to the right; continued by kBorder on each side.
     const uint32_t* pixels;
     int width, height, stride;
+    float gain;  // times its grey values, so that it is as bright as the picture whose planes are sought
     float way[12];  // a, then b
     // Inverse depths of that picture, for geometric consistency, or null; and the way back.
     const float* inverse;
@@ -38,6 +39,7 @@ struct StereoJob {
     float jitter_px;     // by which planes are changed at random
     float smoothness;    // cost of a difference of one pixel of parallax from the neighbours
     float consistency;   // cost of a reprojection error of one pixel
+    float brightness;    // cost of a relative difference of brightness between a window and what a view shows
     float spread;        // difference of grey values at which a pixel of the window counts 1 / e
     float alike[256];    // what pixels of such a difference count
     float stretch;       // most pixels of a view that one pixel of a window may cover: its window must stay within kBorder

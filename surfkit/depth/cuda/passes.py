@@ -13,7 +13,7 @@ from torch import Tensor
 
 from surfkit.cuda.modules import Kernels, kernels
 from surfkit.cuda.source import Source
-from surfkit.depth.native import Grey, Planes, Terms, pattern, way
+from surfkit.depth.native import Grey, Planes, Terms, gains, pattern, way
 from surfkit.native import module
 from surfkit.scene.camera import Camera
 
@@ -30,6 +30,7 @@ class View(ctypes.Structure):
         ("size", ctypes.c_int * 2),
         ("stride", ctypes.c_int),
         ("inverse_size", ctypes.c_int * 2),
+        ("gain", ctypes.c_float),
         ("to_inverse", ctypes.c_float * 2),
         ("way", ctypes.c_float * 12),
         ("back", ctypes.c_float * 12),
@@ -45,7 +46,7 @@ class Job(ctypes.Structure):
         ("survey", ctypes.c_int),
         ("seed", ctypes.c_uint),
         ("lens", ctypes.c_float * 4),
-        ("terms", ctypes.c_float * 7),
+        ("terms", ctypes.c_float * 8),
         ("stretch", ctypes.c_float),
         ("pattern", ctypes.c_float * 96),
     )
@@ -88,7 +89,7 @@ class GpuPasses:
         pictures = [self.picture(other) for other in others]
         nothing = torch.empty(0, 0, device=self.device)
         maps = [nothing if found is None else found.to(self.device) for found in known or [None] * len(others)]
-        views = self.uploads(np.frombuffer(views_of(here.camera, others, pictures, maps), np.uint8))
+        views = self.uploads(np.frombuffer(views_of(here, others, planes, pictures, maps), np.uint8))
         given = self.picture(here), joined(pictures), joined(maps)
         state = [self.uploads(part) for part in (planes.value, planes.cost, planes.each)]
         height, width = planes.cost.shape
@@ -115,17 +116,21 @@ def joined(parts: Sequence[Tensor]) -> Tensor:
     return torch.cat([part.flatten() for part in parts])
 
 
-def views_of(here: Camera, others: Sequence[Grey], pictures: Sequence[Tensor], maps: Sequence[Tensor]) -> ctypes.Array:
+def views_of(
+    here: Grey, others: Sequence[Grey], planes: Planes, pictures: Sequence[Tensor], maps: Sequence[Tensor]
+) -> ctypes.Array:
     """A `View` for each picture to compare with, of those that are joined."""
     border = module().STEREO_BORDER
     made = (View * len(others))()
     first = first_inverse = 0
-    for view, other, picture, inverse in zip(made, others, pictures, maps, strict=True):
+    bright = gains(here, others, planes)
+    for view, other, gain, picture, inverse in zip(made, others, bright, pictures, maps, strict=True):
         height, width = (side - 2 * border for side in picture.shape)
         view.first, view.first_inverse = first, first_inverse
         view.size[:], view.stride, view.inverse_size[:] = (width, height), picture.shape[1], inverse.shape[::-1]
+        view.gain = gain
         view.to_inverse[:] = inverse.shape[1] / width, inverse.shape[0] / height
-        view.way[:], view.back[:] = way(here, other.camera), way(other.camera, here)
+        view.way[:], view.back[:] = way(here.camera, other.camera), way(other.camera, here.camera)
         first, first_inverse = first + picture.numel(), first_inverse + inverse.numel()
     return made
 
@@ -134,7 +139,8 @@ def job_of(camera: Camera, views: int, terms: Terms, seed: int) -> Job:
     """What a pass is told of one picture."""
     offsets = pattern(terms.window)
     most = max(1.0, float(np.abs(offsets[:2]).max()))
-    numbers = terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency, terms.spread
+    parallax = terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency
+    numbers = terms.low, terms.high, *parallax, terms.spread, terms.brightness
     return Job(
         (camera.width, camera.height),
         (views, terms.best),

@@ -9,7 +9,7 @@ using namespace surfkit;
 struct View {
     long long first, first_inverse;
     int width, height, stride, inverse_width, inverse_height;  // the last are 0 without a map
-    float to_inverse[2], way[12], back[12];
+    float gain, to_inverse[2], way[12], back[12];
 };
 
 // A pass over the planes of a picture, as in depth/cpu/stereo.h.
@@ -17,7 +17,7 @@ struct Job {
     int width, height, count, best, survey;
     unsigned seed;
     float fx, fy, cx, cy;
-    float low, high, parallax, jitter_px, smoothness, consistency, spread, stretch;
+    float low, high, parallax, jitter_px, smoothness, consistency, spread, brightness, stretch;
     float offset_x[kSamples], offset_y[kSamples], nearness[kSamples];
 };
 
@@ -71,12 +71,13 @@ struct Place {
 
 // The window of a pixel, in registers: weights that sum to 1; the same times the grey values less their mean.
 struct Window {
-    float weight[SAMPLES], centred[SAMPLES], contrast;
+    float weight[SAMPLES], centred[SAMPLES], contrast, mean;
 
     Window(const Job& job, Buffer<const unsigned> here, long long middle) {
         const int stride = job.width + 2 * kBorder;
         const float own = (float)(here[middle] & 255u);
-        float all = kTiny, mean = 0, square = 0;
+        float all = kTiny, square = 0;
+        mean = 0;
 #pragma unroll
         for (int j = 0; j < SAMPLES; j++) {
             const float value = (float)(here[middle + (int)job.offset_y[j] * stride + (int)job.offset_x[j]] & 255u);
@@ -206,8 +207,8 @@ struct Pixel {
         return fminf(kMostError, sqrtf(off_x * off_x + off_y * off_y));
     }
 
-    // 1 - correlation of the window with what a view shows on a plane, and the reprojection error; kNothing where the view
-    // does not show it.
+    // 1 - correlation of the window with what a view shows on a plane, what their brightness differs by, and the reprojection
+    // error; kNothing where the view does not show it.
     float compared(const Window& window, const View& s, const Plane& p) const {
         const Place place(job, s, (float)x, (float)y, p);
         if (!place.is_shown) return kNothing;
@@ -225,7 +226,10 @@ struct Pixel {
             mean += weighed, square += weighed * value, both += window.centred[j] * value;
         }
         const float contrast = fmaxf(0.0f, square - mean * mean) + kNoise;
-        const float off = fminf(1.0f, fmaxf(0.0f, 1.0f - both / sqrtf(contrast * window.contrast)));
+        const float bright = mean * s.gain, both_bright = (bright + window.mean) * 0.5f + kDark;
+        const float unlike = fminf(kUnlike, fabsf(bright - window.mean) / both_bright * job.brightness);
+        const float apart = fmaxf(0.0f, 1.0f - both / sqrtf(contrast * window.contrast));
+        const float off = fminf(1.0f, apart + unlike);
         return s.inverse_width ? off + job.consistency * missed(s, place.u, place.v) : off;
     }
 
