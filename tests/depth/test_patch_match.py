@@ -373,6 +373,21 @@ def test_fewer_large_pictures_are_kept_in_memory(farm, tmp_path):
     assert Work(PatchMatch(longest=20_000), replace(given, views=huge), pairs, []).room() == 5
 
 
+@pytest.mark.parametrize("setting", ["brightness", "smoothness", "consistency"])
+def test_each_cost_that_is_set_decides_about_maps(farm, tmp_path, setting):
+    scene, tracks, _ = farm
+    pairs = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2], *[[0]] * 16]
+
+    def inverse(name: str, estimator: PatchMatch) -> torch.Tensor:
+        (tmp_path / name).mkdir()
+        given = DepthInput(scene.train, tracks, CPU, tmp_path / name)
+        return Work(estimator, given, pairs, [0]).last.map(0).inverse
+
+    as_set = inverse("set", PatchMatch(rounds=1, passes=1))
+    other = inverse("other", PatchMatch(rounds=1, passes=1, **{setting: getattr(PatchMatch(), setting) / 2}))
+    assert not torch.equal(as_set, other)
+
+
 def test_maps_that_nobody_needs_any_more_are_deleted(farm, tmp_path):
     """While twenty views are estimated one after the other, and with the same result."""
     scene, tracks, _ = farm
