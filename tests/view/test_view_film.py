@@ -26,6 +26,7 @@ class Drawing:
     Attributes:
         heights: That were drawn.
         hold_at: Number of the frame before which it waits.
+        held: Set when it waits.
         go_on: For what.
         closing: Set when the server is about to end.
         error: To raise.
@@ -33,10 +34,11 @@ class Drawing:
 
     def __init__(self):
         self.heights, self.hold_at, self.error = [], None, None
-        self.go_on, self.closing = threading.Event(), None
+        self.held, self.go_on, self.closing = threading.Event(), threading.Event(), None
 
     def __call__(self, view):
         if len(self.heights) == self.hold_at:
+            self.held.set()
             assert self.go_on.wait(LONG_S)
         if self.error is not None:
             raise self.error
@@ -96,7 +98,7 @@ def test_it_stops_and_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(FilmTool, "_clicked", lambda tool: clicks.append(clicked(tool)))
     with path_on_page(drawing, tmp_path) as browser:
         browser.press("make the video")
-        browser.wait_for(lambda b: len(drawing.heights) == 3)
+        wait_until(drawing.held.is_set)
         browser.wait_for(lambda b: any(row.get("label") == "stop" for row in b.gui.values()))
         browser.press("stop")
         wait_until(lambda: len(clicks) == 2)
