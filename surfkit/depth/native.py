@@ -17,11 +17,11 @@ from surfkit.native import module
 from surfkit.scene.camera import Camera
 
 ENOUGH = 2000
-"""About so many pixels tell how bright a picture is."""
+"""Pixels, about, by which the brightness of two pictures is compared."""
 MATCHING, FEWEST = 0.3, 50
-"""Cost of a match from which a pixel tells less about that, where more than so many cost less."""
+"""Only pixels that match at less than this cost are used for that, if there are more than so many."""
 MOST_GAIN = 4.0
-"""Pictures that differ more in brightness are not made alike any further."""
+"""Largest gain, and one over the least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,10 +199,17 @@ def from_middle(at: tuple[int, int]) -> int:
 
 
 def gains(here: Grey, others: Sequence[Grey], planes: Planes) -> list[float]:
-    """What the grey values of each other picture are to be multiplied with to be as bright as those of a picture.
+    """Gain of each other picture: its grey values times this are as bright as those of `here`, whatever the exposure.
 
-    The median of the ratios between pixels and what their planes show there; of about `ENOUGH` pixels, and of those
-    among them that match, if enough do.
+    The median ratio between pixels and what their planes show in the other picture; 1 where nothing is shown.
+
+    Args:
+        here: The picture that the planes belong to.
+        others: V pictures.
+        planes: At the size of `here`; their costs by view tell which pixels match.
+
+    Returns:
+        V gains, from 1 / `MOST_GAIN` to `MOST_GAIN`.
     """
     height, width = here.value.shape
     step = max(1, round((height * width / ENOUGH) ** 0.5))

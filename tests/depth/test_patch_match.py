@@ -215,8 +215,7 @@ def test_a_plane_costs_the_soft_minimum_of_its_views():
     improve(here, others, planes, terms, seed=0)
     below = []
     for x, y in ((x, y) for x in range(8, 26, 3) for y in range(6, 20, 3)):
-        plane = planes.value[y, x].astype(float)
-        costs = np.array([slow_cost(here, there, x, y, plane, terms) for there in others])
+        costs = np.array([slow_cost(here, there, x, y, planes.value[y, x].astype(float), terms) for there in others])
         if costs.max() < 0.99:  # a view that shows nothing is left out
             wanted = -0.3 * np.log(np.exp(-costs / 0.3).mean())
             assert planes.cost[y, x] == pytest.approx(wanted, abs=6e-3)
@@ -234,9 +233,8 @@ def test_repeated_texture_is_told_apart_by_its_brightness():
         pose[0, 3] = -right
         y, x = np.mgrid[:48, :64]
         x = x + 40 * right * 0.5  # of inverse depth 0.5
-        shown = (
-            40 + 1.5 * x + 15 * np.sin(2 * np.pi * x / 8) + 15 * np.sin(2 * np.pi * y / 7) + draw.normal(0, 1, shape)
-        )
+        waves = np.sin(2 * np.pi * x / 8) + np.sin(2 * np.pi * y / 7)
+        shown = 40 + 1.5 * x + 15 * waves + draw.normal(0, 1, shape)
         return Grey(Camera(pose, *lens), (exposure * shown).round().clip(0, 255).astype(np.uint8))
 
     def right(brightness: float, exposure: float) -> float:
@@ -434,13 +432,8 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
     camera = Camera(torch.eye(4, dtype=torch.float64), 30.0, 30.0, shape[1] / 2, shape[0] / 2, shape[1], shape[0])
     grey = Grey(camera, np.full(shape, 128, np.uint8))  # and without texture
     planes = Planes.at(np.full(shape, 0.5, np.float32), 2)
-    improve(
-        grey,
-        [grey, grey],
-        planes,
-        Terms(0.1, 2, 10, 1, 0.01, 0, 30, 2.5, samples=16, best=1, window=7, survey=True),
-        seed=1,
-    )
+    terms = Terms(0.1, 2, 10, 1, 0.01, 0, 30, 2.5, samples=16, best=1, window=7, survey=True)
+    improve(grey, [grey, grey], planes, terms, seed=1)
     assert np.isfinite(planes.value).all() and np.isfinite(planes.cost).all()
 
 

@@ -170,8 +170,8 @@ SURFKIT_INLINE void add_up(const StereoJob& job, const StereoSource& s, const Wi
     sums.value[to] = sum, sums.square[to] = square, sums.both[to] = both;
 }
 
-// 1 - correlation of `count` sights, kLanes at most, and what their brightness differs by: correlation alone takes anything
-// faint for like another. kNothing stays.
+// 1 - correlation of `count` sights, kLanes at most, plus the cost of their difference in brightness: by correlation alone,
+// all faint windows look alike. kNothing stays.
 SURFKIT_INLINE void correlate(const StereoJob& job, const Window& window, Sums& sums, int count, const float* gain,
                               float* match) {
     for (int i = count; i % 4; i++) sums.value[i] = sums.square[i] = sums.both[i] = Floats{};

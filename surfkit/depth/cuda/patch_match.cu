@@ -207,8 +207,8 @@ struct Pixel {
         return fminf(kMostError, sqrtf(off_x * off_x + off_y * off_y));
     }
 
-    // 1 - correlation of the window with what a view shows on a plane, what their brightness differs by, and the reprojection
-    // error; kNothing where the view does not show it.
+    // 1 - correlation of the window with what a view shows on a plane, the cost of their difference in brightness, and the
+    // reprojection error; kNothing where the view does not show it.
     float compared(const Window& window, const View& s, const Plane& p) const {
         const Place place(job, s, (float)x, (float)y, p);
         if (!place.is_shown) return kNothing;
