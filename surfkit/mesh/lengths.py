@@ -14,8 +14,6 @@ from surfkit.scene.scene import Frame
 
 SAMPLED = 16
 """Views that automatic lengths are taken from."""
-PIXELS = 1.0
-"""Automatic voxels are this many pixels wide, at the median depth of the median view, or larger: see tsdf.py."""
 DEPTHS = 2.0
 """Automatic limit of the depth, in median depths."""
 LEAST_CUT = 1.75
@@ -32,9 +30,24 @@ class Lengths:
 
 
 def resolve(
-    voxel: Length, truncation: Length, limit: Length, subject: MeshInput, which: Which, truncation_voxels: float = 4.0
+    voxel: Length,
+    truncation: Length,
+    limit: Length,
+    subject: MeshInput,
+    which: Which,
+    voxel_px: float,
+    truncation_voxels: float,
 ) -> Lengths:
     """The lengths in local units; automatic ones follow from what the views see, the truncation from the voxel.
+
+    Args:
+        voxel: Side of a voxel; if it is auto, `voxel_px` pixels at the median depth.
+        truncation: Of distances; if it is auto, `truncation_voxels` voxels.
+        limit: Depth from which nothing is fused; if it is auto, `DEPTHS` median depths.
+        subject: What is meshed.
+        which: Depth of a pixel.
+        voxel_px: See `voxel`.
+        truncation_voxels: See `truncation`.
 
     Raises:
         BadInput: There is no depth in any view, or lengths are in metres and nobody knows how long a unit is.
@@ -42,7 +55,7 @@ def resolve(
     given = [to_local(value, subject.frame) for value in (voxel, truncation, limit)]
     if given[0] is None or given[2] is None:
         depth, pixel = look(subject, which)
-        given[0] = given[0] or PIXELS * pixel
+        given[0] = given[0] or voxel_px * pixel
         given[2] = given[2] or DEPTHS * depth
     size, cut, far = given
     cut = cut or truncation_voxels * size

@@ -26,7 +26,7 @@ from surfkit.scene.scene import Frame
 
 LEAST_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
-AUTO_TRIANGLES = 15_000_000
+AUTO_TRIANGLES = 20_000_000
 """About as many as an automatic voxel gives at most."""
 
 
@@ -39,8 +39,12 @@ class TSDF(Mesher):
     """
 
     voxel: Length = "auto"
-    """Voxel size, metres; auto is the size of one pixel at the median depth, larger where there would be more than
-    about fifteen million triangles."""
+    """Voxel size, metres; auto is `voxel_px` pixels at the median depth, larger where there would be more than about
+    twenty million triangles."""
+
+    voxel_px: float = 1.0
+    """Voxel size in pixels at the median depth where it is auto: smaller ones separate surfaces that lie close
+    together, and give more triangles."""
 
     truncation: Length = "auto"
     """Truncation distance, metres; auto is `truncation_voxels` voxels. Walls thinner than this may get lost."""
@@ -77,6 +81,8 @@ class TSDF(Mesher):
     def __post_init__(self) -> None:
         for name in ("voxel", "truncation", "depth_limit"):
             check_length(f"mesh.{name}", getattr(self, name))
+        if not 0.1 <= self.voxel_px <= 100:
+            raise BadInput(f"mesh.voxel_px is {self.voxel_px:g}; it must be from 0.1 to 100")
         if not LEAST_CUT <= self.truncation_voxels <= 100:
             raise BadInput(
                 f"mesh.truncation_voxels is {self.truncation_voxels:g}; it must be from {LEAST_CUT:g} to 100"
@@ -153,7 +159,8 @@ class TSDF(Mesher):
 
     def _lengths(self, subject: MeshInput) -> tuple[Lengths, Estimate]:
         """What the lengths come to, and how many blocks that takes; BadInput if it is more than can be."""
-        lengths = resolve(self.voxel, self.truncation, self.depth_limit, subject, self.depth, self.truncation_voxels)
+        given = self.voxel, self.truncation, self.depth_limit
+        lengths = resolve(*given, subject, self.depth, self.voxel_px, self.truncation_voxels)
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
         found = estimate(subject.splats, lengths.voxel, within)
@@ -161,7 +168,7 @@ class TSDF(Mesher):
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(
-                    f"voxels of a pixel, {with_unit(lengths.voxel, subject.frame)}, would give about "
+                    f"voxels of {self.voxel_px:g} pixels, {with_unit(lengths.voxel, subject.frame)}, would give about "
                     f"{found.total * BLOCK_TRIANGLES / 1e6:.0f} million triangles: they are made larger"
                 )
             )

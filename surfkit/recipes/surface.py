@@ -50,8 +50,14 @@ SURFACE = Recipe(
     # Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
     # Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
     # ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
-    # than not.
-    mesh=TSDF(truncation_voxels=1.75, least_views=0.05, largest_px=64.0, trust=Agreement(alone=0.5, covered_by=2)),
+    # than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys apart.
+    mesh=TSDF(
+        voxel_px=0.8,
+        truncation_voxels=1.75,
+        least_views=0.05,
+        largest_px=64.0,
+        trust=Agreement(alone=0.5, covered_by=2),
+    ),
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where

@@ -54,6 +54,9 @@ def test_automatic_lengths_are_those_of_the_pixels():
     assert facts["truncation_m"] == pytest.approx(4 * facts["voxel_m"])
     assert facts["depth_limit_m"] == pytest.approx(2 * np.median(depths) / 0.1, rel=1e-5)
     assert TSDF(truncation_voxels=2.5).mesh(given).facts["truncation_m"] == pytest.approx(2.5 * facts["voxel_m"])
+    coarser = TSDF(voxel_px=1.25).mesh(given).facts
+    assert coarser["voxel_m"] == pytest.approx(1.25 * facts["voxel_m"])
+    assert coarser["truncation_m"] == pytest.approx(4 * coarser["voxel_m"])
     unknown = TSDF().mesh(replace(given, frame=replace(given.frame, metres=None))).facts
     assert unknown["voxel"] == pytest.approx(facts["voxel"]) and "voxel_m" not in unknown
 
@@ -205,6 +208,8 @@ def test_what_cannot_be_meshed_is_said():
         TSDF().mesh(replace(given, views=[]))
     for wrong in (
         {"truncation_voxels": 1.0},
+        {"voxel_px": 0.0},
+        {"voxel_px": float("nan")},
         {"voxel": 0.0},
         {"truncation": -1.0},
         {"depth_limit": float("inf")},
