@@ -42,16 +42,16 @@ class TSDF(Mesher):
     """Voxel size, metres; auto is `voxel_px` pixels at the median depth, larger where there would be more than about
     twenty million triangles."""
 
-    voxel_px: float = 1.0
-    """Voxel size in pixels at the median depth where it is auto: smaller ones separate surfaces that lie close
-    together, and give more triangles."""
-
     truncation: Length = "auto"
     """Truncation distance, metres; auto is `truncation_voxels` voxels. Walls thinner than this may get lost."""
 
     truncation_voxels: float = 4.0
     """Truncation distance in voxels where it is auto: a smaller one averages less noise, but separates surfaces that
     lie close together."""
+
+    voxel_px: float = 1.0
+    """Voxel size in pixels at the median depth where it is auto: smaller ones separate surfaces that lie close
+    together, and give more triangles."""
 
     depth_limit: Length = "auto"
     """Depth beyond which pixels are not fused, metres; auto is twice the median depth."""
