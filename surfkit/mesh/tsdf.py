@@ -51,7 +51,8 @@ class TSDF(Mesher):
 
     voxel_px: float = 1.0
     """Voxel size in pixels at the median depth where it is auto: smaller ones separate surfaces that lie close
-    together, and give more triangles."""
+    together, and give more triangles. A pixel larger than a voxel counts by the inverse of its area, so lower
+    `least_views` with them."""
 
     depth_limit: Length = "auto"
     """Depth beyond which pixels are not fused, metres; auto is twice the median depth."""
@@ -168,7 +169,7 @@ class TSDF(Mesher):
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(
-                    f"voxels of {self.voxel_px:g} pixels, {with_unit(lengths.voxel, subject.frame)}, would give about "
+                    f"voxels of {self.voxel_px:g} px, {with_unit(lengths.voxel, subject.frame)}, would give about "
                     f"{found.total * BLOCK_TRIANGLES / 1e6:.0f} million triangles: they are made larger"
                 )
             )

@@ -213,8 +213,8 @@ GRADIENT = Table(
 )
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
-WITHIN = replace(surface.SURFACE.mesh, voxel_px=1.0)
-CONFIRMED = replace(WITHIN, least_views=0.1, trust=Agreement(alone=0.1))
+PIXEL_VOXELS = replace(surface.SURFACE.mesh, voxel_px=1.0)
+CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=Agreement(alone=0.1))
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; it has no splats, and so no PSNR.
 SURFACE = Table(
@@ -231,7 +231,7 @@ SURFACE = Table(
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
         Row("+ higher learning rates", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
-        Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": WITHIN}),
+        Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),
         Row("+ voxels smaller than a pixel", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
