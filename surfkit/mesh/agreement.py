@@ -129,7 +129,8 @@ def compare(
 
     The point that a pixel shows is carried into the other view. If what is seen there is as far, they agree; if it is
     further, the other view sees through the point. If it is nearer, it hides the point, unless this view in turn sees
-    through what is nearer. Views that do not see the point, or that it is hidden from, are ignored.
+    through what is nearer. To see through a place, all pixels around it must: beside an edge, which of them it falls on
+    is chance. Views that do not see the point, or that it is hidden from, are ignored.
 
     Args:
         camera: Of the pixels.
@@ -171,16 +172,24 @@ def compare_in_torch(
     known = found > 0
     off = ((ratio - 1) / tolerance) ** 2
     agreement = torch.where(known, (1 - off).clamp_min(0), 0.0)
-    seen_through = known & (ratio > 1 + tolerance)
+    nearest = _taken(_nearest(other), x / z, y / z, known)
+    seen_through = known & (ratio > 1 + tolerance) & (nearest > (1 + tolerance) * z * depth)
     hidden = known & (ratio < 1 - tolerance)
     # What hides the point lies on the line from the other view's centre to it.
     turn = camera.world_to_camera @ torch.linalg.inv(there.world_to_camera)
     eye = turn[:3, 3].to(depth.dtype)
     rays = camera.rays(depth.dtype)
     p, q, r = (eye[i] + (rays[i] * depth - eye[i]) * ratio for i in range(3))
-    beyond = _taken(depth, p / r * camera.fx + camera.cx, q / r * camera.fy + camera.cy, hidden & (r > 0))
+    beyond = _taken(_nearest(depth), p / r * camera.fx + camera.cx, q / r * camera.fy + camera.cy, hidden & (r > 0))
     looked_through = (beyond > 0) & (beyond > r * (1 + tolerance))
     return agreement, (seen_through | looked_through).to(depth.dtype), known.to(depth.dtype)
+
+
+def _nearest(depth: Tensor) -> Tensor:
+    """(H, W) the least depth of each pixel that has some and of those around it; 0 where it has none."""
+    known = torch.where(depth > 0, depth, torch.inf)
+    least = -torch.nn.functional.max_pool2d(-known[None, None], 3, 1, 1)[0, 0]
+    return torch.where(depth > 0, least, 0.0)
 
 
 def _taken(values: Tensor, x: Tensor, y: Tensor, where: Tensor) -> Tensor:

@@ -13,6 +13,16 @@ struct Map {
         if (!(x >= 0 && x < (float)width && y >= 0 && y < (float)height)) return 0;
         return values[(int64_t)y * width + (int64_t)x];
     }
+    // The least that there is, of a pixel that has some and those around it.
+    float nearest(float x, float y) const {
+        float least = at(x, y);
+        if (!(least > 0)) return 0;
+        const int column = (int)x, row = (int)y;
+        for (int v = std::max(row - 1, 0); v <= std::min(row + 1, height - 1); v++)
+            for (int u = std::max(column - 1, 0); u <= std::min(column + 1, width - 1); u++)
+                if (const float value = values[(int64_t)v * width + u]; value > 0) least = std::min(least, value);
+        return least;
+    }
 };
 
 }  // namespace
@@ -41,14 +51,15 @@ void agree(const AgreeJob& job, int row) {
         const float ratio = found / (at[2] * depth);
         const float off = (ratio - 1) / job.tolerance;
         agreement = std::max(1 - off * off, 0.0f);
-        if (ratio > far) against = 1;
+        // Beside an edge it takes all pixels around to see through: which of them a point falls on is chance there.
+        if (ratio > far && there.nearest(at[0] / at[2], at[1] / at[2]) > far * at[2] * depth) against = 1;
         if (!(ratio < near)) continue;
         // What hides the point lies on the line from the other view's centre to it.
         const float r[3] = {(float)ray[0], (float)ray[1], 1};
         float p[3];
         for (int i = 0; i < 3; i++) p[i] = job.eye[i] + (r[i] * depth - job.eye[i]) * ratio;
         if (!(p[2] > 0)) continue;
-        const float beyond = here.at(p[0] / p[2] * l.fx + l.cx, p[1] / p[2] * l.fy + l.cy);
+        const float beyond = here.nearest(p[0] / p[2] * l.fx + l.cx, p[1] / p[2] * l.fy + l.cy);
         if (beyond > 0 && beyond > p[2] * far) against = 1;
     }
 }
