@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from surfkit.mesh.base import Mesh
-from surfkit.scene.sets import is_among
 
 RIM = 0.25
 """Share of the area of a connected part from which what would fill a ring shows that the ring is no hole."""
 EVEN = 0.05
 """Of the squared sides of a triangle, that counts as its area."""
+AT_ONCE = 1_000_000
+"""Pairs of corners of the rings that are filled together."""
 
 
 def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
@@ -28,15 +31,18 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
     known, free = edges(mesh)
     parts = _parts(mesh)
     areas = np.bincount(parts[mesh.faces[:, 0]], areas_of(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
-    made = []
-    for ring in rings(free):
-        if 3 <= len(ring) <= most:
-            faces = fill(mesh.vertices[ring].astype(np.float64), ring)
-            if areas_of(mesh.vertices, faces).sum() < RIM * areas[parts[ring[0]]] and not _across(faces, ring, known):
-                made.append(faces)
-    if not made:
+    made, count = [], 0
+    for some in _alike(rings(free), most):
+        corners = mesh.vertices[some].astype(np.float64)
+        local = fill(corners)
+        faces = some[np.arange(len(some))[:, None, None], local]
+        fits = _areas(corners, local) < RIM * areas[parts[some[:, 0]]]
+        fits &= ~_across(faces, local, some.shape[1], known)
+        made.append(faces[fits].reshape(-1, 3))
+        count += int(fits.sum())
+    if not count:
         return mesh, 0
-    return replace(mesh, faces=np.concatenate([mesh.faces, *made]).astype(np.int32)), len(made)
+    return replace(mesh, faces=np.concatenate([mesh.faces, *made]).astype(np.int32)), count
 
 
 def edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -74,13 +80,37 @@ def rings(free: np.ndarray) -> list[np.ndarray]:
     return _rings({b: a for a, b in free[once].tolist()})
 
 
-def _across(faces: np.ndarray, ring: np.ndarray, known: np.ndarray) -> bool:
-    """Whether new triangles have an edge, beside those of the ring, that is among the edges of the mesh, in order."""
-    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    around = np.sort(np.stack([ring, np.roll(ring, -1)], 1), axis=1)
-    names, own = (pairs[:, 0] << 32 | pairs[:, 1] for pairs in (sides, around))
-    names = names[~is_among(names, own)]
-    return bool((known[np.searchsorted(known, names).clip(max=len(known) - 1)] == names).any())
+def _alike(found: Iterable[np.ndarray], most: int) -> Iterator[np.ndarray]:
+    """(R, n) vertices of rings of up to `most` edges, those of one length together, not too many at once."""
+    by_length = defaultdict(list)
+    for ring in found:
+        if 3 <= len(ring) <= most:
+            by_length[len(ring)].append(ring)
+    for length in sorted(by_length):
+        rows, step = np.stack(by_length[length]), max(1, AT_ONCE // length**2)
+        yield from (rows[first : first + step] for first in range(0, len(rows), step))
+
+
+def _areas(corners: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(R,) areas of what fills rings of (R, n, 3) positions with (R, n - 2, 3) triangles."""
+    a, b, c = np.moveaxis(corners[np.arange(len(corners))[:, None, None], faces], 2, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=2).sum(1) / 2
+
+
+def _across(faces: np.ndarray, local: np.ndarray, count: int, known: np.ndarray) -> np.ndarray:
+    """(R,) whether new triangles have an edge, beside those of their ring, that is among the edges of the mesh.
+
+    Args:
+        faces: (R, T, 3) vertices of the mesh.
+        local: The same as places in a ring.
+        count: Edges of a ring.
+        known: (E,) names of the edges of the mesh, in order.
+    """
+    sides, places = (np.sort(some[:, :, [[0, 1], [1, 2], [2, 0]]], axis=3) for some in (faces, local))
+    names = sides[..., 0].astype(np.int64) << 32 | sides[..., 1]
+    within = ~np.isin(places[..., 1] - places[..., 0], (1, count - 1))
+    there = known[np.searchsorted(known, names).clip(max=len(known) - 1)] == names
+    return (within & there).any((1, 2))
 
 
 def _rings(follows: dict[int, int]) -> list[np.ndarray]:
@@ -114,29 +144,33 @@ def areas_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2) / 2
 
 
-def fill(ring: np.ndarray, names: np.ndarray) -> np.ndarray:
-    """(n - 2, 3) names of the corners of the triangles that span a ring of (n, 3) positions with the least area.
+def fill(rings: np.ndarray) -> np.ndarray:
+    """(R, n - 2, 3) corners, as places in a ring, of the triangles that span rings of n edges with the least area.
 
     A little of the squared sides is added, so that of all that lie in a plane those with short sides are taken.
+
+    Args:
+        rings: (R, n, 3) positions.
     """
-    count = len(ring)
-    best, split = np.zeros((count, count)), np.zeros((count, count), np.int64)
+    count = rings.shape[1]
+    best, split = np.zeros((len(rings), count, count)), np.zeros((len(rings), count, count), np.int64)
     for span in range(2, count):
         low = np.arange(count - span)
         between = low[:, None] + np.arange(1, span)  # corners of a triangle over the chord from low to low + span
-        a, b, c = ring[low][:, None], ring[between], ring[low + span][:, None]
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=2)
-        area += EVEN * (((b - a) ** 2).sum(2) + ((c - b) ** 2).sum(2) + ((c - a) ** 2).sum(2))
-        total = area + best[low[:, None], between] + best[between, (low + span)[:, None]]
-        chosen = total.argmin(1)
-        best[low, low + span] = total[low, chosen]
-        split[low, low + span] = between[low, chosen]
-    faces, left = [], [(0, count - 1)]
-    while left:
-        low, high = left.pop()
-        if high - low < 2:
-            continue
-        middle = int(split[low, high])
-        faces.append((low, middle, high))
-        left += [(low, middle), (middle, high)]
-    return names[np.array(faces)]
+        a, b, c = rings[:, low][:, :, None], rings[:, between], rings[:, low + span][:, :, None]
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=3)
+        area += EVEN * (((b - a) ** 2).sum(3) + ((c - b) ** 2).sum(3) + ((c - a) ** 2).sum(3))
+        total = area + best[:, low[:, None], between] + best[:, between, (low + span)[:, None]]
+        best[:, low, low + span] = total.min(2)
+        split[:, low, low + span] = between[low, total.argmin(2)]
+    faces = np.zeros((len(rings), count - 2, 3), np.int64)
+    # Chords with something over them, and where in `faces` that begins.
+    on, at, low, high = np.arange(len(rings)), *(np.full(len(rings), value) for value in (0, 0, count - 1))
+    while len(on):
+        middle = split[on, low, high]
+        faces[on, at] = np.stack([low, middle, high], 1)
+        left, right = middle - low > 1, high - middle > 1
+        after = at + middle - low  # over the first half lie middle - low - 1 triangles
+        on, at = np.concatenate([on[left], on[right]]), np.concatenate([at[left] + 1, after[right]])
+        low, high = np.concatenate([low[left], middle[right]]), np.concatenate([middle[left], high[right]])
+    return faces

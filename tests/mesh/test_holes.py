@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from needs import needs
 
+from surfkit.mesh import holes
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.clean import clean
-from surfkit.mesh.holes import close_holes, edges, fill
+from surfkit.mesh.holes import EVEN, close_holes, edges, fill
 
 trimesh = needs("trimesh")
 
@@ -69,12 +71,46 @@ def test_rings_that_touch_are_left():
 def test_a_bent_ring_is_spanned_by_the_least_area():
     """A square frame folded along its diagonal: the two triangles beside the fold, not those across it."""
     ring = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 2], [0, 1, 0]], float)
-    faces = fill(ring, np.array([10, 11, 12, 13]))
+    flat = np.array([[0, 0, 0], [1, 0, 0], [2, 1, 0], [0, 1, 0]], float)
+    faces = fill(np.stack([flat, ring]))[1]
     areas = {}
     for split in ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]]):
         a, b, c = ring[np.array(split)].transpose(1, 0, 2)
         areas[tuple(sorted(tuple(sorted(f)) for f in split))] = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-    assert tuple(sorted(tuple(sorted(f - 10)) for f in faces)) == min(areas, key=areas.get)
+    assert tuple(sorted(tuple(sorted(f)) for f in faces)) == min(areas, key=areas.get)
+
+
+@pytest.mark.parametrize("count", [3, 5, 8])
+def test_rings_are_spanned_with_the_least_cost_of_all_ways(count):
+    """Against every way to cut a polygon into triangles, tried one by one."""
+
+    def ways(low, high):
+        if high - low < 2:
+            return [[]]
+        return [
+            [*one, *other, (low, middle, high)]
+            for middle in range(low + 1, high)
+            for one in ways(low, middle)
+            for other in ways(middle, high)
+        ]
+
+    def cost(ring, faces):
+        a, b, c = ring[np.array(faces)].transpose(1, 0, 2)
+        sides = ((b - a) ** 2 + (c - b) ** 2 + (c - a) ** 2).sum()
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() + EVEN * sides
+
+    rings = np.random.default_rng(count).normal(size=(20, count, 3))
+    for ring, faces in zip(rings, fill(rings), strict=True):
+        best = min(ways(0, count - 1), key=lambda way: cost(ring, way))
+        assert sorted(map(tuple, faces.tolist())) == sorted(best)
+
+
+def test_many_rings_are_filled_in_parts(monkeypatch):
+    holed = ball(without=(100, 300, 500))
+    whole = close_holes(holed, 6)
+    monkeypatch.setattr(holes, "AT_ONCE", 1)
+    closed, count = close_holes(holed, 6)
+    assert count == whole[1] == 3 and np.array_equal(closed.faces, whole[0].faces)
 
 
 def test_cleaning_says_how_many():
