@@ -33,11 +33,11 @@ def close_holes(mesh: Mesh, most: int) -> tuple[Mesh, int]:
     areas = np.bincount(parts[mesh.faces[:, 0]], areas_of(mesh.vertices, mesh.faces), parts.max(initial=0) + 1)
     made, count = [], 0
     for some in _alike(rings(free), most):
-        corners = mesh.vertices[some].astype(np.float64)
-        local = fill(corners)
-        faces = some[np.arange(len(some))[:, None, None], local]
-        fits = _areas(corners, local) < RIM * areas[parts[some[:, 0]]]
-        fits &= ~_across(faces, local, some.shape[1], known)
+        corners, length = mesh.vertices[some].astype(np.float64), some.shape[1]
+        local, first = fill(corners), length * np.arange(len(some))[:, None, None]
+        faces = some.ravel()[first + local]
+        spanned = areas_of(corners.reshape(-1, 3), (first + local).reshape(-1, 3)).reshape(len(some), -1).sum(1)
+        fits = (spanned < RIM * areas[parts[some[:, 0]]]) & ~_across(faces, local, length, known)
         made.append(faces[fits].reshape(-1, 3))
         count += int(fits.sum())
     if not count:
@@ -89,12 +89,6 @@ def _alike(found: Iterable[np.ndarray], most: int) -> Iterator[np.ndarray]:
     for length in sorted(by_length):
         rows, step = np.stack(by_length[length]), max(1, AT_ONCE // length**2)
         yield from (rows[first : first + step] for first in range(0, len(rows), step))
-
-
-def _areas(corners: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(R,) areas of what fills rings of (R, n, 3) positions with (R, n - 2, 3) triangles."""
-    a, b, c = np.moveaxis(corners[np.arange(len(corners))[:, None, None], faces], 2, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=2).sum(1) / 2
 
 
 def _across(faces: np.ndarray, local: np.ndarray, count: int, known: np.ndarray) -> np.ndarray:
