@@ -1,5 +1,6 @@
 #include "pool.h"
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <exception>
@@ -13,6 +14,13 @@
 
 namespace surfkit {
 namespace {
+
+// The first throw on a thread reserves memory for it; where memory has just given out that fails, and the C library ends
+// the process. So it is reserved before a body runs. (volatile: else the compiler leaves the call out.)
+void be_ready_to_throw() {
+    volatile const int reserved = std::uncaught_exceptions();
+    (void)reserved;
+}
 
 struct Job {
     const std::function<void(int64_t)>* body;
@@ -38,13 +46,18 @@ class Pool {
   public:
     void run(int64_t count, int helpers, const std::function<void(int64_t)>& body) {
         std::lock_guard<std::mutex> one_at_a_time(caller_);
+        be_ready_to_throw();
         Job job;
         job.body = &body;
         job.count = count;
         {
-            std::lock_guard<std::mutex> lock(mutex_);
-            while ((int)threads_.size() < helpers) threads_.emplace_back([this] { serve(); });
-            job.wanted = helpers;
+            std::unique_lock<std::mutex> lock(mutex_);
+            try {
+                while ((int)threads_.size() < helpers) threads_.emplace_back([this] { serve(); });
+            } catch (const std::exception&) {  // no memory for one more: those that are there do the work
+            }
+            done_.wait(lock, [&] { return ready_ == threads_.size(); });
+            job.wanted = std::min(helpers, (int)threads_.size());
             job_ = &job;
         }
         wake_.notify_all();
@@ -57,7 +70,10 @@ class Pool {
 
   private:
     void serve() {
+        be_ready_to_throw();
         std::unique_lock<std::mutex> lock(mutex_);
+        ready_++;
+        done_.notify_all();
         for (;;) {
             wake_.wait(lock, [&] { return job_ && job_->wanted > 0; });
             Job* job = job_;
@@ -73,6 +89,7 @@ class Pool {
     std::mutex caller_, mutex_;
     std::condition_variable wake_, done_;
     std::vector<std::thread> threads_;
+    size_t ready_ = 0;  // of them
     Job* job_ = nullptr;
 };
 

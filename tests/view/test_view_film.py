@@ -123,7 +123,7 @@ def test_the_server_ends_meanwhile(tmp_path, capsys):
     with path_on_page(drawing, tmp_path) as browser:
         drawing.go_on = drawing.closing
         browser.press("make the video")
-        browser.wait_for(lambda b: len(drawing.heights) == 2)
+        wait_until(drawing.held.is_set)
         thread = [each for each in threading.enumerate() if each.name == "video"][-1]
     thread.join(LONG_S)
     assert not thread.is_alive()
