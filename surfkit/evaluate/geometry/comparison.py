@@ -209,14 +209,19 @@ def compare(
     warn_if_sparse(theirs, tau)
     draws: list[Draw] = []
     others: dict[str, Draw | None] = {}
+    done, total = 0, len(WAYS) + settings.draws - 1
+    emit(Progress("measuring", done, total))
     for number in range(settings.draws):
         measure = Measurement(ours, theirs, crop, tau, np.random.default_rng([settings.seed, number]))
         if number == 0:
             measure.refuse_other_frame(matrix)
-        found = {way: measure.draw(matrix, way) for way in ((settings.align,) if number else WAYS)}
+        found = {}
+        for way in (settings.align,) if number else WAYS:
+            found[way] = measure.draw(matrix, way)
+            done += 1
+            emit(Progress("measuring", done, total))
         others = others or found
         draws.append(usable(found[settings.align], tau, quiet=number > 0))
-        emit(Progress("measuring", number + 1, settings.draws))
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
     return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs))
