@@ -213,7 +213,8 @@ GRADIENT = Table(
 )
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
-PIXEL_VOXELS = replace(surface.SURFACE.mesh, voxel_px=1.0)
+PIXEL_MAPS = replace(surface.SURFACE.mesh, oversampling=1.0)
+PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
 CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=Agreement(alone=0.1))
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; it has no splats, and so no PSNR.
@@ -230,9 +231,10 @@ SURFACE = Table(
         Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
-        Row("+ higher learning rates", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
+        Row("+ higher learning rates, lower ones of positions", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
         Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),
-        Row("+ voxels smaller than a pixel", {"mesh": surface.SURFACE.mesh}),
+        Row("+ voxels smaller than a pixel", {"mesh": PIXEL_MAPS}),
+        Row("+ depth maps of twice the size", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from surfkit.core.schedule import LearningRate
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import Elongation
 from surfkit.depth.patch_match import PatchMatch
@@ -21,17 +22,16 @@ from surfkit.start.stereo import StereoStart
 from surfkit.train.stage import Stage
 
 # Short runs learn more at higher rates than those of 3DGS, with which they end; four times these are too high for
-# boruszyn. Positions keep theirs: at higher rates points leave the depth of stereo that they begin at.
-RATES = {
-    name: replace(rate, start=2 * rate.start, end=rate.start) for name, rate in columns.RATES.items() if name != "means"
-}
+# boruszyn. Positions have half of theirs: at higher rates points leave the depth of stereo that they begin at.
+RATES = {name: replace(rate, start=2 * rate.start, end=rate.start) for name, rate in columns.RATES.items()}
+RATES["means"] = LearningRate(0.8e-4, 0.8e-6)
 
 SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
     primitive=Surfel2D(),
     depth=PatchMatch(),
     # In alleys, where no depth is trusted, training keeps right points that it has and finds few by itself.
-    start=StereoStart(closing=0.2),
+    start=StereoStart(closing=0.5),
     pretrain=Stage(
         losses={
             "l1": L1(),
@@ -50,10 +50,12 @@ SURFACE = Recipe(
     # Depth that other views confirm is averaged over as little as may be: neither side of a wall takes from the other.
     # Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
     # ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
-    # than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys apart.
+    # than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys
+    # apart; so do depth maps of twice the size.
     mesh=TSDF(
         voxel_px=0.8,
         truncation_voxels=1.75,
+        oversampling=2.0,
         least_views=0.05,
         largest_px=64.0,
         trust=Agreement(alone=0.5, covered_by=2),
@@ -61,8 +63,8 @@ SURFACE = Recipe(
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where
-# nobody would seem to look, and no discs at the rim: the mesh does not end there.
-STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, trust=replace(SURFACE.mesh.trust, covered_by=0))
+# nobody would seem to look, and no discs at the rim: the mesh does not end there. Its maps have their own pixels alone.
+STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, oversampling=1.0, trust=replace(SURFACE.mesh.trust, covered_by=0))
 STEREO = Recipe(
     about="Stereo depth maps alone, fused as recipe:surface fuses but for rims: no splats, the baseline of any surface",
     method=StereoFusion(mesher=Stereo(fusion=STEREO_FUSION)),
