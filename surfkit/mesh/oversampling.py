@@ -13,11 +13,15 @@ from surfkit.mesh.base import MeshInput
 from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 
+LONGEST = 4096
+"""Side up to which pictures are magnified, pixels: twice the size takes four times the memory."""
+
 
 def oversampled(subject: MeshInput, factor: float) -> MeshInput:
     """What is to be meshed, drawn with `factor` times as many pixels in a row and in a column, without photographs.
 
-    Splats have no pixels: more of them follow edges, and surfaces that are seen from the side, more closely.
+    Splats have no pixels: more of them follow edges, and surfaces that are seen from the side, more closely. Pictures
+    get no longer than `LONGEST` pixels by it.
 
     Raises:
         BadInput: What is drawn are no splats.
@@ -39,7 +43,8 @@ def oversampled(subject: MeshInput, factor: float) -> MeshInput:
 
 
 def magnified(camera: Camera, factor: float) -> Camera:
-    """The same camera with a picture that is `factor` times as large."""
+    """The same camera with a picture that is `factor` times as large, or of `LONGEST` pixels if that would be more."""
+    factor = min(factor, max(1.0, LONGEST / max(camera.width, camera.height)))
     return camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
 
 

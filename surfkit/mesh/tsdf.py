@@ -64,7 +64,8 @@ class TSDF(Mesher):
 
     oversampling: float = 1.0
     """Pixels of a depth map that is fused, for each pixel in a row of the photograph: more follow edges, and surfaces
-    seen from the side, more closely. Drawing, comparing and fusing take as many times more time, squared."""
+    seen from the side, more closely. Drawing, comparing and fusing take as many times more time, squared. Depth maps
+    get no longer than 4,096 pixels by it."""
 
     carve: bool = True
     """Free-space carving: pixels also count as free space in front of their truncation band, which removes floaters."""

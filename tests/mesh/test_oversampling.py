@@ -8,7 +8,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.agreement import Agreement
-from surfkit.mesh.oversampling import oversampled
+from surfkit.mesh.oversampling import magnified, oversampled
 from surfkit.mesh.tsdf import TSDF
 from surfkit.readers.depth_prior import DepthPrior
 
@@ -75,6 +75,13 @@ def test_masks_and_priors_have_the_size_of_what_is_drawn():
     half = TSDF(**LENGTHS, oversampling=1.5, trust=Agreement(priors="weigh", alone=1.0)).mesh(given)
     assert len(half.faces)
     assert oversampled(given, 1) is given
+
+
+def test_large_pictures_are_not_magnified_beyond_what_fits():
+    small, large, huge = (look_at([2.0, 0, 0], size=size) for size in ((48, 36), (2000, 3000), (6000, 4000)))
+    assert [(c.width, c.height) for c in (magnified(small, 2), magnified(small, 0.5))] == [(96, 72), (24, 18)]
+    assert (magnified(large, 2).width, magnified(large, 2).height) == (2731, 4096)
+    assert magnified(huge, 2) == huge and magnified(huge, 0.5).width == 3000
 
 
 def test_what_cannot_be_drawn_is_one_line():
