@@ -115,7 +115,7 @@ def test_only_the_class_falls_that_is_wrong():
     assert found["roof"]["f1"] > 0.97 and found["ground"]["f1"] > 0.9 and found["facade"]["f1"] < 0.12
     whole = compare(mesh(town()), mesh(town()), STILL)
     found = class_figures(classify(whole, STILL), whole.draws[0], TAU)["surface"]
-    assert min(one["f1"] for one in found.values()) == 1
+    assert min(one["f1"] for one in found.values()) > 0.999  # of points that are drawn anew
     lacking = compare(mesh(town(walls=False)), mesh(town()), STILL)
     found = class_figures(classify(lacking, STILL), lacking.draws[0], TAU)["surface"]
     assert found["facade"]["recall"] < 0.15 and found["roof"]["recall"] > 0.99 and found["ground"]["recall"] > 0.99

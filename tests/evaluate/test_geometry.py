@@ -154,6 +154,17 @@ def test_draws_differ_and_seeds_repeat():
     assert np.std([draw[2] for draw in first]) < 0.02
 
 
+def test_reconstructions_are_compared_with_the_same_points_of_the_truth():
+    truth = surface(BALL.vertices * 1.02, GLOBE.faces)
+    coarse = trimesh.creation.icosphere(3, 5.0)
+    rough = surface(coarse.vertices, np.asarray(coarse.faces))
+    fine, other = (compare(each, truth, still(tau=0.4, draws=2)).draws for each in (GLOBE, rough))
+    for one, two in zip(fine, other, strict=True):
+        assert len(one.reconstruction) and not np.array_equal(one.reconstruction, two.reconstruction)
+        assert np.array_equal(one.truth, two.truth)
+    assert not np.array_equal(fine[0].truth, fine[1].truth)
+
+
 def test_a_given_transform_and_crop(tmp_path):
     matrix = np.eye(4)
     matrix[:3, :3] = 2 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])

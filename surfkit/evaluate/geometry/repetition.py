@@ -146,11 +146,10 @@ class Measurement:
 
     def __init__(self, ours: Side, theirs: Side, crop: Crop | None, tau: float, draw: np.random.Generator) -> None:
         self.crop, self.tau, self.paths = crop, tau, (ours.surface.path, theirs.surface.path)
+        target, self.offset = theirs.points(draw), draw.random(3)  # first: the same for every reconstruction
         self.source = ours.points(draw)
-        target = theirs.points(draw)
         self.target = self.cropped(target)
         self.spans = extent_text(self.source), extent_text(target)
-        self.offset = draw.random(3)
         self.targets = cache(self._target)
 
     def cropped(self, points: np.ndarray) -> np.ndarray:
