@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import MeshInput
-from surfkit.readers.depth_prior import DepthPrior
+from surfkit.readers.depth_prior import DepthPrior, resized
 from surfkit.scene.camera import Camera
 
 LONGEST = 4096
@@ -33,10 +34,18 @@ def oversampled(subject: MeshInput, factor: float) -> MeshInput:
             "mesh.oversampling draws splats with more pixels, and what is drawn here is not made of splats; give 1"
         )
     views = [replace(view, camera=magnified(view.camera, factor)) for view in subject.views]
+    capped = sum(factor > 1 and factor * max(v.camera.width, v.camera.height) > LONGEST for v in subject.views)
+    if capped:
+        emit(
+            Warned(
+                f"mesh.oversampling {factor:g} would make {capped:,} of {len(views):,} depth maps longer than "
+                f"{LONGEST:,} pixels: they are drawn at that size, or at that of the photograph if it is larger"
+            )
+        )
 
     def keep(at: int) -> Tensor | None:
         mask = subject.keep(at)
-        return None if mask is None else resized(mask, views[at].camera)
+        return None if mask is None else nearest(mask, views[at].camera)
 
     priors = None if subject.priors is None else ResizedPriors(subject.priors, [view.camera for view in views])
     return replace(subject, views=views, keep=keep, priors=priors, photo=None)
@@ -48,8 +57,8 @@ def magnified(camera: Camera, factor: float) -> Camera:
     return camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
 
 
-def resized(values: Tensor, camera: Camera) -> Tensor:
-    """(..., H, W) at the size of a camera: of each pixel, the value of the one that it lies in."""
+def nearest(values: Tensor, camera: Camera) -> Tensor:
+    """(..., H, W) of (..., h, w) at the size of a camera: of each pixel, the value of the one that it lies in."""
     flat = values.reshape(1, -1, *values.shape[-2:]).float()
     found = interpolate(flat, (camera.height, camera.width), mode="nearest-exact")
     return found.reshape(*values.shape[:-2], camera.height, camera.width).to(values.dtype)
@@ -74,6 +83,7 @@ class ResizedPriors(Sequence[DepthPrior | None]):
         prior, camera = self.priors[at], self.cameras[at]
         if prior is None:
             return None
-        inverse, confidence = (resized(values, camera) for values in (prior.inverse, prior.confidence))
-        normal = None if prior.normal is None else resized(prior.normal, camera)
+        inverse = resized(prior.inverse, (camera.height, camera.width))
+        confidence = nearest(prior.confidence, camera) * (inverse > 0)
+        normal = None if prior.normal is None else nearest(prior.normal, camera)
         return replace(prior, inverse=inverse, confidence=confidence, normal=normal)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.mesh import oversampling
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.oversampling import magnified, oversampled
 from surfkit.mesh.tsdf import TSDF
@@ -45,10 +46,8 @@ def test_automatic_lengths_are_those_of_the_photographs():
 
 
 def test_a_surface_seen_from_the_side_loses_fewer_places():
-    eye = np.array([2.0, 0.0, 0.12])  # three degrees above a plane
-    given = drawn(
-        [look_at(eye, focal=45.0, size=(48, 36)), look_at([0.0, 2.0, 0.15], focal=45.0, size=(48, 36))], slope
-    )
+    eyes = [2.0, 0.0, 0.12], [0.0, 2.0, 0.15]  # rays to the middle meet the plane at 15 and 22 degrees
+    given = drawn([look_at(eye, focal=45.0, size=(48, 36)) for eye in eyes], slope)
     settings = {"voxel": 0.2, "truncation": 0.4, "depth_limit": 40.0, "least_views": 0.01}
     areas = [area(TSDF(**settings, oversampling=by).mesh(given)) for by in (1, 3)]
     assert areas[1] > 1.2 * areas[0]
@@ -64,24 +63,35 @@ def test_masks_and_priors_have_the_size_of_what_is_drawn():
     left = torch.zeros(36, 48, dtype=torch.bool)
     left[:, :20] = True
     numbers = torch.arange(36 * 48.0).reshape(36, 48)
-    prior = DepthPrior(numbers, numbers / 2000, 0.5, normal=numbers.expand(3, -1, -1))
+    plane = 0.5 + 0.002 * torch.arange(48.0).expand(36, -1)
+    prior = DepthPrior(plane, numbers / 2000, 0.5, normal=numbers.expand(3, -1, -1))
     given = replace(given, keep=lambda at: left if at else None, priors=[None, prior, prior])
     more = oversampled(given, 2)
     assert more.keep(0) is None and more.priors[0] is None and len(more.priors) == 3
     assert torch.equal(more.keep(1), left.repeat_interleave(2, 0).repeat_interleave(2, 1))
     twice = numbers.repeat_interleave(2, 0).repeat_interleave(2, 1)
-    assert torch.equal(more.priors[1].inverse, twice) and torch.equal(more.priors[1].normal[2], twice)
+    between = 0.5 + 0.002 * ((torch.arange(96.0) + 0.5) / 2 - 0.5).expand(72, -1)
+    assert torch.allclose(more.priors[1].inverse[:, 1:-1], between[:, 1:-1])
+    assert torch.equal(more.priors[1].normal[2], twice)
     assert torch.equal(more.priors[2].confidence, twice / 2000)
-    half = TSDF(**LENGTHS, oversampling=1.5, trust=Agreement(priors="weigh", alone=1.0)).mesh(given)
-    assert len(half.faces)
+    made = TSDF(**LENGTHS, oversampling=1.5, trust=Agreement(priors="weigh", alone=1.0)).mesh(given)
+    assert len(made.faces)
     assert oversampled(given, 1) is given
 
 
-def test_large_pictures_are_not_magnified_beyond_what_fits():
+def test_large_pictures_are_not_magnified_beyond_what_fits(monkeypatch):
     small, large, huge = (look_at([2.0, 0, 0], size=size) for size in ((48, 36), (2000, 3000), (6000, 4000)))
     assert [(c.width, c.height) for c in (magnified(small, 2), magnified(small, 0.5))] == [(96, 72), (24, 18)]
     assert (magnified(large, 2).width, magnified(large, 2).height) == (2731, 4096)
     assert magnified(huge, 2) == huge and magnified(huge, 0.5).width == 3000
+    told = []
+    monkeypatch.setattr(oversampling, "emit", lambda event: told.append(event.text))
+    given = subject([look_at([2.0, 0, 0])], torus, draw_of=lambda splats: None)
+    views = [replace(given.views[0], camera=camera) for camera in (small, large, huge)]
+    oversampled(replace(given, views=views[:1]), 2)
+    assert not told
+    oversampled(replace(given, views=views), 2)
+    assert len(told) == 1 and told[0].startswith("mesh.oversampling 2 would make 2 of 3 depth maps longer than 4,096")
 
 
 def test_what_cannot_be_drawn_is_one_line():
