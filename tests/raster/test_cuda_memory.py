@@ -1,5 +1,6 @@
 """What the CUDA rasterizer takes of the memory of a GPU: all its tensors, counted on a simulated one."""
 
+import gc
 import shutil
 from functools import cache
 
@@ -76,3 +77,22 @@ def test_bytes_of_a_point_that_is_seen():
     each = (large - small - a_pair * (many - few)) / 200
     record, gradients = 192, 4 * (3 + 4 + 2 + 1 + 4 * 3 + 2 + 2)
     assert each == pytest.approx(record + gradients, rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["surfel", "gaussian"])
+def test_a_view_that_is_no_longer_needed_frees_its_memory_at_once(kind):
+    """Not when Python next collects cycles of references, which it does by the number of objects, not their bytes."""
+    camera = Camera(torch.eye(4, dtype=torch.float64), SIDE, SIDE, SIDE / 2, SIDE / 2, SIDE, SIDE)
+    with simulated_gpu() as gpu:
+        there = splats(kind, 50, 4.0, "axis")
+        there = there.with_named({name: value.to(GPU) for name, value in there.named().items()})
+        given = gpu.held
+        gc.collect()
+        gc.disable()
+        try:
+            render = EmulatedGpu().render(there, camera, 0.01)
+            assert render.maps.color.sum() > 0 and gpu.held > given
+            del render
+            assert gpu.held == given
+        finally:
+            gc.enable()

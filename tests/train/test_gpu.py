@@ -1,5 +1,6 @@
 """Training on a GPU that is simulated: everything of a step is there, with few waits, and comes to the same."""
 
+import gc
 import shutil
 from dataclasses import replace
 from functools import cache
@@ -109,6 +110,24 @@ def test_with_the_kernels(tiny, begin, update):
     assert len(here.points) == len(there.points) > 40
     for name, value in here.points.all_params().items():
         torch.testing.assert_close(there.points.all_params()[name], value, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("update", ["all", "in-view"])
+def test_a_step_leaves_nothing_on_the_gpu(tiny, begin, update):
+    """Also where Python collects no cycles of references: it does so by the number of objects, not their bytes."""
+    losses = {"l1": L1(), "ssim": SSIM(), "normal": NormalConsistency(), "distortion": Distortion(weight=1.0, start=0)}
+    trainer, _ = begin(Stage(steps=12, losses=losses, update=update))
+    gc.collect()
+    gc.disable()
+    try:
+        with simulated_gpu() as gpu:
+            trainer = replace(trainer, rasterizer=EmulatedGpu())
+            _, state = begin(trainer.stage)
+            held = [gpu.held for _ in trainer.run(state)]
+    finally:
+        gc.enable()
+    held = held[-6:-1]  # all photographs are there by then; before the last step none is awaited
+    assert held[0] > 0 and len(set(held)) == 1
 
 
 PARTS = [

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -97,7 +97,7 @@ class Pass:
     ) -> None:
         validate(splats, values=False)
         self.kind = SURFEL if splats.kind == "surfel" else RAY if splats.geometry == "ray" else GAUSSIAN
-        self.program = lambda name, **defines: program(name, KIND=self.kind, **defines)
+        self.program = partial(program, KIND=self.kind)  # which knows nothing of this pass: its tensors go with it
         self.device, self.home, self.view = device, splats.means.device, _view(splats, camera, near, rim)
         self.arrays = [_upload(t, device) for t in splats.tensors().values()]
         count, shape = len(splats), self.arrays[0].new_empty(0)
