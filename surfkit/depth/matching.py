@@ -77,7 +77,8 @@ def ray_map(here: Camera, there: Camera, device: torch.device) -> tuple[Tensor, 
     The first two components over the third are pixels there, and the third over c is the depth there.
     """
     turn, b = ray_way(here, there)
-    a = torch.einsum("ij,jhw->ihw", turn, here.rays(torch.float64))
+    x, y = here.ray_axes(torch.float64)
+    a = (turn[:, :1] * x)[:, None] + (turn[:, 1:2] * y + turn[:, 2:])[..., None]  # A (x, y, 1) of all pixels
     return a.to(device, torch.float32), b.to(device, torch.float32)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -24,7 +24,6 @@ from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_map import Map, inverse_of
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
-from surfkit.readers.depth_files import save_array
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
@@ -32,8 +31,9 @@ from surfkit.scene.scene import View
 KEPT = 48
 """Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
 case."""
-KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 7, 4
-"""Of a pixel: twice as many photographs, and pictures as they are compared; and the depth map of each round."""
+KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 9, 4
+"""Of a pixel: twice as many photographs, and pictures as they are compared, of all sizes; and the depth map of each
+round."""
 JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
@@ -214,17 +214,18 @@ class Work:
                 self.users[other].append(at)
         self.sweep = InitialPoints(longest=settings.coarsest)
         self.improve = GpuPasses(given.device).improve if given.device.type == "cuda" else improve
-        kept = self.room()
+        kept, every = self.room(), range(len(pairs))
         self.small = lru_cache(KEPT)(lambda at: self.sweep.picture(given, at))
         self.value = lru_cache(2 * kept)(self.read)
-        self.grey = lru_cache(kept)(self.halved)
+        self.greys = [
+            lru_cache(kept)(partial(self.halved, level)) for level in range(1 + max(map(self.levels, every), default=0))
+        ]
         self.rounds = [self.round(MATCHED, self.match, kept)]
         for index in range(1, self.number_of_rounds):
             again, before = f", round {index}" if index > 1 else "", self.rounds[-1]
             self.rounds.append(self.round(COMPARED + again, lambda at, of=before: self.reconcile(at, of), kept))
         self.last = self.rounds[-1]
         for each in reversed(self.rounds):
-            every = range(len(pairs))
             each.made.update(at for at in every if self.path(each.what, at).exists() or not self.is_needed(each, at))
 
     @property
@@ -260,26 +261,29 @@ class Work:
         rgb = read_photo(self.given.views[at].path, (camera.width, camera.height)).to(torch.float32)
         return rgb.mean(0).round().to(torch.uint8)
 
-    def halved(self, at: int, level: int) -> Grey:
-        """A photograph at a level; files are decoded once."""
+    def grey(self, at: int, level: int) -> Grey:
+        """A photograph at a level."""
+        return self.greys[level](at)
+
+    def halved(self, level: int, at: int) -> Grey:
+        """The same, made anew; files are decoded once."""
         camera = self.camera(at, level)
         small = adaptive_avg_pool2d(self.value(at).to(torch.float32)[None], (camera.height, camera.width))[0]
         return Grey(camera, small.round().to(torch.uint8).numpy())
 
     def path(self, what: str, at: int) -> Path:
         """Where a map is kept."""
-        return self.given.work / what.replace(",", "").replace(" ", "-") / f"{at:06d}.npy"
+        return self.given.work / what.replace(",", "").replace(" ", "-") / f"{at:06d}.planes"
 
     def kept(self, what: str, at: int, make: Callable[[int], Map | None], all_made: set[int]) -> Map | None:
         """A map from the folder for work, where it is put if it is not there."""
         path = self.path(what, at)
         if not path.exists():
             made = make(at)
-            save_array(path, np.zeros(0, np.uint8) if made is None else made.packed())
+            Map.save(path, made)
             all_made.add(at)
             emit(Progress(what, len(all_made), len(self.given.views)))
-        numbers = np.load(path)
-        return Map.unpacked(numbers) if len(numbers) else None
+        return Map.load(path)
 
     def is_needed(self, of: Round, at: int) -> bool:
         """Whether anything is still to be made from a map: estimates from those of the last round, and from those of

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from surfkit.core.files import replacing
+from surfkit.scene.arrays import write_array
 from surfkit.scene.camera import Camera
 from surfkit.scene.vectors import unit
 
@@ -26,17 +29,20 @@ class Map:
     each: np.ndarray
     parallax: float
 
-    def packed(self) -> np.ndarray:
-        """(H, W, 16 + V) uint8, for a file."""
-        flat = np.full(self.value.shape[:2], self.parallax, np.float32)
-        numbers = np.concatenate([self.value, flat[..., None]], 2)
-        return np.concatenate([numbers.view(np.uint8), self.each], 2)
+    @classmethod
+    def save(cls, path: Path, found: Map | None) -> None:
+        """Write a map, or that there is none, into a file: three arrays one after the other, or nothing."""
+        with replacing(path) as file:
+            for values in (found.value, found.each, np.full(1, found.parallax, np.float32)) if found else ():
+                write_array(file, values)
 
     @classmethod
-    def unpacked(cls, packed: np.ndarray) -> Map:
-        """From what is packed."""
-        numbers = packed[..., :16].copy().view(np.float32)
-        return cls(numbers[..., :3].copy(), packed[..., 16:], float(numbers[0, 0, 3]))
+    def load(cls, path: Path) -> Map | None:
+        """What `save` wrote."""
+        with path.open("rb") as file:
+            if not path.stat().st_size:
+                return None
+            return cls(np.load(file), np.load(file), float(np.load(file)[0]))
 
     def matched(self, best: int) -> Tensor:
         """(H, W) float32 in [0, 1], how well the best views match."""

@@ -59,9 +59,14 @@ class Camera:
         by = max(self.width, self.height) / longest
         return self.resized(max(1, round(self.width / by)), max(1, round(self.height / by)))
 
-    def rays(self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
+    def ray_axes(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+        """(W,) and (H,), x of the rays through each column of pixels and y of those through each row, with z = 1."""
         x = (torch.arange(self.width, dtype=dtype, device=device) + 0.5 - self.cx) / self.fx
         y = (torch.arange(self.height, dtype=dtype, device=device) + 0.5 - self.cy) / self.fy
+        return x, y
+
+    def rays(self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """(3, H, W) direction of every pixel centre in the camera frame, with z = 1."""
+        x, y = self.ray_axes(dtype, device)
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([grid_x, grid_y, torch.ones_like(grid_x)])

@@ -395,7 +395,7 @@ def test_maps_that_nobody_needs_any_more_are_deleted(farm, tmp_path):
     for estimate in settings.estimate(given, range(20)):
         found[estimate.at] = estimate
         left = set(range(estimate.at, 20))
-        there = {int(path.stem) for path in (given.work / "comparing-depth-maps-round-2").glob("*.npy")}
+        there = {int(path.stem) for path in (given.work / "comparing-depth-maps-round-2").glob("*.planes")}
         assert there >= {at for at in left for at in (at, *pairs[at])} & set(range(estimate.at))
         most = max(most, len(list(given.work.rglob("*.npy"))))
     assert most < 30 and not list(given.work.rglob("*.npy"))
@@ -438,13 +438,16 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (3, 4)])
-def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape):
+def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape, tmp_path):
     draw = np.random.default_rng(6)
     made = Map(draw.random((*shape, 3), np.float32), draw.integers(0, 256, (*shape, 5)).astype(np.uint8), 7.5)
-    read = Map.unpacked(made.packed())
+    Map.save(tmp_path / "a", made)
+    read = Map.load(tmp_path / "a")
     np.testing.assert_array_equal(read.inverse, made.value[..., 0])
     np.testing.assert_array_equal(read.value, made.value)
     np.testing.assert_array_equal(read.each, made.each)
+    Map.save(tmp_path / "b", None)
+    assert Map.load(tmp_path / "b") is None
     assert read.parallax == 7.5 and read.normals(Camera(torch.eye(4), 1, 1, 0, 0, *shape[::-1])).shape == (3, *shape)
 
 
