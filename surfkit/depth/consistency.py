@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from surfkit.depth.matching import ray_map
+from surfkit.depth.matching import ray_map, ray_way
+from surfkit.native import module
 from surfkit.scene.camera import Camera
 
 
@@ -60,6 +62,26 @@ def agreement(camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Te
         others: Cameras and maps of other photographs.
         tolerance: Share of the depth.
     """
+    if module() is None or inverse.device.type != "cpu":
+        return agreement_in_torch(camera, inverse, others, tolerance)
+    made = [np.empty(inverse.shape, np.float32) for _ in range(3)]
+    ways = [[number for part in ray_way(camera, there) for number in part.flatten().tolist()] for there, _ in others]
+    module().depth_agreement(
+        np.ascontiguousarray(inverse.numpy(), np.float32),
+        [camera.fx, camera.fy, camera.cx, camera.cy],
+        [np.ascontiguousarray(other.numpy(), np.float32) for _, other in others],
+        ways,
+        tolerance,
+        *made,
+        torch.get_num_threads(),
+    )
+    return Agreement(*map(torch.from_numpy, made))
+
+
+def agreement_in_torch(
+    camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Tensor]], tolerance: float
+) -> Agreement:
+    """The same in torch: on a GPU, where surfkit has no compiled part, and to check that."""
     count, shown, ratios = torch.zeros_like(inverse), torch.zeros_like(inverse), torch.ones_like(inverse)
     for there, other in others:
         a, b = ray_map(camera, there, inverse.device)

@@ -111,7 +111,8 @@ def clusters(mesh: Mesh, gap: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
     node, near = _cells(mesh, gap) if gap else (np.arange(len(mesh.vertices)), np.zeros((0, 2), np.int64))
     a, b, c = node[mesh.faces.T]
-    ends = np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), near])
+    sides = [np.stack([x[x != y], y[x != y]], 1) for x, y in ((a, b), (b, c))]  # most of them lie within one cell
+    ends = np.concatenate([*sides, near])
     links = coo_matrix((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(int(node.max()) + 1,) * 2)
     _, parts = connected_components(links, directed=False)
     part = parts[a]

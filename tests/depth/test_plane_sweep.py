@@ -8,11 +8,12 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
-from surfkit.depth.consistency import Agreement, agreement, at_edge
+from surfkit.depth.consistency import Agreement, agreement, agreement_in_torch, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smooth_costs
+from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
@@ -145,6 +146,29 @@ def test_maps_of_one_surface_agree_and_others_do_not(farm):
     wrong[50:60, 60:80] *= 1.1
     count, _, _ = agreement(cameras[0], wrong, [(cameras[1], maps[1])], 0.01)
     assert not count[50:60, 60:80].any()
+
+
+@pytest.mark.skipif(module() is None, reason="surfkit was installed without its compiled part")
+def test_maps_agree_as_in_torch(farm):
+    """The compiled part and torch, also where maps have holes, no overlap, or another size."""
+    scene, _, truth = farm
+    draw = torch.Generator().manual_seed(3)
+    cameras = [view.camera for view in scene.train[:6]]
+    maps = [1 / truth.exact[view.name].depth.float() for view in scene.train[:6]]
+    maps = [each * (1 + 0.01 * torch.randn(each.shape, generator=draw)) for each in maps]
+    for each in maps:
+        each[torch.rand(each.shape, generator=draw) < 0.2] = 0
+    cameras[1] = cameras[1].resized(57, 41)
+    maps[1] = torch.nn.functional.interpolate(maps[1][None, None], (41, 57), mode="nearest-exact")[0, 0]
+    others = list(zip(cameras[1:], maps[1:], strict=True))
+    native, plain = (how(cameras[0], maps[0], others, 0.01) for how in (agreement, agreement_in_torch))
+    assert native.count.max() >= 3 and native.count.dtype == plain.count.dtype
+    # Positions are rounded differently, and so may fall on the pixel beside.
+    same = (native.count == plain.count) & (native.shown == plain.shown)
+    assert same.float().mean() > 0.999
+    torch.testing.assert_close(native.fused[same], plain.fused[same], rtol=1e-5, atol=0)
+    alone = agreement(cameras[0], maps[0], [], 0.01)
+    assert not alone.shown.any() and torch.equal(alone.fused, maps[0])
 
 
 def test_trust_asks_for_two_maps_at_least_and_for_no_more_than_show_the_place():

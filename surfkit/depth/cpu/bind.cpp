@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "../../native/pool.h"
+#include "agreement.h"
 #include "stereo.h"
 
 namespace nb = nanobind;
@@ -20,6 +21,7 @@ namespace surfkit {
 namespace {
 
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Made = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Words = nb::ndarray<const uint32_t, nb::c_contig, nb::device::cpu>;
 
 const StereoKernels& named(const std::string& name) {
@@ -95,6 +97,26 @@ void add_stereo(nb::module_& m) {
         nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("gains"), nb::arg("inverse"), nb::arg("plane"),
         nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("samples"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
         nb::arg("threads"));
+    m.def(
+        "depth_agreement",
+        [](Floats inverse, std::vector<double> lens, std::vector<Floats> others, std::vector<std::vector<double>> ways, double tolerance,
+           Made count, Made shown, Made fused, int threads) {
+            AgreementJob job{};
+            job.inverse = inverse.data();
+            job.height = (int)inverse.shape(0), job.width = (int)inverse.shape(1);
+            job.fx = lens.at(0), job.fy = lens.at(1), job.cx = lens.at(2), job.cy = lens.at(3);
+            for (size_t i = 0; i < others.size(); i++) {
+                AgreementMap map{others[i].data(), (int)others[i].shape(1), (int)others[i].shape(0), {}};
+                for (int j = 0; j < 12; j++) map.way[j] = ways.at(i).at(j);
+                job.others.push_back(map);
+            }
+            job.tolerance = (float)tolerance;
+            job.count = count.data(), job.shown = shown.data(), job.fused = fused.data();
+            nb::gil_scoped_release free;
+            parallel(job.height, threads, [&](int64_t row) { agreement(job, (int)row); });
+        },
+        nb::arg("inverse"), nb::arg("lens"), nb::arg("others"), nb::arg("ways"), nb::arg("tolerance"), nb::arg("count"), nb::arg("shown"),
+        nb::arg("fused"), nb::arg("threads"));
     m.attr("STEREO_SAMPLES") = kSamples;
     m.attr("STEREO_RADIUS") = kRadius;
     m.attr("STEREO_BORDER") = kBorder;
