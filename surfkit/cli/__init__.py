@@ -71,8 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Words after `surfkit`; those of this process if None.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    # Idle threads of torch would otherwise spin, and use as much CPU time as the work itself.
+    # Idle threads of torch, and of numpy's OpenBLAS, would otherwise spin, and use as much CPU time as the work itself.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # wait 2^4 cycles
     reopen_closed()
     replace_unknown_letters()
     try:
