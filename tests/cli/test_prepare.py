@@ -147,7 +147,7 @@ def test_an_estimate_goes_on_though_a_photograph_was_damaged_meanwhile(farm, mon
         assert main(words) == 130
     first = maps(farm)
     assert "matching photographs  6/6" in capsys.readouterr().err, "the first map comes after most of the work"
-    assert len(first) == 3 and list((farm / "estimated_depths/.work").rglob("*.npy"))
+    assert len(first) == 3 and list((farm / "estimated_depths/.work").rglob("*.planes"))
     damage(farm, 3)
     assert main(words) == 0
     assert len(maps(farm)) == 3 * 5 and maps(farm).items() >= first.items()

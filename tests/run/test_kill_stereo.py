@@ -15,6 +15,8 @@ from surfkit.readers.made_maps import read_made
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
+ARRAYS = ".npy", ".planes"
+"""Ends of the names of files with arrays: maps that are whole, and those of the rounds of stereo."""
 
 
 def die_at(array):
@@ -22,7 +24,7 @@ def die_at(array):
     left, replace = [array], os.replace
 
     def replaced(unfinished, path):
-        left[0] -= str(path).endswith(".npy")
+        left[0] -= str(path).endswith(ARRAYS)
         if left[0] == 0:
             os.kill(os.getpid(), signal.SIGKILL)
         replace(unfinished, path)
@@ -58,14 +60,14 @@ def killed(data, folder, at):
 
 def arrays(folder):
     """Every whole array in a folder, by where it is: when it was written, and what it is."""
-    paths = [path for path in folder.rglob("*.npy") if not path.name.startswith(".")]
+    paths = [path for path in folder.rglob("[!.]*") if path.name.endswith(ARRAYS)]
     return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes()) for path in paths}
 
 
 def unfinished(cache):
     """How many maps of each round are in the folder for work."""
     folders = [path for path in cache.rglob(".work/*") if path.is_dir()]
-    return {path.name: count for path in folders if (count := len(list(path.glob("[!.]*.npy"))))}
+    return {path.name: count for path in folders if (count := len(list(path.glob("[!.]*.planes"))))}
 
 
 def test_maps_that_are_there_are_not_made_again(farm, tmp_path, own_cache):
