@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from surfkit.depth.matching import ray_map, ray_way
+from surfkit.depth.matching import ray_map, way_numbers
 from surfkit.native import module
 from surfkit.scene.camera import Camera
 
@@ -65,12 +65,11 @@ def agreement(camera: Camera, inverse: Tensor, others: Sequence[tuple[Camera, Te
     if module() is None or inverse.device.type != "cpu":
         return agreement_in_torch(camera, inverse, others, tolerance)
     made = [np.empty(inverse.shape, np.float32) for _ in range(3)]
-    ways = [[number for part in ray_way(camera, there) for number in part.flatten().tolist()] for there, _ in others]
     module().depth_agreement(
         np.ascontiguousarray(inverse.numpy(), np.float32),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         [np.ascontiguousarray(other.numpy(), np.float32) for _, other in others],
-        ways,
+        [way_numbers(camera, there) for there, _ in others],
         tolerance,
         *made,
         torch.get_num_threads(),

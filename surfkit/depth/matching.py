@@ -89,6 +89,11 @@ def ray_way(here: Camera, there: Camera) -> tuple[Tensor, Tensor]:
     return lens @ turn[:3, :3], lens @ turn[:3, 3]
 
 
+def way_numbers(here: Camera, there: Camera) -> list[float]:
+    """What `ray_way` gives for compiled code: A by rows, then b."""
+    return [number for part in ray_way(here, there) for number in part.flatten().tolist()]
+
+
 def _warp(here: Camera, other: Picture, planes: Tensor) -> tuple[Tensor, Tensor]:
     """(D, C, H, W) of `other` as seen from here if all had one inverse depth; (D, H, W) where that is inside of it."""
     a, b = ray_map(here, other.camera, planes.device)

@@ -22,7 +22,7 @@ from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
 from surfkit.depth.neighbours import depth_range, neighbours
-from surfkit.depth.plane_map import Map, inverse_of
+from surfkit.depth.plane_map import Map, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
 from surfkit.scene.photos import read_photo
@@ -74,7 +74,7 @@ class PatchMatch(DepthEstimator):
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -280,10 +280,10 @@ class Work:
         path = self.path(what, at)
         if not path.exists():
             made = make(at)
-            Map.save(path, made)
+            save_map(path, made)
             all_made.add(at)
             emit(Progress(what, len(all_made), len(self.given.views)))
-        return Map.load(path)
+        return load_map(path)
 
     def is_needed(self, of: Round, at: int) -> bool:
         """Whether anything is still to be made from a map: estimates from those of the last round, and from those of

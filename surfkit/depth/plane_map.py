@@ -29,21 +29,6 @@ class Map:
     each: np.ndarray
     parallax: float
 
-    @classmethod
-    def save(cls, path: Path, found: Map | None) -> None:
-        """Write a map, or that there is none, into a file: three arrays one after the other, or nothing."""
-        with replacing(path) as file:
-            for values in (found.value, found.each, np.full(1, found.parallax, np.float32)) if found else ():
-                write_array(file, values)
-
-    @classmethod
-    def load(cls, path: Path) -> Map | None:
-        """What `save` wrote."""
-        with path.open("rb") as file:
-            if not path.stat().st_size:
-                return None
-            return cls(np.load(file), np.load(file), float(np.load(file)[0]))
-
     def matched(self, best: int) -> Tensor:
         """(H, W) float32 in [0, 1], how well the best views match."""
         costs = np.sort(self.each, 2)[..., :best].mean(2, dtype=np.float32)
@@ -64,6 +49,21 @@ class Map:
         nx, ny = gx * camera.fx, gy * camera.fy
         away = torch.stack([nx, ny, w - nx * rays[0] - ny * rays[1]])
         return -unit(away)
+
+
+def save_map(path: Path, found: Map | None) -> None:
+    """Write a map, or that there is none, into a file: three arrays one after the other, or nothing."""
+    with replacing(path) as file:
+        for values in (found.value, found.each, np.full(1, found.parallax, np.float32)) if found else ():
+            write_array(file, values)
+
+
+def load_map(path: Path) -> Map | None:
+    """What `save_map` wrote."""
+    with path.open("rb") as file:
+        if not path.stat().st_size:
+            return None
+        return Map(np.load(file), np.load(file), float(np.load(file)[0]))
 
 
 def inverse_of(found: Map | None, device: torch.device) -> Tensor | None:

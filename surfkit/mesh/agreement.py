@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
-from surfkit.depth.matching import ray_map, ray_way
+from surfkit.depth.matching import ray_map, way_numbers
 from surfkit.mesh.overlap import Depths, overlapping
 from surfkit.mesh.trust import Trust
 from surfkit.native import module
@@ -150,7 +150,7 @@ def compare(
     module().compare_depths(
         *(np.ascontiguousarray(some.numpy(), np.float32) for some in (depth, other)),
         [camera.fx, camera.fy, camera.cx, camera.cy],
-        [part for array in ray_way(camera, there) for part in array.flatten().tolist()],
+        way_numbers(camera, there),
         turn[:3, 3].tolist(),
         tolerance,
         *made,

@@ -8,11 +8,12 @@ import torch
 from needs import needs_native
 
 from surfkit.core.check import BadInput
+from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.neighbours import neighbours
 from surfkit.depth.patch_match import PatchMatch, Work
-from surfkit.depth.plane_map import Map
+from surfkit.depth.plane_map import Map, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.native import module
 from surfkit.readers.data import Data
@@ -397,11 +398,23 @@ def test_maps_that_nobody_needs_any_more_are_deleted(farm, tmp_path):
         left = set(range(estimate.at, 20))
         there = {int(path.stem) for path in (given.work / "comparing-depth-maps-round-2").glob("*.planes")}
         assert there >= {at for at in left for at in (at, *pairs[at])} & set(range(estimate.at))
-        most = max(most, len(list(given.work.rglob("*.npy"))))
-    assert most < 30 and not list(given.work.rglob("*.npy"))
+        most = max(most, len(list(given.work.rglob("*.planes"))))
+    assert 5 < most < 30 and not [path for path in given.work.rglob("*") if path.is_file()]
     alone = DepthInput(scene.train, tracks, CPU, tmp_path / "alone")
     (again,) = settings.estimate(alone, [9])
     assert torch.equal(again.inverse, found[9].inverse) and torch.equal(again.confidence, found[9].confidence)
+
+
+def test_photographs_are_made_smaller_once(farm, tmp_path, monkeypatch):
+    """Also where no more of them stay in memory than one is compared with, at any size."""
+    scene, tracks, _ = farm
+    made, halved = [], Work.halved
+    monkeypatch.setattr(Work, "halved", lambda self, level, at: made.append((level, at)) or halved(self, level, at))
+    monkeypatch.setattr(patch_match, "KEPT", 1)
+    views = scene.train[:6]
+    settings = PatchMatch(longest=120, coarsest=32, passes=1, rounds=1, neighbours=5)
+    list(settings.estimate(DepthInput(views, tracks, CPU, tmp_path), range(6)))
+    assert len({level for level, _ in made}) == 2 and len(made) == len(set(made)) == 2 * 6
 
 
 def test_the_number_of_threads_changes_nothing(farm, tmp_path):
@@ -441,13 +454,13 @@ def test_pictures_of_a_few_pixels_are_no_trouble(shape):
 def test_maps_of_a_few_pixels_are_read_as_they_were_written(shape, tmp_path):
     draw = np.random.default_rng(6)
     made = Map(draw.random((*shape, 3), np.float32), draw.integers(0, 256, (*shape, 5)).astype(np.uint8), 7.5)
-    Map.save(tmp_path / "a", made)
-    read = Map.load(tmp_path / "a")
+    save_map(tmp_path / "a", made)
+    read = load_map(tmp_path / "a")
     np.testing.assert_array_equal(read.inverse, made.value[..., 0])
     np.testing.assert_array_equal(read.value, made.value)
     np.testing.assert_array_equal(read.each, made.each)
-    Map.save(tmp_path / "b", None)
-    assert Map.load(tmp_path / "b") is None
+    save_map(tmp_path / "b", None)
+    assert load_map(tmp_path / "b") is None
     assert read.parallax == 7.5 and read.normals(Camera(torch.eye(4), 1, 1, 0, 0, *shape[::-1])).shape == (3, *shape)
 
 

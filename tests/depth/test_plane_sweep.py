@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from needs import needs_native
 
 from surfkit.core.check import BadInput
 from surfkit.depth.base import DepthInput
@@ -13,7 +14,6 @@ from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smooth_costs
-from surfkit.native import module
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.camera import Camera
@@ -148,7 +148,7 @@ def test_maps_of_one_surface_agree_and_others_do_not(farm):
     assert not count[50:60, 60:80].any()
 
 
-@pytest.mark.skipif(module() is None, reason="surfkit was installed without its compiled part")
+@needs_native
 def test_maps_agree_as_in_torch(farm):
     """The compiled part and torch, also where maps have holes, no overlap, or another size."""
     scene, _, truth = farm

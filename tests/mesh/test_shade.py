@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from needs import needs, needs_native
 
+from surfkit.mesh import shade
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces, draw_in_numpy, from_above, shaded, up_of
 
@@ -75,6 +76,23 @@ def test_a_ball_is_grey_where_it_is_seen_from_outside_and_blue_from_inside():
             assert 0.1 < there.float().mean() < 0.85
             assert bool((image[2] > image[0] + 0.05)[there].float().mean() > 0.9) == blue
     assert from_above(mesh, np.array([0, 0, 1.0]), 60).shape == (3, 60, 60)
+
+
+def test_large_meshes_are_judged_by_some_of_their_triangles(monkeypatch):
+    """A slope of many triangles: the way it faces, and how far it reaches."""
+    rows, columns = (part.ravel() for part in np.mgrid[:40, :60])
+    vertices = np.stack([columns, rows, 0.5 * columns], 1).astype(np.float32)
+    first = (rows * 60 + columns)[(rows < 39) & (columns < 59)]
+    faces = (
+        np.stack([first, first + 1, first + 60, first + 1, first + 61, first + 60], 1).reshape(-1, 3).astype(np.int32)
+    )
+    slope, upright = Mesh(vertices, faces), np.array([-0.5, 0, 1]) / 1.25**0.5
+    whole = up_of(slope, ()), from_above(slope, upright, 80)
+    monkeypatch.setattr(shade, "SAMPLES", 350)
+    some = up_of(slope, ()), from_above(slope, upright, 80)
+    for up, picture in (whole, some):
+        np.testing.assert_allclose(up, upright, atol=1e-6)
+        assert abs(picture.shape[1] - whole[1].shape[1]) <= 2 and (picture < 1).float().mean() > 0.9
 
 
 def test_from_above_is_not_mirrored():
