@@ -37,14 +37,14 @@ class Grey:
     value: np.ndarray
 
     @cached_property
-    def packed(self) -> np.ndarray:
-        """(H + 2 b, W + 2 b) uint32: a pixel, and those to the right, below, and below to the right, for interpolation.
+    def in_pairs(self) -> np.ndarray:
+        """(H + 2 b, W + 2 b + 1) uint16: a pixel and the one below, so that four bytes are what interpolation takes.
 
-        Continued by a border of b pixels.
+        Continued by a border of b pixels, and one more to the right.
         """
         border = module().STEREO_BORDER
-        wide = np.pad(self.value, (border, border + 1), mode="edge").astype(np.uint32)
-        return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
+        wide = np.pad(self.value, (border, border + 1), mode="edge").astype(np.uint16)
+        return wide[:-1] | wide[1:] << 8
 
     def padded(self) -> np.ndarray:
         """(H + 2 r, W + 2 r) float32, continued by the radius of the windows."""
@@ -142,7 +142,7 @@ def improve(
         here.padded(),
         [camera.fx, camera.fy, camera.cx, camera.cy],
         pattern(terms.window),
-        [other.packed for other in others],
+        [other.in_pairs for other in others],
         ways,
         gains(here, others, planes),
         [None if inverse is None else inverse.numpy() for inverse in known or [None] * len(others)],

@@ -31,7 +31,7 @@ from surfkit.scene.scene import View
 KEPT = 48
 """Pictures and maps kept in memory, if they take no more than `KEPT_BYTES`; those that one is compared with in any
 case."""
-KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 9, 4
+KEPT_BYTES, PIXEL_BYTES, DEPTH_BYTES = 2 << 30, 6, 4
 """Of a pixel: twice as many photographs, and pictures as they are compared, of all sizes; and the depth map of each
 round."""
 JITTER_PX = 0.5

@@ -22,7 +22,7 @@ namespace {
 
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Made = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using Words = nb::ndarray<const uint32_t, nb::c_contig, nb::device::cpu>;
+using Pairs = nb::ndarray<const uint16_t, nb::c_contig, nb::device::cpu>;
 
 const StereoKernels& named(const std::string& name) {
 #if defined(SURFKIT_X86)
@@ -37,7 +37,7 @@ const StereoKernels& named(const std::string& name) {
 void add_stereo(nb::module_& m) {
     m.def(
         "patch_match",
-        [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Words> pixels, std::vector<std::vector<double>> ways,
+        [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Pairs> pixels, std::vector<std::vector<double>> ways,
            std::vector<double> gains, std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
            nb::ndarray<float, nb::c_contig, nb::device::cpu> cost,
            nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int samples, int best, bool survey,
@@ -49,7 +49,7 @@ void add_stereo(nb::module_& m) {
                 s.stride = (int)pixels[i].shape(1);
                 s.height = (int)pixels[i].shape(0) - 2 * kBorder;
                 s.gain = (float)gains.at(i);
-                s.width = s.stride - 2 * kBorder;
+                s.width = s.stride - 2 * kBorder - 1;
                 const std::vector<double>& way = ways.at(i);
                 for (int j = 0; j < 12; j++) s.way[j] = (float)way.at(j), s.back[j] = (float)way.at(12 + j);
                 const std::optional<Floats>& map = inverse.at(i);

@@ -29,14 +29,20 @@ struct Plane {
     float w, gx, gy;
 };
 
-static inline Ints gather(const uint32_t* base, Ints at) {
+// What is at `base`, and `step` bytes further for each that `at` counts.
+template <int step>
+SURFKIT_INLINE Ints gather(const void* base, Ints at) {
 #if defined(__AVX512F__)
-    return (Ints)_mm512_i32gather_epi32((__m512i)at, base, 4);
+    return (Ints)_mm512_i32gather_epi32((__m512i)at, base, step);
 #elif defined(__AVX2__)
-    return (Ints)_mm256_i32gather_epi32((const int*)base, (__m256i)at, 4);
+    return (Ints)_mm256_i32gather_epi32((const int*)base, (__m256i)at, step);
 #else
     Ints r;
-    for (int i = 0; i < kLanes; i++) r[i] = (int32_t)base[at[i]];
+    for (int i = 0; i < kLanes; i++) {
+        int32_t found;
+        std::memcpy(&found, (const char*)base + (int64_t)at[i] * step, sizeof found);
+        r[i] = found;
+    }
     return r;
 #endif
 }
@@ -59,7 +65,7 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
     for (int v = 0; v < job.samples / kLanes; v++) {
         const Ints at = __builtin_convertvector(
             load(job.offset_y + v * kLanes) * (float)stride + load(job.offset_x + v * kLanes), Ints);
-        const Ints raw = gather((const uint32_t*)middle, at);
+        const Ints raw = gather<4>(middle, at);
         std::memcpy(&value[v], &raw, sizeof raw);
         out.weight[v] = load(job.nearness + v * kLanes) * exp_negative(magnitude(value[v] - here) * scale);
         all += out.weight[v];
@@ -77,21 +83,21 @@ SURFKIT_INLINE void look(const StereoJob& job, int x, int y, Window& out) {
     out.mean = m;
 }
 
-// Grey values between pixels, times 64 * 64, at fixed-point positions of which six bits are fractions. The four bytes of a
-// pixel are those that interpolation takes.
+// Grey values between pixels, times 64 * 64, at fixed-point positions of which six bits are fractions. Two pixels of a
+// column are next to each other, so four bytes from there are those that interpolation takes.
 SURFKIT_INLINE Ints between(const StereoSource& s, Ints x, Ints y) {
-    const Ints four = gather(s.pixels, (y >> kFraction) * s.stride + (x >> kFraction));
+    const Ints four = gather<2>(s.pixels, (y >> kFraction) * s.stride + (x >> kFraction));
     const Ints right = x & (kOne - 1), down = y & (kOne - 1);
 #if defined(__AVX512BW__)
-    const __m512i across = _mm512_maddubs_epi16((__m512i)four, (__m512i)(0x00ff00ff * right + 0x00400040));
-    return (Ints)_mm512_madd_epi16(across, (__m512i)(0xffff * down + kOne));
+    const __m512i along = _mm512_maddubs_epi16((__m512i)four, (__m512i)(0x00ff00ff * down + 0x00400040));
+    return (Ints)_mm512_madd_epi16(along, (__m512i)(0xffff * right + kOne));
 #elif defined(__AVX2__) && !defined(__AVX512F__)
-    const __m256i across = _mm256_maddubs_epi16((__m256i)four, (__m256i)(0x00ff00ff * right + 0x00400040));
-    return (Ints)_mm256_madd_epi16(across, (__m256i)(0xffff * down + kOne));
+    const __m256i along = _mm256_maddubs_epi16((__m256i)four, (__m256i)(0x00ff00ff * down + 0x00400040));
+    return (Ints)_mm256_madd_epi16(along, (__m256i)(0xffff * right + kOne));
 #else
-    const Ints upper = (four & 255) * (kOne - right) + (four >> 8 & 255) * right;
-    const Ints under = (four >> 16 & 255) * (kOne - right) + (four >> 24 & 255) * right;
-    return upper * (kOne - down) + under * down;
+    const Ints here = (four & 255) * (kOne - down) + (four >> 8 & 255) * down;
+    const Ints next = (four >> 16 & 255) * (kOne - down) + (four >> 24 & 255) * down;
+    return here * (kOne - right) + next * right;
 #endif
 }
 
@@ -213,7 +219,7 @@ SURFKIT_INLINE Floats with_reprojection(const StereoJob& job, const StereoSource
     const Mask inside = less_equal(zero, at_x) & lesser(at_x, wide) & less_equal(zero, at_y) & lesser(at_y, high);
     const Ints column = __builtin_convertvector(keep(inside, at_x), Ints);
     const Ints row = __builtin_convertvector(keep(inside, at_y), Ints);
-    const Ints word = gather((const uint32_t*)s.inverse, row * s.inverse_width + column);
+    const Ints word = gather<4>(s.inverse, row * s.inverse_width + column);
     Floats found;
     std::memcpy(&found, &word, sizeof found);
     const Floats z = madd(u, t[6], madd(v, t[7], madd(found, t[11], broadcast(t[8]))));

@@ -10,8 +10,8 @@ namespace surfkit {
 // A picture to compare with. A pixel (x, y) of inverse depth w falls on the pixel a (x, y, 1) + b w of it, over the third
 // component; pixels are numbered from the middle of the first one.
 struct StereoSource {
-    // Four bytes: a grey value, and those to the right, below, and below to the right; continued by kBorder on each side.
-    const uint32_t* pixels;
+    // Two bytes: a grey value and the one below; continued by kBorder on each side, and one more to the right.
+    const uint16_t* pixels;
     int width, height, stride;
     float gain;  // times its grey values, so that it is as bright as the picture whose planes are sought
     float way[12];  // a, then b

@@ -101,14 +101,24 @@ class GpuPasses:
             part[:] = found.cpu().numpy()
 
     def picture(self, grey: Grey) -> Tensor:
-        """`Grey.packed` on the GPU, as long as it is kept here."""
+        """Four grey values in one number for each pixel, on the GPU, as long as it is kept here."""
         if grey not in self.uploaded:
-            self.uploaded[grey] = self.uploads(grey.packed.view(np.int32))
+            self.uploaded[grey] = self.uploads(in_fours(grey.value).view(np.int32))
         return self.uploaded[grey]
 
     def uploads(self, values: np.ndarray) -> Tensor:
         """A copy of an array on the GPU."""
         return torch.from_numpy(values.copy()).to(self.device)
+
+
+def in_fours(value: np.ndarray) -> np.ndarray:
+    """(H + 2 b, W + 2 b) uint32: a pixel, and those to the right, below, and below to the right, for interpolation.
+
+    Continued by a border of b pixels.
+    """
+    border = module().STEREO_BORDER
+    wide = np.pad(value, (border, border + 1), mode="edge").astype(np.uint32)
+    return wide[:-1, :-1] | wide[:-1, 1:] << 8 | wide[1:, :-1] << 16 | wide[1:, 1:] << 24
 
 
 def joined(parts: Sequence[Tensor]) -> Tensor:

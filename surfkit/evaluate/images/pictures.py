@@ -87,4 +87,4 @@ def write_picture(path: Path, image: Tensor) -> None:
     """Save a (3, H, W) image in [0, 1] as PNG, rounded to 8 bits; whole or not at all."""
     pixels = (image.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
     with replacing(path) as file:
-        Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(file, "PNG", compress_level=4)
+        Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(file, "PNG", compress_level=1)
