@@ -1,5 +1,7 @@
 """Meshes and clouds from files of every kind, and what is wrong with bad ones."""
 
+import struct
+
 import numpy as np
 import pytest
 from needs import needs
@@ -75,6 +77,40 @@ def test_faces_at_vertices_that_are_not_finite_go(tmp_path, told):
     vertices[0] = np.inf
     found = read_surface(binary_ply(tmp_path / "mesh.ply", vertices, BOX.faces))
     assert len(found.faces) == (BOX.faces != 0).all(1).sum() and len(told) == 1
+
+
+def cloud_with_lists(path, xyz, counted="uchar", first=(), cut=None):
+    """A cloud whose points are in i % 4 views each, with a weight for each view, as OpenMVS writes them."""
+    lists = [f"property list {counted} uint views", "property float error", "property list uchar double weights"]
+    axes = [f"property float {axis}" for axis in "xyz"]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}", *first, *axes, *lists, "end_header"]
+    wide = {"uchar": "B", "int": "i", "float": "f"}[counted]
+    rows = [
+        struct.pack(f"<3f{wide}{i % 4}IfB{i % 4}d", *point, i % 4, *range(i % 4), 0.5, i % 4, *[1.0] * (i % 4))
+        for i, point in enumerate(xyz)
+    ]
+    path.write_bytes(("\n".join(head) + "\n").encode() + b"".join(rows)[:cut])
+    return path
+
+
+@pytest.mark.parametrize("counted", ["uchar", "int"])
+def test_points_with_lists(tmp_path, counted):
+    xyz = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    found = read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, counted))
+    assert found.faces is None and np.array_equal(found.vertices(), xyz)
+
+
+def test_bad_points_with_lists(tmp_path):
+    xyz = np.ones((6, 3), np.float32)
+    for cut in (-1, -9, -10):  # within the last list, before its count, within the number before that
+        with pytest.raises(BadInput, match="cut off after 5 of 6 vertices"):
+            read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, cut=cut))
+    with pytest.raises(BadInput, match="counts its numbers with float"):
+        read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, "float"))
+    with pytest.raises(BadInput, match="do not come before 'property list uchar int a'"):
+        read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, first=["property list uchar int a"]))
+    with pytest.raises(BadInput, match="cannot read numbers of type 'half'"):
+        read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, first=["property half a"]))
 
 
 @pytest.mark.parametrize(

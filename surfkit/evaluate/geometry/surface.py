@@ -11,6 +11,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
+from surfkit.evaluate.geometry.lists import has_lists, points_beside_lists
 from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.export.ply import TYPES, read_vertices
 from surfkit.readers.sparse_ply import read_points
@@ -104,7 +105,7 @@ def _ply(path: Path) -> Surface:
     lines = _header(path)
     count = next((int(line.split()[2]) for line in lines if line.startswith("element face ")), None)
     if "format binary_little_endian 1.0" in lines:
-        rows, _ = read_vertices(path)
+        rows = points_beside_lists(path, lines) if count is None and has_lists(lines) else read_vertices(path)[0]
         if not {"x", "y", "z"} <= set(rows.dtype.names or ()):
             raise BadInput(f"{path}: its points lack x, y or z; write the file again")
         return Surface(path, rows, None if count is None else _faces(path, lines, rows, count))
