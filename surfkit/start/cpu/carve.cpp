@@ -23,8 +23,6 @@ inline void require(double a, double b, double& low, double& high) {
     }
 }
 
-inline void count_up(uint8_t& value) { value += value < 255; }
-
 }  // namespace
 
 void carve(const CarveGrid& grid, const CarveView& view, uint8_t* surfaces, uint8_t* through, int threads) {
@@ -48,13 +46,12 @@ void carve(const CarveGrid& grid, const CarveView& view, uint8_t* surfaces, uint
                 const double z = z0 + k * p[10], turn = 1 / z;
                 const int u = std::clamp((int)((u0 + k * u1) * turn), 0, view.width - 1);
                 const int v = std::clamp((int)((v0 + k * v1) * turn), 0, view.height - 1);
+                // Without branches, as no voxel tells which way the next one goes.
                 const double found = view.depth[(int64_t)v * view.width + u];
-                if (found <= 0) continue;
-                if (found > z + view.beyond) {
-                    count_up(through[column + k]);
-                } else if (std::fabs(found - z) <= view.near) {
-                    count_up(surfaces[column + k]);
-                }
+                const bool known = found > 0, beyond = found > z + view.beyond, near = std::fabs(found - z) <= view.near;
+                uint8_t &to_surfaces = surfaces[column + k], &to_through = through[column + k];
+                to_surfaces += known & !beyond & near & (to_surfaces < 255);
+                to_through += known & beyond & (to_through < 255);
             }
         }
     });
