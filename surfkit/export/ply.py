@@ -238,7 +238,7 @@ def read_elements(path: Path) -> tuple[Elements, dict[str, str]]:
     heads = [i for i, line in enumerate(lines) if line.startswith("element ")]
     found: Elements = {}
     for here, end in zip(heads, [*heads[1:], len(lines)], strict=True):
-        name, count, dtype = _element(path, lines[here:end])
+        name, count, dtype = element_layout(path, lines[here:end])
         if name in found:
             raise BadInput(f"{path}: has element {name} twice; write the file again")
         if size - at < count * dtype.itemsize:
@@ -291,12 +291,16 @@ def _vertex(path: Path, lines: list[str]) -> tuple[int, np.dtype]:
         first = " ".join(words[0]) if words else "nothing"
         raise BadInput(f"{path}: the first element must be 'element vertex N'; the header has {first!r}")
     ends = [i for i, line in enumerate(lines) if line.startswith("element ")] + [len(lines)]
-    _, count, dtype = _element(path, lines[ends[0] : ends[1]])
+    _, count, dtype = element_layout(path, lines[ends[0] : ends[1]])
     return count, dtype
 
 
-def _element(path: Path, lines: list[str]) -> tuple[str, int, np.dtype]:
-    """Name, number of rows and layout of one row, of a line 'element NAME N' and those that follow it."""
+def element_layout(path: Path, lines: list[str]) -> tuple[str, int, np.dtype]:
+    """Name, number of rows and layout of one row, of a line 'element NAME N' and those that follow it.
+
+    Raises:
+        BadInput: Not such a line, or properties that are no scalars of PLY, have one name, or are none.
+    """
     head = lines[0].split()
     if len(head) != 3 or not head[2].isdecimal():
         raise BadInput(f"{path}: the header has {' '.join(head)!r} in place of 'element NAME COUNT'")

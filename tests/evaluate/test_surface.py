@@ -107,10 +107,22 @@ def test_bad_points_with_lists(tmp_path):
             read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, cut=cut))
     with pytest.raises(BadInput, match="counts its numbers with float"):
         read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, "float"))
-    with pytest.raises(BadInput, match="do not come before 'property list uchar int a'"):
-        read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, first=["property list uchar int a"]))
-    with pytest.raises(BadInput, match="cannot read numbers of type 'half'"):
-        read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, first=["property half a"]))
+    for line, message in {
+        "property list uchar int a": "do not come before 'property list uchar int a'",
+        "property half a": "cannot read 'property half a' of a vertex",
+        "property float x": "or one twice: x, x",
+    }.items():
+        with pytest.raises(BadInput, match=message):
+            read_surface(cloud_with_lists(tmp_path / "cloud.ply", xyz, first=[line]))
+    path = cloud_with_lists(tmp_path / "cloud.ply", xyz)
+    whole = path.read_bytes()
+    for line in (b"property list uchar double", b"property list half double weights", b"property list"):
+        path.write_bytes(whole.replace(b"property list uchar double weights", line))
+        with pytest.raises(BadInput, match="cannot read 'property list.* of a vertex"):
+            read_surface(path)
+    path.write_bytes(whole.replace(b"element vertex 6", b"element camera 6"))
+    with pytest.raises(BadInput, match="the first element must be 'element vertex N'"):
+        read_surface(path)
 
 
 @pytest.mark.parametrize(
