@@ -220,7 +220,7 @@ def read_vertices(path: Path) -> tuple[np.ndarray, list[str]]:
     Raises:
         BadInput: Not such a file, or damaged.
     """
-    lines, start, size = _opened(path)
+    lines, start, size = open_header(path)
     count, dtype = _vertex(path, lines)
     if size - start < count * dtype.itemsize:
         whole = (size - start) // dtype.itemsize
@@ -234,7 +234,7 @@ def read_elements(path: Path) -> tuple[Elements, dict[str, str]]:
     Raises:
         BadInput: Not such a file, or damaged.
     """
-    lines, at, size = _opened(path)
+    lines, at, size = open_header(path)
     heads = [i for i, line in enumerate(lines) if line.startswith("element ")]
     found: Elements = {}
     for here, end in zip(heads, [*heads[1:], len(lines)], strict=True):
@@ -249,8 +249,12 @@ def read_elements(path: Path) -> tuple[Elements, dict[str, str]]:
     return found, _tags(_comments(lines))
 
 
-def _opened(path: Path) -> tuple[list[str], int, int]:
-    """Lines of the header, where it ends, and the size of the file."""
+def open_header(path: Path) -> tuple[list[str], int, int]:
+    """Lines of the header, where it ends, and the size of the file, of a binary little-endian PLY file.
+
+    Raises:
+        BadInput: Not such a file, or its header does not end.
+    """
     try:
         with Path(path).open("rb") as file:
             lines = _header_lines(path, file)

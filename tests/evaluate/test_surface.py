@@ -120,6 +120,9 @@ def test_bad_points_with_lists(tmp_path):
         path.write_bytes(whole.replace(b"property list uchar double weights", line))
         with pytest.raises(BadInput, match="cannot read 'property list.* of a vertex"):
             read_surface(path)
+    path.write_bytes(whole.replace(b"end_header", b"comment"))
+    with pytest.raises(BadInput, match="the PLY header does not end"):
+        read_surface(path)
     path.write_bytes(whole.replace(b"element vertex 6", b"element camera 6"))
     with pytest.raises(BadInput, match="the first element must be 'element vertex N'"):
         read_surface(path)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.export.ply import TYPES, element_layout
+from surfkit.export.ply import TYPES, element_layout, open_header
 
 LIST = "property list "
 
@@ -22,7 +22,8 @@ def has_lists(lines: Sequence[str]) -> bool:
 def points_beside_lists(path: Path, lines: Sequence[str]) -> np.ndarray:
     """(P,) records of what a point has before its first list, of a binary little-endian cloud.
 
-    Rows differ in length, so one after the other is looked at: about half a second for a million points.
+    Rows differ in length, so one after the other is looked at: about half a second for a million points. They are in
+    memory, without their lists.
 
     Args:
         path: The file.
@@ -36,9 +37,9 @@ def points_beside_lists(path: Path, lines: Sequence[str]) -> np.ndarray:
     if not {"x", "y", "z"} <= {line.split()[-1] for line in own[:first]}:
         raise BadInput(f"{path}: x, y and z of its points do not come before {own[first]!r}; leave that list out")
     _, count, dtype = element_layout(path, [head, *own[:first]])
-    steps = _steps(path, own[first:])
+    steps, found = _steps(path, own[first:]), bytearray()
+    _, at, size = open_header(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        at, size, found = data.find(b"\n", max(data.find(b"end_header"), 0)) + 1, len(data), bytearray()
         for row in range(count):
             end = at + dtype.itemsize
             found += data[at:end]
