@@ -135,7 +135,7 @@ def vote(found: Votes, depth: np.ndarray, lens: list[float], pose: np.ndarray) -
         through = known & (seen > z + BEYOND)
         for counts, more in (
             (found.through[i], through),
-            (found.surfaces[i], known & ~through & (abs(seen - z) <= NEAR)),
+            (found.surfaces[i], known & (abs(seen - z) <= NEAR)),
         ):
             counts += more & (counts < 255)
 

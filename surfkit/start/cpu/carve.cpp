@@ -50,7 +50,7 @@ void carve(const CarveGrid& grid, const CarveView& view, uint8_t* surfaces, uint
                 const double found = view.depth[(int64_t)v * view.width + u];
                 const bool known = found > 0, beyond = found > z + view.beyond, near = std::fabs(found - z) <= view.near;
                 uint8_t &to_surfaces = surfaces[column + k], &to_through = through[column + k];
-                to_surfaces += known & !beyond & near & (to_surfaces < 255);
+                to_surfaces += known & near & (to_surfaces < 255);
                 to_through += known & beyond & (to_through < 255);
             }
         }

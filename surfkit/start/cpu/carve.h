@@ -17,7 +17,7 @@ struct CarveView {
     int width, height;
     double fx, fy, cx, cy;
     double pose[12];
-    double near, beyond;  // voxels
+    double near, beyond;  // voxels; the second is the larger
     int low[2], high[2];  // columns along x and y that it may see: from, to
 };
 
