@@ -144,10 +144,12 @@ def boundaries(mesh: Mesh) -> tuple[int, float, float]:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    start, end = mesh.faces.ravel().astype(np.int64), mesh.faces[:, [1, 2, 0]].ravel().astype(np.int64)
-    sides = np.sort(np.minimum(start, end) << 32 | np.maximum(start, end))
-    first = np.append(np.flatnonzero(np.diff(sides, prepend=-1)), len(sides))
-    rim = sides[first[:-1][np.diff(first) == 1]]
+    corners = mesh.faces.astype(np.int64)
+    others = np.roll(corners, -1, 1)
+    sides = np.sort((np.minimum(corners, others) << 32 | np.maximum(corners, others)).ravel())
+    differs = np.ones(len(sides) + 1, bool)
+    differs[1:-1] = sides[1:] != sides[:-1]
+    rim = sides[differs[:-1] & differs[1:]]
     if not len(rim):
         return 0, 0.0, 0.0
     ends = np.stack([rim >> 32, rim & 0xFFFFFFFF], 1)
@@ -157,7 +159,7 @@ def boundaries(mesh: Mesh) -> tuple[int, float, float]:
     count, parts = connected_components(links, directed=False)
     places = mesh.vertices[points].astype(np.float64)
     lengths = np.linalg.norm(places[at[:, 0]] - places[at[:, 1]], axis=1)
-    return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), len(rim) / (len(first) - 1)
+    return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), len(rim) / (int(np.count_nonzero(differs)) - 1)
 
 
 def _keep(mesh: Mesh, faces: np.ndarray) -> tuple[Mesh, int]:

@@ -235,7 +235,7 @@ SURFACE = Table(
         Row("+ harmonics of degree 2", {"primitive": surface.SURFACE.primitive}),
         Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),
         Row("+ voxels smaller than a pixel", {"mesh": PIXEL_MAPS}),
-        Row("+ depth maps of twice the size", {"mesh": surface.SURFACE.mesh}),
+        Row("+ depth maps of 1.5 times the size", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
