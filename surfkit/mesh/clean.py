@@ -159,7 +159,8 @@ def boundaries(mesh: Mesh) -> tuple[int, float, float]:
     count, parts = connected_components(links, directed=False)
     places = mesh.vertices[points].astype(np.float64)
     lengths = np.linalg.norm(places[at[:, 0]] - places[at[:, 1]], axis=1)
-    return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), len(rim) / (int(np.count_nonzero(differs)) - 1)
+    share = len(rim) / int(differs[1:].sum())
+    return int(count), float(np.bincount(parts[at[:, 0]], lengths).max()), share
 
 
 def _keep(mesh: Mesh, faces: np.ndarray) -> tuple[Mesh, int]:
