@@ -125,7 +125,6 @@ def improve(
     terms: Terms,
     seed: int,
     known: Sequence[Tensor | None] | None = None,
-    settled: np.ndarray | None = None,
 ) -> None:
     """One pass over both colours of the checkerboard, in place; no number of threads changes a bit.
 
@@ -136,7 +135,6 @@ def improve(
         terms: See there.
         seed: Of the random changes.
         known: (h, w) float32 inverse depth of the others, for geometric consistency.
-        settled: (H, W) bool, planes that stay as they are, for others to take; none if not given.
     """
     camera = here.camera
     ways = [[*way(camera, other.camera), *way(other.camera, camera)] for other in others]
@@ -151,7 +149,6 @@ def improve(
         planes.value,
         planes.cost,
         planes.each,
-        None if settled is None else np.ascontiguousarray(settled, np.uint8),
         [terms.low, terms.high, terms.parallax, terms.jitter_px, terms.smoothness, terms.consistency]
         + [terms.spread, terms.brightness],
         terms.samples,

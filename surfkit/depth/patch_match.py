@@ -17,7 +17,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Progress, emit
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
-from surfkit.depth.consistency import Agreement, agreement, at_edge
+from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
@@ -38,8 +38,6 @@ JITTER_PX = 0.5
 """Parallax by which planes are changed at random in the last pass at a size; twice as much in each one before."""
 LAST_JITTER_PX = 0.25
 """Of the pass that compares depth maps."""
-SETTLED_PX = 0.5
-"""Reprojection error in `agree` other maps below which a plane stays when maps are compared once more."""
 FEW, MANY = 16, 32
 """Pixels of a window that are compared at first, and from the last photometric pass at full size on."""
 MATCHED, COMPARED = "matching photographs", "comparing depth maps"
@@ -69,14 +67,14 @@ class PatchMatch(DepthEstimator):
 
     Planes begin with a plane sweep of small pictures and are improved from coarse to fine by photometric consistency,
     in the views that match best at each pixel; then also by the reprojection error in the depth maps of other
-    views (Xu and Tao 2019); planes that several of these confirm closely change in the first comparison only. The time
-    is linear in the number of pixels. Needs the compiled part of surfkit; on a GPU, planes are tried there.
+    views (Xu and Tao 2019). The time is linear in the number of pixels. Needs the compiled part of surfkit; on a GPU,
+    planes are tried there.
     """
 
     aligned: ClassVar[bool] = True
     matched: ClassVar[bool] = True
     oriented: ClassVar[bool] = True
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = 7
 
     longest: int = 1600
     """Longest side of a depth map in pixels; never more than that of the photograph."""
@@ -162,10 +160,15 @@ class PatchMatch(DepthEstimator):
 
     def trusted(self, work: Work, at: int, found: Map) -> Estimate:
         """What the maps of other photographs agree with, and the mean of what they say."""
-        said = work.agreement(at, found, [work.last.depth(near) for near in work.pairs[at]], self.tolerance_px)
+        camera = work.camera(at, 0)
+        depths = ((near, work.last.depth(near)) for near in work.pairs[at])
+        others = [(work.camera(near, 0), depth) for near, depth in depths if depth is not None]
+        share = self.tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
+        inverse = found.inverse.to(work.given.device)
+        said = agreement(camera, inverse, others, share)
         trust = said.trust(self.agree).cpu() * found.matched(self.best)
-        trust[at_edge(found.inverse.to(work.given.device), self.window // 2, self.edge).cpu()] = 0
-        return Estimate(at, said.fused.cpu(), trust, found.normals(work.camera(at, 0)))
+        trust[at_edge(inverse, self.window // 2, self.edge).cpu()] = 0
+        return Estimate(at, said.fused.cpu(), trust, found.normals(camera))
 
 
 @dataclass(frozen=True)
@@ -333,11 +336,7 @@ class Work:
         return max(1, self.settings.passes - fewer)
 
     def reconcile(self, at: int, before: Round) -> Map | None:
-        """One more pass, which looks at the depth maps of the others too.
-
-        Planes that these confirm closely stay, but in the first comparison: those of photometric consistency alone are
-        less exact.
-        """
+        """One more pass, which looks at the depth maps of the others too."""
         found = before.map(at)
         span = depth_range(self.given.views[at], self.given.observations, self.sweep.margin)
         if found is None or span is None:
@@ -347,20 +346,8 @@ class Work:
         planes.value[:], planes.each[:] = found.value, found.each
         terms = replace(self.terms(span, found.parallax), consistency=self.settings.consistency)
         there = [self.grey(near, 0) for near in self.pairs[at]]
-        compared, settled = self.rounds.index(before), None
-        if compared:
-            count = self.agreement(at, found, known, SETTLED_PX).count
-            settled = (count >= self.settings.agree).cpu().numpy()
-        seed = at * 31 + 30 - compared
-        self.improve(self.grey(at, 0), there, planes, terms, seed=seed, known=known, settled=settled)
+        self.improve(self.grey(at, 0), there, planes, terms, seed=at * 31 + 30 - self.rounds.index(before), known=known)
         return Map(planes.value, planes.each, found.parallax)
-
-    def agreement(self, at: int, found: Map, depths: Sequence[Tensor | None], tolerance_px: float) -> Agreement:
-        """What depth maps of the photographs that one is compared with say of its map."""
-        pairs = zip(self.pairs[at], depths, strict=True)
-        others = [(self.camera(near, 0), depth) for near, depth in pairs if depth is not None]
-        share = tolerance_px / found.parallax / float(found.inverse[found.inverse > 0].median())
-        return agreement(self.camera(at, 0), found.inverse.to(self.given.device), others, share)
 
     def terms(self, span: tuple[float, float], parallax: float) -> Terms:
         """Of the pass that compares depth maps, but for the weight of that."""

@@ -60,11 +60,6 @@ def known(seen: list[Grey], seed: int = 2) -> list[torch.Tensor | None]:
     return [None if at == 1 else each for at, each in enumerate(maps)]
 
 
-def some_settled(grey: Grey) -> np.ndarray:
-    """A fifth of the pixels."""
-    return np.random.default_rng(5).random(grey.value.shape) < 0.2
-
-
 def differing(found: Planes, true: Planes) -> float:
     """Share of the pixels with another plane, or the same at another cost: of two that cost the same to five digits,
     either may be taken, and pixels of the second colour go on from it."""
@@ -103,20 +98,6 @@ def test_planes_of_the_cpu(load, name):
     assert differing(found, true) < 0.01
     assert differing(before, true) > 0.8
     assert {*passes.uploaded} == {here, *others}
-
-
-def test_settled_planes_stay(load):
-    here, *others = pictures(4)
-    true = begun(here, len(others))
-    found, before = copied(true), copied(true)
-    settled = some_settled(here)
-    improve(here, others, true, TERMS, seed=3, known=known(others), settled=settled)
-    passes = GpuPasses(load(SOURCES[16]).device, load)
-    passes.improve(here, others, found, TERMS, seed=3, known=known(others), settled=settled)
-    assert differing(found, true) < 0.01
-    for name, values in vars(found).items():
-        assert np.array_equal(values[settled], getattr(before, name)[settled])
-    assert (found.value[~settled] != before.value[~settled]).any(1).mean() > 0.8
 
 
 def test_several_passes_find_what_those_of_the_cpu_find(load):
@@ -170,7 +151,6 @@ def test_pictures_leave_the_gpu_with_what_keeps_them():
 
 
 MISTAKES = {
-    "all planes move": ("if (settled.size && settled", "if (settled.size < 0 && settled"),
     "no border": ("(long long)(y + kBorder)", "(long long)(y)"),
     "the other colour": ("(y + colour) & 1", "(y + colour + 1) & 1"),
     "pixels across": ("four >> 8 & 255u", "four >> 16 & 255u"),
@@ -190,11 +170,10 @@ MISTAKES = {
 def test_mistakes_are_seen(name):
     here, *others = pictures(6)
     true = begun(here, len(others))
-    found, maps, terms, settled = copied(true), known(others), replace(TERMS, samples=16), some_settled(here)
-    improve(here, others, true, terms, seed=3, known=maps, settled=settled)
+    found, maps, terms = copied(true), known(others), replace(TERMS, samples=16)
+    improve(here, others, true, terms, seed=3, known=maps)
     wrong = Emulated(changed(SOURCES[16], *MISTAKES[name]))
     with pytest.raises(KernelError, match=r"index -\d+ of here|other planes"):
-        passes = GpuPasses(torch.device("cpu"), lambda source: wrong)
-        passes.improve(here, others, found, terms, seed=3, known=maps, settled=settled)
+        GpuPasses(torch.device("cpu"), lambda source: wrong).improve(here, others, found, terms, seed=3, known=maps)
         if differing(found, true) > 0.012:
             raise KernelError("other planes")

@@ -286,55 +286,6 @@ def test_maps_agree_better_after_more_rounds(farm, tmp_path):
     assert trusted[1] > 1.05 * trusted[0] > 0
 
 
-def test_from_the_second_comparison_on_planes_that_other_maps_confirm_stay(farm, tmp_path):
-    """Within half a pixel of reprojection, in three maps; counted here in float64, pixel by pixel."""
-    scene, tracks, _ = farm
-    settings, at = PatchMatch(coarsest=60, rounds=2), 7
-    pairs = neighbours(scene.train, tracks, settings.neighbours, settings.angle)
-    work = Work(settings, DepthInput(scene.train, tracks, CPU, tmp_path), pairs, [at])
-    matched, before, after = (each.map(at) for each in work.rounds)
-    inverse = before.value[..., 0].astype(np.float64)
-    share = 0.5 / before.parallax / np.median(inverse)
-    camera, count = work.camera(at, 0), np.zeros(inverse.shape)
-    points = (camera.rays(torch.float64).numpy() / inverse).reshape(3, -1)
-    for near in pairs[at]:
-        there = work.camera(near, 0)
-        turn = (there.world_to_camera @ camera.world_to_camera.inverse()).numpy()
-        x, y, z = turn[:3, :3] @ points + turn[:3, 3:]
-        u, v = np.floor(there.fx * x / z + there.cx), np.floor(there.fy * y / z + there.cy)
-        seen = (z > 0) & (u >= 0) & (v >= 0) & (u < there.width) & (v < there.height)
-        other = work.rounds[1].map(near).value[..., 0]
-        found = other[np.where(seen, v, 0).astype(int), np.where(seen, u, 0).astype(int)]
-        count += (seen & (np.abs(found * z - 1) < share)).reshape(inverse.shape)
-    settled = count >= 3
-    first, second = ((one.value == other.value).all(2) for one, other in ((matched, before), (before, after)))
-    assert 0.2 < settled.mean() < 0.9
-    assert first[settled].mean() < 0.5
-    assert second[settled].mean() > 0.99 and second[~settled].mean() < 0.15
-
-
-def test_settled_planes_stay_and_others_are_improved():
-    draw = np.random.default_rng(0)
-    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 40.0, 20.0, 15.0, 40, 30)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[0, 3] = -0.2
-    seen = [
-        Grey(replace(camera, world_to_camera=p), draw.integers(0, 256, (30, 40), np.uint8))
-        for p in (camera.world_to_camera, pose)
-    ]
-    begun = Planes.at(draw.uniform(0.5, 1.5, (30, 40)).astype(np.float32), 1)
-    settled = draw.random((30, 40)) < 0.5
-    results = []
-    for mask in (settled, np.zeros_like(settled), None):
-        planes = replace(begun, **{name: value.copy() for name, value in vars(begun).items()})
-        improve(seen[0], seen[1:], planes, replace(STILL, parallax=8.0, jitter_px=0.5), seed=1, settled=mask)
-        results.append(planes)
-    for name, value in vars(begun).items():
-        assert np.array_equal(getattr(results[0], name)[settled], value[settled])
-        assert np.array_equal(getattr(results[1], name), getattr(results[2], name))
-    assert (results[0].value != begun.value).any(2)[~settled].mean() > 0.2
-
-
 def test_a_window_of_which_nothing_counts_matches_nothing():
     """With a narrow spread, as settings allow it, a bright pixel is compared with none of the dark ones around it."""
     here, there = two_pictures(0)

@@ -22,7 +22,6 @@ namespace {
 
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Made = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using Flags = nb::ndarray<const uint8_t, nb::c_contig, nb::device::cpu>;
 using Pairs = nb::ndarray<const uint16_t, nb::c_contig, nb::device::cpu>;
 
 const StereoKernels& named(const std::string& name) {
@@ -41,8 +40,8 @@ void add_stereo(nb::module_& m) {
         [](Floats image, std::vector<double> lens, Floats pattern, std::vector<Pairs> pixels, std::vector<std::vector<double>> ways,
            std::vector<double> gains, std::vector<std::optional<Floats>> inverse, nb::ndarray<float, nb::c_contig, nb::device::cpu> plane,
            nb::ndarray<float, nb::c_contig, nb::device::cpu> cost,
-           nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::optional<Flags> settled, std::vector<double> settings, int samples,
-           int best, bool survey, uint32_t seed, const std::string& kernels, int threads) {
+           nb::ndarray<uint8_t, nb::c_contig, nb::device::cpu> each, std::vector<double> settings, int samples, int best, bool survey,
+           uint32_t seed, const std::string& kernels, int threads) {
             std::vector<StereoSource> sources(pixels.size());
             for (size_t i = 0; i < pixels.size(); i++) {
                 StereoSource& s = sources[i];
@@ -86,7 +85,6 @@ void add_stereo(nb::module_& m) {
             job.best = best;
             job.survey = survey;
             job.seed = seed;
-            job.settled = settled ? settled->data() : nullptr;
             const StereoKernels& k = named(kernels);
             const int rows = 4;
             nb::gil_scoped_release free;
@@ -97,7 +95,7 @@ void add_stereo(nb::module_& m) {
                 });
         },
         nb::arg("image"), nb::arg("lens"), nb::arg("pattern"), nb::arg("pixels"), nb::arg("ways"), nb::arg("gains"), nb::arg("inverse"), nb::arg("plane"),
-        nb::arg("cost"), nb::arg("each"), nb::arg("settled").none(), nb::arg("settings"), nb::arg("samples"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
+        nb::arg("cost"), nb::arg("each"), nb::arg("settings"), nb::arg("samples"), nb::arg("best"), nb::arg("survey"), nb::arg("seed"), nb::arg("kernels"),
         nb::arg("threads"));
     m.def(
         "depth_agreement",

@@ -486,7 +486,6 @@ struct Pixel {
 void improve(const StereoJob& job, int row, int colour) {
     for (int x = (row + colour) & 1; x < job.width; x += 2) {
         const int64_t here = (int64_t)row * job.width + x;
-        if (job.settled && job.settled[here]) continue;
         Pixel pixel{job, x, row};
         look(job, x, row, pixel.window);
         pixel.plane = pixel.at(x, row);

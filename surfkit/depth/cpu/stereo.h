@@ -47,7 +47,6 @@ struct StereoJob {
     int best;            // views that count
     bool survey;         // look at all views anew, to choose those that count
     uint32_t seed;
-    const uint8_t* settled;  // (height, width) 1 where a plane stays as it is; or null
 };
 
 struct StereoKernels {

@@ -83,7 +83,6 @@ class GpuPasses:
         terms: Terms,
         seed: int,
         known: Sequence[Tensor | None] | None = None,
-        settled: np.ndarray | None = None,
     ) -> None:
         """See `depth.native.improve`; the same bits twice on one GPU."""
         on = self.load(SOURCES[terms.samples])
@@ -91,8 +90,7 @@ class GpuPasses:
         nothing = torch.empty(0, 0, device=self.device)
         maps = [nothing if found is None else found.to(self.device) for found in known or [None] * len(others)]
         views = self.uploads(np.frombuffer(views_of(here, others, planes, pictures, maps), np.uint8))
-        kept = self.uploads(np.zeros((0, 0), np.uint8) if settled is None else settled.astype(np.uint8))
-        given = self.picture(here), joined(pictures), joined(maps), kept
+        given = self.picture(here), joined(pictures), joined(maps)
         state = [self.uploads(part) for part in (planes.value, planes.cost, planes.each)]
         height, width = planes.cost.shape
         grid = -(-width // (2 * WIDE)), -(-height // HIGH)

@@ -332,12 +332,10 @@ struct Pixel {
 
 KERNEL(kThreads, BLOCKS)
 improve(Job job, int colour, Buffer<const View> views, Buffer<const unsigned> here, Buffer<const unsigned> pictures,
-        Buffer<const float> inverses, Buffer<const unsigned char> settled, Buffer<float3> planes, Buffer<float> costs,
-        Buffer<unsigned char> each) {
+        Buffer<const float> inverses, Buffer<float3> planes, Buffer<float> costs, Buffer<unsigned char> each) {
     const int y = blockIdx.y * (kThreads / kWide) + threadIdx.x / kWide;
     const int x = 2 * (blockIdx.x * kWide + threadIdx.x % kWide) + ((y + colour) & 1);
     if (x >= job.width || y >= job.height) return;
-    if (settled.size && settled[(long long)y * job.width + x]) return;
     const long long middle = (long long)(y + kBorder) * (job.width + 2 * kBorder) + x + kBorder;
     const Pixel pixel{job, x, y, views, pictures, inverses, planes, costs, each};
     const Window window(job, here, middle);
