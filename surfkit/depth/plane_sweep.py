@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
@@ -20,6 +20,7 @@ from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import CANDIDATES, depth_range, neighbours
 from surfkit.depth.scanlines import best_planes, smooth_costs
 from surfkit.readers.depth_files import save_array
+from surfkit.scene.camera import Camera
 from surfkit.scene.memory import free_bytes
 from surfkit.scene.photos import read_photo
 from surfkit.scene.scene import View
@@ -103,7 +104,7 @@ class PlaneSweep(DepthEstimator):
 
     def refuse_unfit(self, views: Sequence[View]) -> None:
         """See `DepthEstimator.refuse_unfit`."""
-        refuse_wide_window(self.window, self.longest, views)
+        refuse_wide_window(self.window, {view.name: view.camera.fitted(self.longest) for view in views})
 
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
@@ -184,12 +185,11 @@ class PlaneSweep(DepthEstimator):
         return min(max(3, round(min(most, 1e9) / self.step_px) + 1), self.max_planes)
 
 
-def refuse_wide_window(window: int, longest: int, views: Sequence[View]) -> None:
-    """BadInput if a window is larger than all depth maps, whose longest sides are at most `longest` pixels.
+def refuse_wide_window(window: int, cameras: Mapping[str, Camera]) -> None:
+    """BadInput if a window is larger than all depth maps, of which the cameras are given by name.
 
     Where only some are smaller, such as a thumbnail among photographs, little is found in these.
     """
-    cameras = {view.name: view.camera.fitted(longest) for view in views}
     sides = {name: min(camera.width, camera.height) for name, camera in cameras.items()}
     name = max(sides, key=lambda each: sides[each], default="")
     if 3 <= sides.get(name, 0) < window:  # in smaller ones nothing is found, with any window

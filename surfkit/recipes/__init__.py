@@ -21,7 +21,7 @@ from surfkit.primitives.gaussian3d import Gaussian3D
 from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.recipes import city, city_datasets
-from surfkit.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS
+from surfkit.recipes.surface import STEREO, SURFACE, SURFACE_BLOCKS, SURFACE_SHORT
 from surfkit.refine.light import DistilSH, PruneAndRecover, slowing
 from surfkit.train.stage import Stage
 
@@ -122,6 +122,7 @@ RECIPES = {
     "lightgaussian": LIGHT,
     "surface": SURFACE,
     "surface-blocks": SURFACE_BLOCKS,
+    "surface-short": SURFACE_SHORT,
     "stereo": STEREO,
     "import": IMPORTED,
     "citygs": city.FIRST,

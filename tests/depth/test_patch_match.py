@@ -483,6 +483,27 @@ def test_small_photographs_among_larger_ones_do_not_refuse_the_window(farm, tmp_
         estimator.refuse_unfit(views[:3])
 
 
+def test_a_scale_is_a_share_of_each_photograph_and_the_longest_side_still_counts(farm, tmp_path):
+    scene, tracks, _ = farm
+    few = {"coarsest": 32, "passes": 1, "rounds": 1, "neighbours": 3}
+    found = []
+    for name, settings in {"scale": {"scale": 2.5}, "longest": {"longest": 48}}.items():
+        given = DepthInput(scene.train, tracks, CPU, tmp_path / name)
+        found += PatchMatch(**few, **settings).estimate(given, [3])
+    assert found[0].inverse.shape == (36, 48)  # of 120 x 90
+    assert torch.equal(found[0].inverse, found[1].inverse) and torch.equal(found[0].confidence, found[1].confidence)
+
+    def sides(camera: Camera) -> tuple[int, int]:
+        return camera.width, camera.height
+
+    whole = scene.train[0].camera
+    assert sides(PatchMatch(scale=2).of_map(whole.resized(4001, 3000))) == (1600, 1200)
+    assert sides(PatchMatch(scale=4).of_map(whole.resized(4001, 3000))) == (1000, 750)
+    assert sides(PatchMatch(scale=1000).of_map(whole)) == (1, 1)
+    with pytest.raises(BadInput, match=r"window is 7, and the largest depth map, of view_0.*, is 7 x 5 pixels"):
+        PatchMatch(scale=18).refuse_unfit(scene.train)
+
+
 def test_views_without_points_have_no_depth(farm, tmp_path):
     scene, tracks, _ = farm
     name = scene.train[2].name
@@ -513,6 +534,8 @@ def test_settings_that_make_no_sense_are_refused():
         {"tolerance_px": 0},
         {"edge": 1},
         {"longest": 8},
+        {"scale": 0.5},
+        {"scale": float("nan")},
     ):
         with pytest.raises(BadInput):
             PatchMatch(**setting)

@@ -143,7 +143,7 @@ def test_sparse_points_only_where_depth_maps_have_none(farm):
     assert cKDTree(stereo.xyz).query(added.numpy())[0].min() > 2 * stereo.size.min()
     assert cloud.opacity[: len(stereo)].unique() == 0.5 and (cloud.opacity[len(stereo) :] == 0.1).all()
     assert torch.allclose(cloud.normals.norm(dim=1), torch.ones(len(cloud.xyz))) and cloud.rgb.dtype == torch.uint8
-    for own, share in ((slice(None, len(stereo)), 0.65), (slice(len(stereo), None), 1.0)):  # each among its own kind
+    for own, share in ((slice(None, len(stereo)), 0.65), (slice(len(stereo), None), 4.0)):  # each among its own kind
         near = cKDTree(cloud.xyz[own].numpy()).query(cloud.xyz[own].numpy(), k=4)[0][:, 1:]
         np.testing.assert_allclose(cloud.size[own].numpy(), share * np.sqrt((near**2).mean(1)), rtol=1e-4)
     again = start.cloud(known(farm, spoilt=half))
