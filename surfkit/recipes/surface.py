@@ -80,7 +80,8 @@ SURFACE_BLOCKS = replace(
     tune=replace(SURFACE.pretrain, rates={}),
 )
 
-# Half of the work is stereo, so it is done at half the size and once; what it says is soon learnt by fewer splats.
+# With so few steps, stereo would be most of the work: it is done at half the size, and depth maps are compared once. Few
+# steps teach few splats, and their depth is worth fewer voxels.
 SURFACE_SHORT = replace(
     SURFACE,
     about="A first look at the surface, for runs of some hundred steps: stereo at half the size, fewer points",

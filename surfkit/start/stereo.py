@@ -28,7 +28,7 @@ SPARSE_OPACITY = 0.1
 SPARSE_SIZE = 4.0
 """Their standard deviation, in distances between them. Most lie at the rim, where few or no photographs show more: what
 begins small is still small there after a thousand steps, and leaves black between. (On examples/boruszyn 1, 2, 4 and 8
-times: 21.3, 21.2, 21.8 and 21.7 dB, means of three seeds.)"""
+times: 21.3, 21.2, 21.8 and 21.4 dB, means of three seeds.)"""
 FEWER = 0.9
 """A start with less than this share of the points that were asked for is told."""
 OVERLAP = 10
