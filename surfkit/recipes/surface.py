@@ -80,8 +80,8 @@ SURFACE_BLOCKS = replace(
     tune=replace(SURFACE.pretrain, rates={}),
 )
 
-# With so few steps, stereo would be most of the work: it is done at half the size, and depth maps are compared once. Few
-# steps teach few splats, and their depth is worth fewer voxels.
+# With so few steps, stereo would be most of the work: it is done at half the size, and depth maps are compared once.
+# Few steps teach few splats, and their depth is worth fewer voxels.
 SURFACE_SHORT = replace(
     SURFACE,
     about="A first look at the surface, for runs of some hundred steps: stereo at half the size, fewer points",
