@@ -318,10 +318,11 @@ def test_the_reprojection_error_counts_up_to_its_limit():
     assert with_wrong.cost[12, 16] - plain.cost[12, 16] == pytest.approx(0.3, abs=1e-5)
 
 
-def test_those_views_are_looked_at_that_match_best_here_and_around():
+@pytest.mark.parametrize("views", [7, 16])  # some, and as many as there may be
+def test_those_views_are_looked_at_that_match_best_here_and_around(views):
     """Twice as many as count; the pixel itself counts twice, each of its neighbours once."""
     here = two_pictures(0)[0]
-    others = [two_pictures(seed)[1] for seed in range(1, 8)]
+    others = [two_pictures(seed)[1] for seed in range(1, views + 1)]
     planes = Planes.at(np.full((24, 32), 0.5, np.float32), len(others))
     planes.each[:] = np.random.default_rng(5).integers(0, 60, planes.each.shape)  # noise matches worse than that
     before = planes.each.astype(int)
