@@ -45,20 +45,15 @@ SPLAT_FN bool valid(const SplatIn<double>& s, int columns) {
 
 // Colour of a splat seen from the camera, and what its gradient needs.
 struct Shade {
-    Vec<double> direction;
-    double length, basis[16], rgb[3];
+    splat::Sight<double> sight;
+    double rgb[3];
 };
 template <class Arrays>
 SPLAT_FN Shade shade(const Arrays& s, long long i, const SplatIn<double>& in, const CameraModel<double>& cam) {
-    Shade o;
-    const Vec<double> d = in.mean - cam.centre;
-    o.length = square_root(splat::dot(d, d));
-    o.direction = (1 / splat::largest(o.length, 1e-300)) * d;
-    splat::sh_basis(o.direction, s.coefficients, o.basis);
+    Shade o{splat::sight(in.mean, cam.centre, s.coefficients), {0.5, 0.5, 0.5}};
     const long long row = 3LL * s.coefficients * i;
-    for (int c = 0; c < 3; c++) o.rgb[c] = 0.5;
     for (int k = 0; k < s.coefficients; k++)
-        for (int c = 0; c < 3; c++) o.rgb[c] += o.basis[k] * s.sh[row + 3 * k + c];
+        for (int c = 0; c < 3; c++) o.rgb[c] += o.sight.basis[k] * s.sh[row + 3 * k + c];
     return o;
 }
 // `out_sh` has the layout of s.sh.
@@ -70,12 +65,11 @@ SPLAT_FN void shade_backward(const Arrays& s, long long i, const Shade& o, const
     const long long row = 3LL * s.coefficients * i;
     for (int k = 0; k < s.coefficients; k++)
         for (int c = 0; c < 3; c++) {
-            out_sh[row + 3 * k + c] = (float)(g[c] * o.basis[k]);
+            out_sh[row + 3 * k + c] = (float)(g[c] * o.sight.basis[k]);
             weight[k] += g[c] * s.sh[row + 3 * k + c];
         }
-    if (s.coefficients == 1 || !(o.length > 0)) return;
-    const Vec<double> d = splat::sh_backward(o.direction, s.coefficients, weight);
-    out.mean = out.mean + (1 / o.length) * (d - splat::dot(d, o.direction) * o.direction);
+    if (s.coefficients > 1 && o.sight.length > 0)
+        out.mean = out.mean + splat::sight_backward(o.sight, s.coefficients, weight);
 }
 
 // A little larger than exact, so that the float32 row test never loses a pixel.

@@ -183,6 +183,29 @@ SPLAT_FN Vec<R> sh_backward(Vec<R> d, int count, const R w[16]) {
     return g;
 }
 
+// The direction in which a splat is seen, how far away it is, and the harmonics there.
+template <class R>
+struct Sight {
+    Vec<R> direction;
+    R length, basis[16];
+};
+template <class R>
+SPLAT_FN Sight<R> sight(Vec<R> mean, Vec<R> eye, int count) {
+    Sight<R> o;
+    const Vec<R> d = mean - eye;
+    o.length = square_root(dot(d, d));
+    o.direction = (R(1) / largest(o.length, R(1e-300))) * d;
+    sh_basis(o.direction, count, o.basis);
+    return o;
+}
+
+// dL/d(mean) by the direction, from dL/d(basis); means nothing where the length is 0.
+template <class R>
+SPLAT_FN Vec<R> sight_backward(const Sight<R>& o, int count, const R w[16]) {
+    const Vec<R> d = sh_backward(o.direction, count, w);
+    return (R(1) / o.length) * (d - dot(d, o.direction) * o.direction);
+}
+
 // ---- one splat, its parts
 
 template <class R>

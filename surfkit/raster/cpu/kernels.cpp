@@ -6,8 +6,11 @@
 #include "../../native/simd.h"
 
 #define SPLAT_FN static SURFKIT_INLINE
+#include "doubles.h"
 #include "../pixels.h"
+#include "../project.h"
 #include "kernels.h"
+#include "colors.h"
 #include "images.h"
 #include "surfels.h"
 
@@ -436,6 +439,23 @@ void contribution(Kind kind, const Job& job, int64_t tile, float alpha_power, fl
             [&](auto k) { contribution_tile<decltype(k)>(Tile(job, tile), alpha_power, open_power, sums, touched); });
 }
 
+int tiles(const splat::Bound<double>& bound, int tiles_x, int tiles_y, double rim, uint32_t* to) {
+    int count = 0;
+    each_tile(bound, tiles_x, tiles_y, rim, [&](int tile) { to[count++] = (uint32_t)tile; });
+    return count;
+}
+
+bool add_rows(const float* rows, const uint8_t* touched, int64_t count, int width, double* sums) {
+    bool some = false;
+    for (int64_t k = 0; k < count; k++) {
+        if (!touched[k]) continue;
+        for (int i = 0; i < width; i += 4)
+            for (int j = i; j < i + 4; j++) sums[j] += rows[k * width + j];
+        some = true;
+    }
+    return some;
+}
+
 void probe(Kind kind, const Job& job, int64_t tile, const Probes& probes) {
     of_kind(kind, [&](auto k) { probe_tile<decltype(k)>(Tile(job, tile), probes); });
 }
@@ -458,6 +478,10 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                normal_rows,
                                project_surfels,
                                surfels_backward,
+                               tiles,
+                               shade_some,
+                               shade_some_backward,
+                               add_rows,
                                adam};
     return table;
 }

@@ -95,6 +95,16 @@ struct Kernels {
                             splat::SurfelView<double>* out, bool* drawn);
     void (*surfels_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
                              const double* sums, int stride, splat::SplatGrad<double>* out);
+    // Writes the tiles that a bound touches (`each_tile`), at most tiles_x * tiles_y; their number.
+    int (*tiles)(const splat::Bound<double>&, int tiles_x, int tiles_y, double rim, uint32_t* to);
+    // Colours of the splats of some rows, below 0 too. And the gradients of their coefficients, in the layout of `sh`, and
+    // what is added to those of their means, from `rgb`, the sums over their pixels, `stride` numbers apart.
+    void (*shade)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
+                  double (*rgb)[3]);
+    void (*shade_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
+                           const double* rgb, int stride, float* out_sh, splat::SplatGrad<double>* out);
+    // Adds up those of `count` rows of `width` numbers, a multiple of 4, that are touched; whether one is.
+    bool (*add_rows)(const float* rows, const uint8_t* touched, int64_t count, int width, double* sums);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
                  float share1, float share2, float second_correction, float epsilon);
 };

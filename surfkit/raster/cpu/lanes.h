@@ -25,6 +25,7 @@ SURFKIT_INLINE static Wide operator+(Wide a, Wide b) { return Wide(a.v + b.v); }
 SURFKIT_INLINE static Wide operator-(Wide a, Wide b) { return Wide(a.v - b.v); }
 SURFKIT_INLINE static Wide operator*(Wide a, Wide b) { return Wide(a.v * b.v); }
 SURFKIT_INLINE static Wide operator/(Wide a, Wide b) { return Wide(a.v / b.v); }
+SURFKIT_INLINE static Wide& operator+=(Wide& a, Wide b) { return a = a + b; }
 SURFKIT_INLINE static Wide operator-(Wide a) { return Wide(-a.v); }
 SURFKIT_INLINE static WideMask operator<(Wide a, Wide b) { return {(WideInts)(a.v < b.v)}; }
 SURFKIT_INLINE static WideMask operator>(Wide a, Wide b) { return {(WideInts)(a.v > b.v)}; }

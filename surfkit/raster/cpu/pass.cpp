@@ -100,7 +100,6 @@ Pass::Pass(Kind kind, const SplatArrays& splats, const CameraModel<double>& came
 template <class Record>
 void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* radii) {
     const int64_t n = splats.count, chunks = chunks_of(n, kChunk);
-    const int columns = scale_columns(kind_);
     records_ = buffer<char>(n * sizeof(Record));
     tiles_of_.assign(chunks, {});
     index_ = buffer<int64_t>(n);
@@ -111,41 +110,45 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
     Record* records = (Record*)records_.get();
     std::vector<int64_t> invalid(chunks, -1);
     const Outlook outlook(camera_);
+    const Kernels& kernel = kernels();
     parallel(chunks, threads, [&](int64_t c) {
         int64_t at = c * kChunk;
         std::vector<uint32_t> touched;  // moved at the end: neighbours in tiles_of_ share cache lines between threads
+        const Buffer<uint32_t> some_tiles = buffer<uint32_t>((int64_t)tiles_x_ * tiles_y_);
         int64_t rows[kChunk];
         const int64_t candidates = may_touch(kind_, splats, c * kChunk, outlook, rows, invalid[c], seen, radii);
-        Record group[kGroup];
-        Bound<double> bounds[kGroup];
-        bool drawn[kGroup];
-        for (int64_t k = 0; k < candidates; k++) {
-            const int64_t in_group = k % kGroup;
-            if (!in_group)
-                project_some(splats, rows + k, std::min(kGroup, candidates - k), camera_, form_, group, bounds, drawn);
-            if (!drawn[in_group]) continue;
-            const int64_t i = rows[k];
-            Record& r = group[in_group];
-            Bound<double> b = bounds[in_group];
-            const double radius = std::sqrt(std::max({b.hxx, b.hyy, b.r2}));
-            b = widened(b);
-            fill_bound(r, b);
-            const size_t before = touched.size();
-            each_tile(b, tiles_x_, tiles_y_, rim_, [&](uint32_t tile) { touched.push_back(tile); });
-            const uint32_t tiles = (uint32_t)(touched.size() - before);
-            if (!tiles) continue;
-            const SplatIn<double> in = read_splat(splats, i, columns);
-            const Shade look = shade(splats, i, in, camera_);
-            if (!std::isfinite(look.rgb[0] + look.rgb[1] + look.rgb[2]) && !(invalid[c] >= 0 && invalid[c] < i))
-                invalid[c] = i;
-            for (int q = 0; q < 3; q++) r.color[q] = (float)std::max(look.rgb[q], 0.0);
-            records[at] = r;
-            index_[at] = i;
-            depth_[at] = (float)(splat::mul(camera_.turn, in.mean) + camera_.shift).z;
-            tiles_[at] = tiles;
-            seen[i] = true;
-            radii[i] = (float)radius;
-            at++;
+        for (int64_t from = 0; from < candidates; from += kGroup) {
+            const int64_t some = std::min(kGroup, candidates - from);
+            Record group[kGroup];
+            Bound<double> bounds[kGroup];
+            bool drawn[kGroup];
+            project_some(splats, rows + from, some, camera_, form_, group, bounds, drawn);
+            const int64_t first = at;
+            for (int64_t k = 0; k < some; k++) {
+                if (!drawn[k]) continue;
+                const Bound<double> b = widened(bounds[k]);
+                const int tiles = kernel.tiles(b, tiles_x_, tiles_y_, rim_, some_tiles.get());
+                if (!tiles) continue;
+                touched.insert(touched.end(), some_tiles.get(), some_tiles.get() + tiles);
+                tiles_[at] = (uint32_t)tiles;
+                const int64_t i = rows[from + k];
+                fill_bound(group[k], b);
+                records[at] = group[k];
+                index_[at] = i;
+                seen[i] = true;
+                radii[i] = (float)std::sqrt(std::max({bounds[k].hxx, bounds[k].hyy, bounds[k].r2}));
+                at++;
+            }
+            double rgb[kGroup][3];
+            kernel.shade(splats, index_.get() + first, at - first, camera_, rgb);
+            for (int64_t r = first; r < at; r++) {
+                const double* look = rgb[r - first];
+                const int64_t i = index_[r];
+                if (!std::isfinite(look[0] + look[1] + look[2]) && !(invalid[c] >= 0 && invalid[c] < i)) invalid[c] = i;
+                for (int q = 0; q < 3; q++) records[r].color[q] = (float)std::max(look[q], 0.0);
+                const Vec<double> mean{splats.means[3 * i], splats.means[3 * i + 1], splats.means[3 * i + 2]};
+                depth_[r] = (float)(splat::mul(camera_.turn, mean) + camera_.shift).z;
+            }
         }
         tiles_of_[c] = std::move(touched);
         seen_in_[c] = (int32_t)(at - c * kChunk);
@@ -294,23 +297,16 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
         double all[kGroup * kRaySumsChosen] = {};
         for (int64_t r = from; r < end; r++) {
             double* const s = all + hit * width;
-            bool some = false;
-            for (uint32_t slot = slot_[r]; slot < slot_[r] + tiles_[r]; slot++) {
-                if (!touched[slot]) continue;
-                const float* row = sums.get() + (size_t)slot * width;
-                for (int i = 0; i < width; i++) s[i] += row[i];
-                some = true;
-            }
-            if (some) rows[hit++] = index_[r];
+            const size_t slot = slot_[r];
+            if (k.add_rows(sums.get() + slot * width, touched.data() + slot, tiles_[r], width, s))
+                rows[hit++] = index_[r];
         }
         SplatGrad<double> gradients[kGroup];
         gradients_of(kind_, splats, rows, hit, camera_, form_, all, width, gradients);
-        for (int64_t k = 0; k < hit; k++) {
-            const int64_t i = rows[k];
-            const double* s = all + k * width;
-            SplatGrad<double>& g = gradients[k];
-            const SplatIn<double> in = read_splat(splats, i, columns);
-            shade_backward(splats, i, shade(splats, i, in, camera_), s + color_at, g, out.sh);
+        k.shade_backward(splats, rows, hit, camera_, all + color_at, width, out.sh, gradients);
+        for (int64_t h = 0; h < hit; h++) {
+            const int64_t i = rows[h];
+            const SplatGrad<double>& g = gradients[h];
             out.means[3 * i] = (float)g.mean.x;
             out.means[3 * i + 1] = (float)g.mean.y;
             out.means[3 * i + 2] = (float)g.mean.z;
@@ -319,7 +315,7 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
             out.opacities[i] = (float)g.opacity;
             for (int q = 0; q < 2; q++) {
                 out.signal[2 * i + q] = (float)g.signal[q];
-                if (out.chosen) out.chosen[2 * i + q] = (float)s[chosen_at + q];
+                if (out.chosen) out.chosen[2 * i + q] = (float)all[h * width + chosen_at + q];
             }
         }
     };

@@ -1,13 +1,10 @@
 // One rendered view: projection, tile lists, blending, and the way back.
 #pragma once
 
-#include <cmath>
 #include <cstdint>
 #include <vector>
 
-static inline double square_root(double x) { return std::sqrt(x); }
-static inline double natural_log(double x) { return std::log(x); }
-static inline double round_down(double x) { return std::floor(x); }
+#include "doubles.h"
 #include "../project.h"
 #include "../../native/buffer.h"
 #include "kernels.h"
