@@ -266,5 +266,5 @@ def test_what_is_foretold_of_each_kind(runs, data, growing, tmp_path, capsys):
 
 def test_recipes_with_blocks_densify_what_a_block_owns():
     made = recipes()
-    names = ("citygs2", "citygs2-short", "citygs2-s", "citygs2-t", "citygs2-aerial", "citygs2-street")
+    names = ("citygs2", "citygs2-short", "citygs2-s", "citygs2-t", "citygs2-aerial", "citygs2-street", "surface-blocks")
     assert {made[name].context for name in names} == {"tuned"} and made["citygs"].context == "densified"
