@@ -5,8 +5,7 @@
 #include <algorithm>
 #include <type_traits>
 
-#include "kernels.h"
-#include "lanes.h"
+#include "surfels.h"
 
 namespace surfkit {
 namespace {
@@ -37,13 +36,13 @@ SURFKIT_INLINE void put_coefficient(WideChannels value, float* sh, int k) {
 
 // The sights of up to kWide splats; lanes without one repeat the last. `basis[k][lane]` has the harmonics.
 SURFKIT_INLINE splat::Sight<Wide> sight_of_some(const SplatArrays& s, const int64_t* rows, int some,
-                                                splat::Vec<Wide> eye, double (*basis)[kWide]) {
+                                                const splat::CameraModel<Wide>& cam, double (*basis)[kWide]) {
     double all[3][kWide];
     for (int lane = 0; lane < kWide; lane++)
         for (int k = 0; k < 3; k++) all[k][lane] = s.means[3 * rows[std::min(lane, some - 1)] + k];
     splat::Vec<Wide> mean;
     std::memcpy(&mean, all, sizeof all);
-    const splat::Sight<Wide> o = splat::sight(mean, eye, s.coefficients);
+    const splat::Sight<Wide> o = splat::sight(mean, cam.centre, s.coefficients);
     std::memcpy(basis, o.basis, s.coefficients * sizeof(Wide));
     return o;
 }
@@ -58,15 +57,14 @@ SURFKIT_INLINE WideChannels color_of(const float* sh, const double (*basis)[kWid
 
 template <int coefficients>
 void shade_some_of(const SplatArrays& s, const int64_t* rows, int64_t count, const splat::CameraModel<double>& camera,
-                double (*rgb)[3]) {
-    const splat::Vec<Wide> eye{camera.centre.x, camera.centre.y, camera.centre.z};
+                   double (*rgb)[3]) {
+    const splat::CameraModel<Wide> cam = for_all_lanes(camera);
     for (int64_t at = 0; at < count; at += kWide) {
         const int some = (int)std::min<int64_t>(kWide, count - at);
         double basis[16][kWide];
-        sight_of_some(s, rows + at, some, eye, basis);
+        sight_of_some(s, rows + at, some, cam, basis);
         for (int lane = 0; lane < some; lane++) {
-            const WideChannels color =
-                color_of<coefficients>(s.sh + 3 * coefficients * rows[at + lane], basis, lane);
+            const WideChannels color = color_of<coefficients>(s.sh + 3 * coefficients * rows[at + lane], basis, lane);
             std::memcpy(rgb[at + lane], &color, sizeof rgb[0]);
         }
     }
@@ -74,13 +72,13 @@ void shade_some_of(const SplatArrays& s, const int64_t* rows, int64_t count, con
 
 template <int coefficients>
 void shade_some_backward_of(const SplatArrays& s, const int64_t* rows, int64_t count,
-                         const splat::CameraModel<double>& camera, const double* rgb, int stride, float* out_sh,
-                         splat::SplatGrad<double>* out) {
-    const splat::Vec<Wide> eye{camera.centre.x, camera.centre.y, camera.centre.z};
+                            const splat::CameraModel<double>& camera, const double* rgb, int stride, float* out_sh,
+                            splat::SplatGrad<double>* out) {
+    const splat::CameraModel<Wide> cam = for_all_lanes(camera);
     for (int64_t at = 0; at < count; at += kWide) {
         const int some = (int)std::min<int64_t>(kWide, count - at);
         double basis[16][kWide], weight[16][kWide] = {};
-        const splat::Sight<Wide> sight = sight_of_some(s, rows + at, some, eye, basis);
+        const splat::Sight<Wide> sight = sight_of_some(s, rows + at, some, cam, basis);
         for (int lane = 0; lane < some; lane++) {
             const int64_t row = 3 * coefficients * rows[at + lane];
             const WideChannels color = color_of<coefficients>(s.sh + row, basis, lane);

@@ -97,8 +97,9 @@ struct Kernels {
                              const double* sums, int stride, splat::SplatGrad<double>* out);
     // Writes the tiles that a bound touches (`each_tile`), at most tiles_x * tiles_y; their number.
     int (*tiles)(const splat::Bound<double>&, int tiles_x, int tiles_y, double rim, uint32_t* to);
-    // Colours of the splats of some rows, below 0 too. And the gradients of their coefficients, in the layout of `sh`, and
-    // what is added to those of their means, from `rgb`, the sums over their pixels, `stride` numbers apart.
+    // Colours of the splats of some rows, below 0 too. And the gradients of their coefficients (1, 4, 9 or 16 of them),
+    // in the layout of `sh`, and what is added to those of their means, from `rgb`, the sums over their pixels, `stride`
+    // numbers apart.
     void (*shade)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
                   double (*rgb)[3]);
     void (*shade_backward)(const SplatArrays&, const int64_t* rows, int64_t count, const splat::CameraModel<double>&,
