@@ -12,6 +12,7 @@ from surfkit.depth.base import DepthInput
 from surfkit.depth.consistency import Agreement, agreement, agreement_in_torch, at_edge
 from surfkit.depth.matching import Picture, cost_volume, ray_map
 from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.depth.scanlines import best_planes, smooth_costs
 from surfkit.readers.data import Data
@@ -34,11 +35,17 @@ def farm(tmp_path_factory):
     return scene, observations(data, scene), truth
 
 
-def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
-    scene, observations, truth = farm
-    given = DepthInput(scene.train, observations, CPU, tmp_path)
-    wanted = [7, 12]
-    for estimate, at in zip(PlaneSweep().estimate(given, wanted), wanted, strict=True):
+@pytest.fixture(scope="module")
+def swept(farm, tmp_path_factory):
+    """Estimates of two views."""
+    scene, observations, _ = farm
+    given = DepthInput(scene.train, observations, CPU, tmp_path_factory.mktemp("work"))
+    return list(PlaneSweep().estimate(given, [7, 12]))
+
+
+def test_depth_is_within_one_percent_where_it_is_trusted(farm, swept):
+    scene, _, truth = farm
+    for estimate, at in zip(swept, [7, 12], strict=True):
         depth = truth.exact[scene.train[at].name].depth.float()
         trusted = (estimate.confidence > 0.5) & (depth > 0)
         error = (1 / (estimate.inverse * depth) - 1).abs()[trusted]
@@ -46,6 +53,18 @@ def test_depth_is_within_one_percent_where_it_is_trusted(farm, tmp_path):
         assert error.median() < 0.006 and (error < 0.02).float().mean() > 0.9
         everywhere = (1 / (estimate.inverse * depth) - 1).abs()[depth > 0]
         assert (everywhere > 0.05).float().mean() > 0.01  # so the check had something to reject
+
+
+@needs_native
+def test_the_compiled_estimator_finds_the_same_depth_within_a_pixel_of_parallax(farm, swept, tmp_path):
+    scene, observations, _ = farm
+    given = DepthInput(scene.train, observations, CPU, tmp_path)
+    pixel = 0.026  # of parallax, as a share of depth
+    for one, other in zip(PatchMatch(coarsest=60).estimate(given, [7, 12]), swept, strict=True):
+        both = (one.confidence >= 0.375) & (other.confidence >= 0.375)
+        apart = (one.inverse / other.inverse - 1).abs()[both]
+        assert both.float().mean() > 0.45
+        assert apart.median() < pixel / 4 and (apart < pixel).float().mean() > 0.98
 
 
 def test_exposure_does_not_matter(farm, tmp_path):
