@@ -20,7 +20,17 @@ LIKENESS = 0.75
 
 def flags(command: type, argv: Sequence[str]) -> list[str]:
     """All flags of a command, such as "--pretrain.steps", with the recipe and the parts that `argv` chooses."""
-    return list(_flags_of(command, command, "", argv))
+    return [flag for flag, _ in _flags_of(command, command, "", argv)]
+
+
+def negations_with_their_flag(command: type, argv: Sequence[str]) -> list[str]:
+    """The same words, with `--PART.NAME` before each `--PART.no-NAME`: tyro finds a part that nobody chose, and so is
+    the default one, by the former alone. What comes last counts."""
+    if not any(".no-" in word for word in argv):
+        return list(argv)
+    switches = {flag for flag, hint in _flags_of(command, command, "", argv) if bool in members(hint)}
+    turned_on = [word.replace(".no-", ".") if ".no-" in word else "" for word in argv]
+    return [part for flag, word in zip(turned_on, argv, strict=True) for part in ([flag] * (flag in switches) + [word])]
 
 
 def explain_flag(command: type, flag: str, argv: Sequence[str]) -> str | None:
@@ -45,8 +55,9 @@ def owners(command: type, flag: str, argv: Sequence[str]) -> list[str]:
     return sorted(found)
 
 
-def _flags_of(owner: Any, kind: type, path: str, argv: Sequence[str]) -> Iterator[str]:
-    """The flags of all fields of a class; `owner` has their values: an instance, or the class for its defaults."""
+def _flags_of(owner: Any, kind: type, path: str, argv: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """The flags of all fields of a class, with the type of each; `owner` has their values: an instance, or the class
+    for its defaults."""
     hints = hints_of(kind)
     for field in fields(kind):
         hint = hints[field.name]
@@ -64,8 +75,8 @@ def _flags_of(owner: Any, kind: type, path: str, argv: Sequence[str]) -> Iterato
         yield from _flags_in(hint, value, below, argv)
 
 
-def _flags_in(hint: Any, value: Any, path: str, argv: Sequence[str]) -> Iterator[str]:
-    """The flags of one setting of that type and value, whose own flag would be `--path`."""
+def _flags_in(hint: Any, value: Any, path: str, argv: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """The flags of one setting of that type and value, with their types; its own flag would be `--path`."""
     chosen = [word.removeprefix(f"{path}:") for word in argv if path and word.startswith(f"{path}:")]
     kinds = [kind for kind in members(hint) if isinstance(kind, type) and get_origin(kind) is None]
     kinds = [kind for kind in kinds if is_dataclass(kind) or issubclass(kind, Component)]
@@ -78,7 +89,7 @@ def _flags_in(hint: Any, value: Any, path: str, argv: Sequence[str]) -> Iterator
         for key, item in items.items():
             yield from _flags_in(held[0], item, join(path, str(key).replace("_", "-")), argv)
     elif path and not kinds:
-        yield f"--{path}"
+        yield f"--{path}", hint
 
 
 def _components_in(value: Any) -> dict[Any, Any]:

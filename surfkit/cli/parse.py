@@ -24,7 +24,7 @@ from tyro._errors import (
     on_parse_error,
 )
 
-from surfkit.cli.flags import explain_flag, flags
+from surfkit.cli.flags import explain_flag, flags, negations_with_their_flag
 from surfkit.cli.help_text import one_paragraph_each
 from surfkit.cli.recipes import ARGV
 from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
@@ -60,7 +60,7 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
     """
     if hasattr(command, "default_table"):
         argv = files_as_choices(argv)
-    argv = flags_as_choices(command, [*argv, *_default(command, argv)])
+    argv = negations_with_their_flag(command, flags_as_choices(command, [*argv, *_default(command, argv)]))
     token = ARGV.set(tuple(argv))
 
     def refuse(event: ParseErrorEvent) -> None:

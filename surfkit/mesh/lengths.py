@@ -5,17 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
 from surfkit.mesh.picture import Which, depth_of
+from surfkit.raster.api import Splats
 from surfkit.scene.lengths import Length, to_local
 from surfkit.scene.scene import Frame
 
 SAMPLED = 16
 """Views that automatic lengths are taken from."""
 DEPTHS = 2.0
-"""Automatic limit of the depth, in median depths."""
+"""Automatic limit of the depth, in median depths, where hardly anything lies beyond."""
+WITHIN = 0.98
+"""Share of the pixels whose depth is within the automatic limit: photographs along a street show much that is further
+than twice the median."""
+NEAR = 0.03
+"""Share of its depth by which a splat may lie off what a view sees there, and be part of it."""
 LEAST_CUT = 1.75
 """Least truncation, voxels: the corners of a cell lie up to the root of three from a plane through it."""
 
@@ -43,7 +50,8 @@ def resolve(
     Args:
         voxel: Side of a voxel; if it is auto, `voxel_px` pixels at the median depth.
         truncation: Of distances; if it is auto, `truncation_voxels` voxels.
-        limit: Depth from which nothing is fused; if it is auto, `DEPTHS` median depths.
+        limit: Depth from which nothing is fused; if it is auto, `DEPTHS` median depths, or that of the share `WITHIN`
+            of the pixels if it is more.
         subject: What is meshed.
         which: Depth of a pixel.
         voxel_px: See `voxel`.
@@ -54,9 +62,9 @@ def resolve(
     """
     given = [to_local(value, subject.frame) for value in (voxel, truncation, limit)]
     if given[0] is None or given[2] is None:
-        depth, pixel = look(subject, which)
+        depth, pixel, far = look(subject, which)
         given[0] = given[0] or voxel_px * pixel
-        given[2] = given[2] or DEPTHS * depth
+        given[2] = given[2] or max(DEPTHS * depth, far)
     size, cut, far = given
     cut = cut or truncation_voxels * size
     if cut < LEAST_CUT * size:
@@ -74,14 +82,20 @@ def with_unit(length: float, frame: Frame) -> str:
     return f"{length / frame.scale:.3g} units"
 
 
-def look(subject: MeshInput, which: Which) -> tuple[float, float]:
-    """Median over some views of their median depth, and of the width of a pixel there; local units.
+def sampled(subject: MeshInput) -> list[int]:
+    """Positions of up to `SAMPLED` views, evenly."""
+    count = len(subject.views)
+    return [at * count // min(SAMPLED, count) for at in range(min(SAMPLED, count))]
+
+
+def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
+    """Median over some views of their median depth, of the width of a pixel there, and of all pixels the depth that a
+    share of `WITHIN` has at most; local units.
 
     Views without depth are passed over for others.
     """
-    count = len(subject.views)
-    first = [at * count // min(SAMPLED, count) for at in range(min(SAMPLED, count))]
-    depths, pixels = [], []
+    count, first = len(subject.views), sampled(subject)
+    depths, pixels, seen = [], [], []
     for at in [*first, *sorted(set(range(count)) - set(first))]:
         if len(depths) >= len(first) // 2 + 1 and at not in first:
             break
@@ -92,9 +106,28 @@ def look(subject: MeshInput, which: Which) -> tuple[float, float]:
         if len(depth):
             depths.append(float(depth.median()))
             pixels.append(depths[-1] / min(view.camera.fx, view.camera.fy))
+            seen.append(depth)
     if not depths:
         raise BadInput(
             f"no depth in any of {count} views: the splats are not opaque enough to be a surface; train for more steps"
             + (", or try --mesh.depth expected" if which == "median" else "")
         )
-    return float(np.median(depths)), float(np.median(pixels))
+    far = np.quantile(torch.cat(seen).numpy(), WITHIN)
+    return float(np.median(depths)), float(np.median(pixels)), float(far)
+
+
+def without_hidden(subject: MeshInput, which: Which) -> Splats:
+    """The splats without those that some of the sampled views look at and none of them sees, as behind walls.
+
+    These never become a surface. They are many where points begin at depth that nobody trusts.
+    """
+    means = subject.splats.means.double().cpu()
+    looked, seen = torch.zeros(2, len(means), dtype=torch.bool)
+    for view in (subject.views[at] for at in sampled(subject)):
+        depth = depth_of(subject.draw(view), which)
+        x, y, z = view.camera.project(means).T
+        inside = torch.nonzero((z > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height))[:, 0]
+        found = depth[y[inside].long(), x[inside].long()]
+        looked[inside] = True
+        seen[inside] |= (found > 0) & ((found / z[inside] - 1).abs() < NEAR)
+    return subject.splats.take(seen | ~looked)

@@ -20,7 +20,7 @@ def without_oversized(subject: MeshInput, largest_px: float, which: Which) -> Me
     """
     if subject.draw_of is None:
         raise BadInput("mesh.largest_px leaves out splats, and what is drawn here is not made of splats; give 0")
-    _, pixel = look(subject, which)
+    _, pixel, _ = look(subject, which)
     kept = subject.splats.scales.amax(1) <= largest_px * pixel
     if kept.all():
         return subject

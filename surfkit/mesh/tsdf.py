@@ -16,10 +16,11 @@ from surfkit.mesh.base import Mesh, Mesher, MeshInput
 from surfkit.mesh.cuda import grid as gpu
 from surfkit.mesh.fusion import Task, fuse
 from surfkit.mesh.lattice import FULL, MOST, SIDE, Lattice, Picture
-from surfkit.mesh.lengths import LEAST_CUT, Lengths, resolve, with_unit
+from surfkit.mesh.lengths import LEAST_CUT, Lengths, resolve, with_unit, without_hidden
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
+from surfkit.mesh.sky import without_sky
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
 from surfkit.scene.lengths import Length, check_length, to_local
@@ -56,7 +57,8 @@ class TSDF(Mesher):
     `least_views` with them."""
 
     depth_limit: Length = "auto"
-    """Depth beyond which pixels are not fused, metres; auto is twice the median depth."""
+    """Depth beyond which pixels are not fused, metres; auto is twice the median depth, or more where more than a
+    fiftieth of the pixels lies beyond, as along a street."""
 
     depth: Which = "median"
     """Depth of a pixel: median is that of the splat where the accumulated opacity reaches 0.5, expected the mean of
@@ -77,6 +79,10 @@ class TSDF(Mesher):
     largest_px: float = 0.0
     """Leave out splats with a larger standard deviation, in pixels at the median depth: they paint places that few
     views see, and hide the surface behind them. 0 keeps all."""
+
+    sky: bool = True
+    """Fuse the sky too. Off: what lies above the horizon is left out if depth priors know nothing there, nor above it;
+    which way is up, the cameras tell. Splats paint the sky at any distance, and views agree on it."""
 
     floaters: float = 0.0
     """Drop connected components that views see through more than this many times as often as they see them; 0 keeps
@@ -106,7 +112,7 @@ class TSDF(Mesher):
     @property
     def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
-        return self.trust is not None and self.trust.needs_prior
+        return not self.sky or (self.trust is not None and self.trust.needs_prior)
 
     def refuse_unfit(self, frame: Frame) -> None:
         """See `Mesher.refuse_unfit`."""
@@ -123,6 +129,8 @@ class TSDF(Mesher):
                 f"{LEAST_BYTES // 10**6}MB or more"
             )
         given = len(subject.splats)
+        if not self.sky:
+            subject = without_sky(subject)
         if self.largest_px:
             subject = without_oversized(subject, self.largest_px, self.depth)
         lengths, found = self._lengths(subject)
@@ -173,8 +181,11 @@ class TSDF(Mesher):
         lengths = resolve(*given, subject, self.depth, self.voxel_px, self.truncation_voxels)
         centres = torch.stack([view.camera.centre for view in subject.views]).numpy()
         within = centres.min(0) - lengths.limit, centres.max(0) + lengths.limit
-        found = estimate(subject.splats, lengths.voxel, within)
+        splats, found = subject.splats, estimate(subject.splats, lengths.voxel, within)
         most = min(round(AUTO_TRIANGLES / BLOCK_TRIANGLES), for_mesh(subject) // MESH_BYTES)
+        if found.total > most:
+            splats = without_hidden(subject, self.depth)
+            found = estimate(splats, lengths.voxel, within)
         if self.voxel == "auto" and found.total > most:
             emit(
                 Warned(
@@ -187,7 +198,7 @@ class TSDF(Mesher):
             auto = self.truncation == "auto"
             cut = self.truncation_voxels * coarser if auto else max(lengths.truncation, LEAST_CUT * coarser)
             lengths = Lengths(coarser, cut, lengths.limit)
-            found = estimate(subject.splats, coarser, within)
+            found = estimate(splats, coarser, within)
         refuse_too_fine(lengths, subject, np.abs(within).max())
         refuse_too_large(lengths, subject, found.total)
         return lengths, found

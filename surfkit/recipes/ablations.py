@@ -213,7 +213,8 @@ GRADIENT = Table(
 )
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
-PIXEL_MAPS = replace(surface.SURFACE.mesh, oversampling=1.0)
+WITH_SKY = replace(surface.SURFACE.mesh, sky=True)
+PIXEL_MAPS = replace(WITH_SKY, oversampling=1.0)
 PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
 CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=Agreement(alone=0.1))
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
@@ -235,7 +236,8 @@ SURFACE = Table(
         Row("+ harmonics of degree 2", {"primitive": surface.SURFACE.primitive}),
         Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),
         Row("+ voxels smaller than a pixel", {"mesh": PIXEL_MAPS}),
-        Row("+ depth maps of 1.5 times the size", {"mesh": surface.SURFACE.mesh}),
+        Row("+ depth maps of 1.5 times the size", {"mesh": WITH_SKY}),
+        Row("+ sky left out", {"mesh": surface.SURFACE.mesh}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
         Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),

@@ -59,13 +59,16 @@ SURFACE = Recipe(
         oversampling=1.5,
         least_views=0.05,
         largest_px=64.0,
+        sky=False,
         trust=Agreement(alone=0.5, covered_by=2),
     ),
 )
 
 # The same depth, fused in the same way, without splats: what these bring is the difference. Stereo has holes, where
 # nobody would seem to look, and no discs at the rim: the mesh does not end there. Its maps have their own pixels alone.
-STEREO_FUSION = replace(SURFACE.mesh, largest_px=0.0, oversampling=1.0, trust=replace(SURFACE.mesh.trust, covered_by=0))
+STEREO_FUSION = replace(
+    SURFACE.mesh, largest_px=0.0, oversampling=1.0, sky=True, trust=replace(SURFACE.mesh.trust, covered_by=0)
+)
 STEREO = Recipe(
     about="Stereo depth maps alone, fused as recipe:surface fuses but for rims: no splats, the baseline of any surface",
     method=StereoFusion(mesher=Stereo(fusion=STEREO_FUSION)),

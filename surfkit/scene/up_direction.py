@@ -59,13 +59,11 @@ def up_direction(axis: Axis | None, views: Sequence[View], frame: Frame | None, 
         return Up(np.eye(3)["xyz".index(axis)], "--up")
     if frame is None or not views:
         return Up(np.eye(3)[2], "z, as no cameras are known")
-    turn = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
-    if frame.crs is not None:
-        return Up(_snapped(turn[:, 2]), "georeferenced frame")
-    found = _up_of_cameras(views)
+    found = up_of_views(views, frame)
     if found is None:
         return Up(np.eye(3)[2], "z, as the cameras do not tell")
-    return Up(_snapped(turn @ found), "cameras")
+    turn = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
+    return Up(_snapped(turn @ found), "cameras" if frame.crs is None else "georeferenced frame")
 
 
 def map_axes(up: np.ndarray) -> np.ndarray:
@@ -79,12 +77,14 @@ def map_axes(up: np.ndarray) -> np.ndarray:
     return np.stack([east, np.cross(up, east), up]) + 0.0
 
 
-def _up_of_cameras(views: Sequence[View]) -> np.ndarray | None:
-    """(3,) unit vector: the direction that no camera has to its side, as cameras are held level; or None.
+def up_of_views(views: Sequence[View], frame: Frame) -> np.ndarray | None:
+    """(3,) unit vector, axes of the input: z of a georeferenced frame, else what the cameras tell, or None.
 
-    Where all cameras head one way, that is any direction across it, and the one across the plane that they fly in
-    counts.
+    That is the direction which no camera has to its side, as cameras are held level. Where all cameras head one way, it
+    is any direction across it, and the one across the plane that they fly in counts.
     """
+    if frame.crs is not None:
+        return np.eye(3)[2]
     turns = np.stack([view.camera.world_to_camera[:3, :3].numpy() for view in views])
     spread, axes = np.linalg.eigh(np.einsum("vi,vj->ij", turns[:, 0], turns[:, 0]) / len(turns))
     if spread[1] < SPAN or spread[0] > TILT * spread[1]:

@@ -16,6 +16,7 @@ from surfkit.losses.base import Loss, Regularizer
 from surfkit.losses.photometric import L1
 from surfkit.losses.regularizers import MeanOpacity
 from surfkit.losses.surface import Distortion
+from surfkit.mesh.tsdf import TSDF
 from surfkit.primitives.base import Primitive
 
 
@@ -45,6 +46,16 @@ def test_a_part_of_the_recipe_is_swapped_or_taken_away(tmp_path):
         ("pretrain.prune.1:none", "pretrain.prune.0:none"): (),
     }.items():
         assert parse(Train, [f"recipe:{file}", *words], "surfkit train").recipe.pretrain.prune == left
+
+
+@pytest.mark.parametrize(
+    "words", [["--mesh.no-carve"], ["mesh:tsdf", "--mesh.no-carve"], ["--mesh.carve", "--mesh.no-carve"]]
+)
+def test_a_switch_of_a_part_that_nobody_chose_is_turned_off(words):
+    words = ["recipe:2dgs", "--no-prepare", *words, "--mesh.voxel", "2"]
+    assert parse(Train, words, "surfkit train").recipe.mesh == TSDF(voxel=2.0, carve=False)
+    with pytest.raises(BadInput, match="no option --mesh.no-voxel; perhaps you meant --mesh.voxel"):
+        parse(Train, ["recipe:2dgs", "--mesh.no-voxel"], "surfkit train")
 
 
 def test_entries_of_a_dict_come_change_and_go():

@@ -12,12 +12,12 @@ from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh import fusion, native, tsdf
 from surfkit.mesh.lattice import LEAST_SLANT, SIDE, Lattice
-from surfkit.mesh.lengths import LEAST_CUT
+from surfkit.mesh.lengths import LEAST_CUT, without_hidden
 from surfkit.mesh.picture import depth_of, picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
 from surfkit.mesh.tiles import Box
 from surfkit.mesh.tsdf import TSDF
-from surfkit.raster.api import Maps
+from surfkit.raster.api import Maps, Splats
 
 from .shapes import around, look_at, maps_of, slope, sphere, subject, torus
 
@@ -59,6 +59,38 @@ def test_automatic_lengths_are_those_of_the_pixels():
     assert coarser["truncation_m"] == pytest.approx(4 * coarser["voxel_m"])
     unknown = TSDF().mesh(replace(given, frame=replace(given.frame, metres=None))).facts
     assert unknown["voxel"] == pytest.approx(facts["voxel"]) and "voxel_m" not in unknown
+
+
+def test_the_automatic_depth_limit_reaches_what_is_seen_along_a_street():
+    def street(points):
+        return points[..., 2]
+
+    given = subject([look_at((0.3 * x, 0.0, 0.2), (5.0, 0.5 * x - 1, 0.0)) for x in range(5)], street)
+    depths = [given.draw(view).depth for view in given.views]
+    median = np.median([float(depth[depth > 0].median()) for depth in depths])
+    far = np.quantile(np.concatenate([depth[depth > 0].numpy() for depth in depths]), 0.98)
+    facts = TSDF(voxel=0.5, least_views=0.01).mesh(given).facts
+    assert facts["depth_limit_m"] == pytest.approx(far / 0.1, rel=1e-4) and far > 3 * median
+
+
+def test_splats_behind_walls_do_not_make_automatic_voxels_larger(monkeypatch):
+    given, fine = subject(around(8), sphere), TSDF(voxel_px=0.25, least_views=0.05)
+    exact = fine.mesh(given)
+    tensors = given.splats.tensors()
+    shells = [tensors | {"means": size * tensors["means"]} for size in (1, 0.85, 0.7, 0.55)]
+    both = Splats(given.splats.kind, *(torch.cat([shell[name] for shell in shells]) for name in tensors))
+    hidden = replace(given, splats=both)
+    kept = without_hidden(hidden, "median").means.norm(dim=1)
+    assert len(given.splats) <= len(kept) < 1.1 * len(given.splats)
+    assert kept.min() > 0.42, "3 % of the depth behind the surface"
+    monkeypatch.setattr(tsdf, "AUTO_TRIANGLES", 2 * len(exact.faces))
+    assert fine.mesh(hidden).facts["voxel"] == exact.facts["voxel"]
+    monkeypatch.setattr(tsdf, "without_hidden", lambda subject, which: subject.splats)
+    assert fine.mesh(hidden).facts["voxel"] > 1.04 * exact.facts["voxel"], "else they are counted"
+    away = replace(given, views=given.views[:1])
+    assert len(without_hidden(away, "median")) < len(given.splats), "the back is hidden from the one view"
+    turned = [replace(view, camera=look_at((0.0, 0.0, 5.0), (0.0, 0.0, 9.0))) for view in given.views]
+    assert len(without_hidden(replace(given, views=turned), "median")) == len(given.splats), "nobody looks"
 
 
 def test_an_automatic_voxel_grows_with_what_would_be_too_many_triangles(monkeypatch):

@@ -363,7 +363,7 @@ def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys):
     assert main(words) == 2 and not (tmp_path / "none").exists()
     assert "let the run make them with depth:patch-match and without --no-prepare" in capsys.readouterr().err
     trust = replace(SURFACE.mesh.trust, covered_by=0)  # where stereo has no depth, nobody would seem to look
-    fusion = replace(SURFACE.mesh, largest_px=0.0, oversampling=1.0, trust=trust)
+    fusion = replace(SURFACE.mesh, largest_px=0.0, oversampling=1.0, sky=True, trust=trust)
     assert STEREO.method.mesher.fusion == fusion, "it has no splats"
     assert STEREO.depth == SURFACE.depth and not STEREO.has_stages
 
