@@ -86,6 +86,13 @@ class Mesher(Component):
         """
         return False
 
+    def needs_prior_of(self, views: Sequence[View], frame: Frame) -> bool:
+        """Whether it looks at depth priors of these views: only if `needs_prior`.
+
+        They may be many, and take hours to make again.
+        """
+        return self.needs_prior
+
     def ready(self) -> None:
         """Check, before hours are spent, whether it can work.
 

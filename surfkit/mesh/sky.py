@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import MeshInput
 from surfkit.scene.camera import Camera
+from surfkit.scene.scene import View
 from surfkit.scene.up_direction import up_of_views
 
 CONFIDENT = 0.1
@@ -25,8 +27,10 @@ def without_sky(subject: MeshInput) -> MeshInput:
     Told if they cannot: there are no depth maps, or the cameras do not tell which way is up.
     """
     up = up_of_views(subject.views, subject.frame)
+    if up is not None and not may_show_sky(subject.views, up):
+        return subject
     if subject.priors is None or up is None:
-        why = "there are no depth maps" if subject.priors is None else "the cameras do not tell which way is up"
+        why = "the cameras do not tell which way is up" if up is None else "there are no depth maps"
         emit(Warned(f"the sky is not left out of the mesh: {why}"))
         return subject
     priors = subject.priors
@@ -39,6 +43,18 @@ def without_sky(subject: MeshInput) -> MeshInput:
         return solid if mask is None else mask & solid
 
     return replace(subject, keep=keep)
+
+
+def may_show_sky(views: Sequence[View], up: np.ndarray | None) -> bool:
+    """Whether any picture reaches above the horizon, and so has a corner there; not if nobody knows which way is up."""
+    return up is not None and any((_corners(view.camera) @ up > 0).any() for view in views)
+
+
+def _corners(camera: Camera) -> np.ndarray:
+    """(4, 3) rays through the corners of the picture, local axes."""
+    x, y = np.repeat([0, camera.width], 2), np.tile([0, camera.height], 2)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(4)], 1)
+    return rays @ camera.world_to_camera[:3, :3].numpy()
 
 
 def sky(camera: Camera, known: Tensor, up: np.ndarray) -> Tensor:

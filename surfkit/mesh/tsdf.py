@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -20,11 +20,12 @@ from surfkit.mesh.lengths import LEAST_CUT, Lengths, resolve, with_unit, without
 from surfkit.mesh.oversampling import oversampled
 from surfkit.mesh.oversized import without_oversized
 from surfkit.mesh.picture import Which, depth_of, picture, weighed
-from surfkit.mesh.sky import without_sky
+from surfkit.mesh.sky import may_show_sky, without_sky
 from surfkit.mesh.tiles import BLOCK_TRIANGLES, GRID_BYTES, MESH_BYTES, SHARE, Estimate, estimate, plan
 from surfkit.mesh.trust import Trust
 from surfkit.scene.lengths import Length, check_length, to_local
-from surfkit.scene.scene import Frame
+from surfkit.scene.scene import Frame, View
+from surfkit.scene.up_direction import up_of_views
 
 LEAST_BYTES = 50_000_000
 """With less memory, tiles would be smaller than what a view sees of a wall."""
@@ -112,7 +113,15 @@ class TSDF(Mesher):
     @property
     def needs_prior(self) -> bool:
         """See `Mesher.needs_prior`."""
-        return not self.sky or (self.trust is not None and self.trust.needs_prior)
+        return not self.sky or self._trusts_prior
+
+    def needs_prior_of(self, views: Sequence[View], frame: Frame) -> bool:
+        """See `Mesher.needs_prior_of`."""
+        return self._trusts_prior or (not self.sky and may_show_sky(views, up_of_views(views, frame)))
+
+    @property
+    def _trusts_prior(self) -> bool:
+        return self.trust is not None and self.trust.needs_prior
 
     def refuse_unfit(self, frame: Frame) -> None:
         """See `Mesher.refuse_unfit`."""
@@ -168,7 +177,7 @@ class TSDF(Mesher):
                 depth = torch.where(keep, depth, 0.0)
             if self.trust is None:
                 return picture(depth, maps, view.camera, lengths.voxel)
-            prior = subject.priors[at] if self.trust.needs_prior and subject.priors is not None else None
+            prior = subject.priors[at] if self._trusts_prior and subject.priors is not None else None
             trust = self.trust.within(maps, depth, prior)
             seen = picture(torch.where(trust > 0, depth, 0.0), maps, view.camera, lengths.voxel)
             return replace(seen, shade=weighed(seen.shade, trust.numpy()))

@@ -113,7 +113,7 @@ def mesh_input(
         draw = with_depth(run, draw)
     splats = made.splats.splats if made.splats else points(scene.train if mesher is not None else (), draw)
     masks = mask_cache(scene.train, budget_bytes // 4)
-    wanted = mesher is not None and mesher.needs_prior
+    wanted = mesher is not None and mesher.needs_prior_of(scene.train, scene.frame)
     priors = read_priors(run.data, scene, budget_bytes // 4) if wanted else None
     return MeshInput(
         splats=splats,

@@ -79,7 +79,7 @@ def with_maps_to_mesh(run: Run, mesher: Mesher, scene: Scene, caches: CacheSetti
         BadInput: They may not be made, or cannot.
     """
     before, own = run.data.priors, replace(run, data=replace(run.data, priors=None))
-    if not mesher.needs_prior:
+    if not mesher.needs_prior_of(scene.train, scene.frame):
         yield run
     elif before is not None and is_there(before):
         with mark_used(located(before)):

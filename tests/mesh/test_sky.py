@@ -7,7 +7,8 @@ import numpy as np
 import torch
 
 from surfkit.mesh import sky as module
-from surfkit.mesh.sky import sky, without_sky
+from surfkit.mesh.agreement import Agreement
+from surfkit.mesh.sky import may_show_sky, sky, without_sky
 from surfkit.mesh.tsdf import TSDF
 from surfkit.readers.depth_prior import DepthPrior
 
@@ -51,9 +52,19 @@ def test_a_photograph_on_its_side_has_the_same_sky():
     assert torch.equal(sky(side, known.T, UP).T, sky(camera, known, UP))
 
 
-def test_nothing_that_is_looked_down_at_is_sky():
-    camera = look_at((0.0, 0.0, 5.0), (0.0, 3.0, 0.0))
-    assert not sky(camera, torch.zeros(72, 96, dtype=torch.bool), UP).any()
+def test_views_that_look_down_show_no_sky_and_need_no_depth_maps():
+    down = [look_at(2.5 * np.array([x, y, 1.6])) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    across = [*down, look_at(EYES[0])]
+    assert not any(sky(camera, torch.zeros(72, 96, dtype=torch.bool), UP).any() for camera in down)
+    for cameras, shown in ((down, False), (across, True)):
+        given = subject(cameras, house)
+        assert may_show_sky(given.views, UP) == shown
+        assert TSDF(sky=False).needs_prior_of(given.views, given.frame) == shown
+        assert TSDF(sky=False, trust=Agreement(priors="weigh")).needs_prior_of(given.views, given.frame)
+        assert not TSDF().needs_prior_of(given.views, given.frame)
+    with mock.patch.object(module, "emit") as told:
+        given = subject(down, house)
+        assert without_sky(given) is given and not told.called
 
 
 def painted(cameras):
