@@ -52,7 +52,7 @@ SURFACE = Recipe(
     # Splats begin two pixels wide; those that have grown far beyond paint rims and alleys, and are no surface. The mesh
     # ends where fewer than three pictures show a place; within, what nobody confirms, as in alleys, is more often right
     # than not. Voxels smaller than a pixel, with as short a truncation as they allow, keep the walls of alleys
-    # apart; so do depth maps of 1.5 times the size.
+    # apart; so do depth maps of 1.5 times the size. The sky, which photographs from the ground show, is no surface.
     mesh=TSDF(
         voxel_px=0.8,
         truncation_voxels=1.75,
