@@ -71,7 +71,8 @@ def wait_for(what, seconds=60):
 
 
 def test_how_each_ended_the_largest_first(workers, tmp_path):
-    say = "import time; print(time.time(), os.environ['OMP_NUM_THREADS'], repr(os.environ['CUDA_VISIBLE_DEVICES']))"
+    told = "time.time(), os.environ['OMP_NUM_THREADS'], repr(os.environ['CUDA_VISIBLE_DEVICES'])"
+    say = f"import time; print({told}, flush=True)"
     codes = [say, f"{say}\nraise SystemExit(1)", f"{say}\nos.kill(os.getpid(), 9)"]
     jobs = [job(tmp_path, at, code, cost=cost) for at, (code, cost) in enumerate(zip(codes, (1, 9, 5), strict=True))]
     jobs.append(job(tmp_path, 3, needs=(tmp_path / "elsewhere",)))

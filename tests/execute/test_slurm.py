@@ -39,7 +39,7 @@ def wait_for(what, seconds=60):
 
 @pytest.mark.parametrize("cluster", ["local", "debug"])
 def test_how_each_ended_the_largest_first(cluster, tmp_path):
-    say = "import time; print(time.time(), os.environ['OMP_NUM_THREADS'])"
+    say = "import time; print(time.time(), os.environ['OMP_NUM_THREADS'], flush=True)"
     codes = [say, f"{say}\nraise SystemExit(1)", f"{say}\nos.kill(os.getpid(), 9)"]
     jobs = [job(tmp_path, at, code, cost=cost) for at, (code, cost) in enumerate(zip(codes, (1, 9, 5), strict=True))]
     jobs.append(job(tmp_path, 3, cost=0.0, needs=(tmp_path / "elsewhere",)))

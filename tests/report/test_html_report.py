@@ -20,7 +20,7 @@ from surfkit.report.html.page import Options, html, page_of
 HOSTILE = (
     "<script>alert(1)</script>",
     '"><img src=x onerror=alert(1)>',
-    "'</style><svg onload=alert(1)>&amp;{{ 7*7 }}",
+    "'</style><svg onload=alert(1)>&amp;{{ 1357*2468 }}",
 )
 
 
@@ -77,7 +77,7 @@ def test_hostile_texts_are_shown_as_text(tmp_path, text):
     shown = found.text()
     assert shown.count(text) > 25, "the text as it was written, in every place that has some"
     assert shown.count(folder) > 5 and photos[1] in shown
-    assert "49" not in re.findall(r"\d+", shown), "a text is no template"
+    assert "3349076" not in re.findall(r"\d+", shown), "a text is no template"
 
 
 @pytest.mark.parametrize("text", HOSTILE)
