@@ -24,14 +24,14 @@ BIN_PX = 2.0
 def without_sky(subject: MeshInput) -> MeshInput:
     """What is to be meshed, without the pixels that show the sky, where depth maps and cameras can tell.
 
-    Told if they cannot: there are no depth maps, or the cameras do not tell which way is up.
+    Told if they cannot, as there are no depth maps, or the cameras do not tell which way is up.
     """
     up = up_of_views(subject.views, subject.frame)
     if up is not None and not may_show_sky(subject.views, up):
         return subject
     if subject.priors is None or up is None:
         why = "the cameras do not tell which way is up" if up is None else "there are no depth maps"
-        emit(Warned(f"the sky is not left out of the mesh: {why}"))
+        emit(Warned(f"sky that the photographs may show stays in the mesh, as {why}; masks leave it out"))
         return subject
     priors = subject.priors
 
