@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
@@ -88,6 +89,12 @@ def sampled(subject: MeshInput) -> list[int]:
     return [at * count // min(SAMPLED, count) for at in range(min(SAMPLED, count))]
 
 
+def shown(subject: MeshInput, at: int, which: Which) -> Tensor:
+    """(H, W) depth that the view at a position shows and that is to be fused, camera z; 0 where there is none."""
+    depth, keep = depth_of(subject.draw(subject.views[at]), which), subject.keep(at)
+    return depth if keep is None else torch.where(keep, depth, 0.0)
+
+
 def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
     """Median over some views of their median depth, of the width of a pixel there, and of all pixels the depth that a
     share of `WITHIN` has at most; local units.
@@ -100,9 +107,8 @@ def look(subject: MeshInput, which: Which) -> tuple[float, float, float]:
         if len(depths) >= len(first) // 2 + 1 and at not in first:
             break
         view = subject.views[at]
-        depth = depth_of(subject.draw(view), which)
-        keep = subject.keep(at)
-        depth = depth[depth > 0] if keep is None else depth[(depth > 0) & keep]
+        depth = shown(subject, at, which)
+        depth = depth[depth > 0]
         if len(depth):
             depths.append(float(depth.median()))
             pixels.append(depths[-1] / min(view.camera.fx, view.camera.fy))
@@ -123,10 +129,10 @@ def without_hidden(subject: MeshInput, which: Which) -> Splats:
     """
     means = subject.splats.means.double().cpu()
     looked, seen = torch.zeros(2, len(means), dtype=torch.bool)
-    for view in (subject.views[at] for at in sampled(subject)):
-        depth = depth_of(subject.draw(view), which)
-        x, y, z = view.camera.project(means).T
-        inside = torch.nonzero((z > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height))[:, 0]
+    for at in sampled(subject):
+        depth, camera = shown(subject, at, which), subject.views[at].camera
+        x, y, z = camera.project(means).T
+        inside = torch.nonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))[:, 0]
         found = depth[y[inside].long(), x[inside].long()]
         looked[inside] = True
         seen[inside] |= (found > 0) & ((found / z[inside] - 1).abs() < NEAR)

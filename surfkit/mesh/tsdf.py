@@ -83,7 +83,8 @@ class TSDF(Mesher):
 
     sky: bool = True
     """Fuse the sky too. Off: what lies above the horizon is left out if depth priors know nothing there, nor above it;
-    which way is up, the cameras tell. Splats paint the sky at any distance, and views agree on it."""
+    which way is up, the cameras tell. Views without a depth prior keep theirs. Splats paint the sky at any distance,
+    and views agree on it."""
 
     floaters: float = 0.0
     """Drop connected components that views see through more than this many times as often as they see them; 0 keeps

@@ -87,6 +87,8 @@ def test_splats_behind_walls_do_not_make_automatic_voxels_larger(monkeypatch):
     assert fine.mesh(hidden).facts["voxel"] == exact.facts["voxel"]
     monkeypatch.setattr(tsdf, "without_hidden", lambda subject, which: subject.splats)
     assert fine.mesh(hidden).facts["voxel"] > 1.04 * exact.facts["voxel"], "else they are counted"
+    nothing = torch.zeros(72, 96, dtype=torch.bool)
+    assert not len(without_hidden(replace(given, keep=lambda at: nothing), "median")), "masks hide too"
     away = replace(given, views=given.views[:1])
     assert len(without_hidden(away, "median")) < len(given.splats), "the back is hidden from the one view"
     turned = [replace(view, camera=look_at((0.0, 0.0, 5.0), (0.0, 0.0, 9.0))) for view in given.views]
