@@ -20,11 +20,11 @@ from surfkit.execute.base import Executor, Inline
 from surfkit.raster.select import Device
 from surfkit.readers.data import Reading
 from surfkit.report.ablation import Table
-from surfkit.report.notes import lines_on_depth
+from surfkit.report.notes import lines_on_depth, row_numbers
 from surfkit.report.rows import Trial
 from surfkit.report.screen import Screen
 from surfkit.report.sharing import sharing_lines
-from surfkit.report.study import FORMS, Plan, ablate, report_so_far, trials
+from surfkit.report.study import FORMS, Plan, ablate, mesh_alone, report_so_far, trials
 from surfkit.report.table import LEGEND, STACKED, drawing, failures, lines
 from surfkit.report.truth import Truth
 
@@ -136,10 +136,13 @@ class Ablate:
         return 1 if broken else 0
 
     def before(self, plan: Plan, left: Sequence[Trial]) -> None:
-        """Say what is known before the first run: which rows lack depth maps, and an estimate of time and disk."""
+        """Say what is known before the first run: which rows lack depth maps or are passed over, time and disk."""
         folders, labels = {trial.folder for trial in left}, [row.label for row in self.table.rows]
         for line in lines_on_depth([trial for trial in trials(plan) if trial.folder in folders], labels):
             say(f"note: {line}")
+        if passed_over := mesh_alone(plan):
+            which = f"{row_numbers(passed_over, labels)}, {' and '.join(passed_over)}"
+            say(f"note: left out is {which}: it draws no pictures, and meshes are compared with --gt alone")
         if self.probe:
             foretell(plan, left, self.probe)
 

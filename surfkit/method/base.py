@@ -106,6 +106,8 @@ class Method(Component):
 
     uses: ClassVar[tuple[str, ...]] = ()
     """Fields of the recipe that the method looks at, such as "primitive"; "mesh" if what it can draw may be meshed."""
+    draws: ClassVar[bool] = True
+    """Whether what it makes can draw a view. `surfkit ablate` runs rows of a method without it for their F1 alone."""
     needs_prior: ClassVar[bool] = False
     """Whether it looks at depth priors; they are made as the recipe's `depth` says where the data set has none."""
     needs_normals: ClassVar[bool] = False

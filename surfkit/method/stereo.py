@@ -17,6 +17,7 @@ from surfkit.raster.api import Maps
 class StereoFusion(Method):
     """Fuse the depth maps of the photographs into a mesh; nothing is optimised."""
 
+    draws: ClassVar[bool] = False
     needs_prior: ClassVar[bool] = True
 
     mesher: Stereo = field(default_factory=Stereo)

@@ -144,8 +144,6 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray, list[list
     model = _reconstruction(folder)
     shots = _shots(folder, model)
     points = [point for _, point in sorted(model.points3D.items())]
-    if not points:
-        reject(BadInput(f"{folder}: the model has no 3D points, which training starts from; triangulate it in COLMAP"))
     xyz = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
     with np.errstate(over="ignore"):

@@ -70,6 +70,12 @@ def costs(gigabytes: float, memory: float, fps: float) -> dict[str, float]:
 FILTER = {"pretrain.densify.filters": (Elongation(),)}
 DEPTH = {"pretrain.losses.depth": DepthRegression(start=0.5, end=0.0025)}
 
+
+def stereo_alone(on: str) -> Row:
+    """The last row of a table: depth maps of stereo alone, fused, which any optimised surface has to beat."""
+    return Row("stereo alone", recipe=RECIPES["stereo"], kept=False, on=on, group="Without splats")
+
+
 # What the second stage of CityGaussianV2 adds to its pretraining. Its losses and its densification are those of
 # pretraining, but for the normal loss, which counts from the beginning.
 PARALLEL = {
@@ -166,6 +172,7 @@ MODEL = Table(
             paper=published(0.727, 23.17, 0.266, 0.519, 0.402, 0.453, millions=8.05, minutes=235)
             | costs(0.44, 31.5, 66.7),
         ),
+        stereo_alone(on="baseline"),
     ),
 )
 
@@ -209,6 +216,7 @@ GRADIENT = Table(
             kept=False,
             paper=published(0.674, 22.21, 0.347, 0.490, 0.380, 0.428, millions=9.43, minutes=90),
         ),
+        stereo_alone(on="SSIM + RGB + normal"),
     ),
 )
 
@@ -289,6 +297,7 @@ TRIM = Table(
         Row("ratio 0.1, by the best view", {"tune.prune.0.score": "peak"}, kept=False),
         Row("ratio 0.1, by the sum", {"tune.prune.0.score": "sum"}, kept=False),
         Row("ratio 0.1, as released", {"tune.prune.0": Trim(ratio=0.1, score="released", recovery=0)}, kept=False),
+        stereo_alone(on="no trim"),
     ),
 )
 
@@ -312,6 +321,7 @@ PARTITION = Table(
         Row("surroundings frozen", {"context": "frozen"}, kept=False),
         Row("blocks add no points", STILL, kept=False),
         Row("blocks agree (DOGS)", STILL | {"tune.regularizers.consensus": Consensus()}, kept=False),
+        stereo_alone(on="contracted grid, 2 x 2"),
     ),
 )
 

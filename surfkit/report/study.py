@@ -237,13 +237,23 @@ def sized(recipe: Recipe, plan: Plan) -> Recipe:
     return limit_points(recipe, plan.max_points) if recipe.has_stages else recipe
 
 
+def mesh_alone(plan: Plan) -> list[str]:
+    """Labels of the rows that make a mesh and draw no pictures, where no mesh is compared: they have no quality to
+    show, and are run only where they are named."""
+    if plan.truth or plan.rows:
+        return []
+    return [label for label, recipe in build(plan.table).items() if not recipe.method.draws]
+
+
 def unfinished(plan: Plan) -> list[Trial]:
     """The trials of the rows of a plan that are still to be run, one for each folder."""
-    every, labels = trials(plan), pick(plan.table, plan.rows)
+    every, labels, passed_over = trials(plan), pick(plan.table, plan.rows), mesh_alone(plan)
     known = known_outcomes(every)
     first: dict[Path, Trial] = {}
     for trial in every:
-        if trial.label in labels and not plan.is_done(trial, known.get(trial.folder, Outcome())):
+        if trial.label not in labels or trial.label in passed_over:
+            continue
+        if not plan.is_done(trial, known.get(trial.folder, Outcome())):
             first.setdefault(trial.folder, trial)
     return list(first.values())
 

@@ -189,7 +189,7 @@ def test_nothing_is_made_to_show_a_table_without_runs(scene, monkeypatch, tmp_pa
 
 def test_the_tables_and_their_rows(tmp_path, capsys):
     assert main(["tables"]) == 0
-    assert re.search(r"^model +13 +What each component brings", capsys.readouterr().out, re.M)
+    assert re.search(r"^model +14 +What each component brings", capsys.readouterr().out, re.M)
     for name in ("model", "table:model"):
         assert main(["tables", name]) == 0
         shown = capsys.readouterr().out

@@ -12,15 +12,17 @@ from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.densify import CountCap, Elongation
+from surfkit.method.stereo import StereoFusion
 from surfkit.readers.data import Data
 from surfkit.readers.fingerprint import fingerprint as data_fingerprint
 from surfkit.readers.read import read
-from surfkit.recipes.ablations import COARSE_BASELINE, MODEL
+from surfkit.recipes.ablations import COARSE_BASELINE, MODEL, TABLES, stereo_alone
+from surfkit.recipes.surface import STEREO
 from surfkit.report import rows
-from surfkit.report.ablation import Row, Table
+from surfkit.report.ablation import Row, Table, build
 from surfkit.report.rows import Outcome
 from surfkit.report.screen import Screen
-from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials
+from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials, unfinished
 from surfkit.report.table import lines, markdown
 from surfkit.report.truth import Truth
 from surfkit.run import shared
@@ -106,17 +108,36 @@ def test_equal_recipes_run_once_and_seeds_come_in_turn(data, runs, tmp_path):
 
 def test_a_limit_on_points_holds_in_every_row(data, tmp_path):
     plan = Plan(MODEL, (data,), tmp_path, max_points=500)
-    recipes = [trial.recipe for trial in trials(plan)]
-    assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * len(MODEL.rows)
+    recipes = [trial.recipe for trial in trials(plan) if trial.label != "stereo alone"]
+    assert [recipe.pretrain.densify.filters[-1] for recipe in recipes] == [CountCap(500)] * (len(MODEL.rows) - 1)
     assert recipes[1].pretrain.densify.filters == (Elongation(), CountCap(500))
     stages = [(path, stage) for recipe in recipes for path, stage, _ in recipe.stages() if stage.densify is not None]
     assert {path for path, _ in stages} == {"pretrain", "partition_pretrain", "tune"}, "in blocks, too"
     assert all(stage.densify.most_points == 500 for _, stage in stages)
     free = trials(replace(plan, max_points=None))
-    assert not {trial.folder for trial in trials(plan)} & {trial.folder for trial in free}
+    ours, others = ({each.folder for each in found if each.recipe.has_stages} for found in (trials(plan), free))
+    assert not ours & others
     assert "at most 500 points" in markdown(report_of(plan, [], {}))
     with pytest.raises(BadInput, match="points"):
         trials(replace(plan, max_points=0))
+
+
+def test_rows_that_make_a_mesh_alone_are_run_where_meshes_are_compared(data, tmp_path):
+    table = replace(TABLE, rows=(*TABLE.rows, stereo_alone(on="base")))
+    plan = Plan(table, (data,), tmp_path, steps=300)
+    assert [trial.label for trial in unfinished(plan)] == ["base", "less | more"]
+    compared = replace(plan, truth=(Truth(data.path, 1.0),))
+    for wanted in (compared, replace(plan, rows=("stereo alone",))):
+        last = unfinished(wanted)[-1]
+        assert last.label == "stereo alone" and isinstance(last.recipe.method, StereoFusion)
+    every = build(table)
+    assert every["stereo alone"].depth is not None, "it makes the depth maps that it fuses"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_table_has_stereo_alone_as_its_baseline(name):
+    found = [recipe for recipe in build(TABLES[name]).values() if recipe.method == STEREO.method]
+    assert len(found) == 1 and found[0].depth == STEREO.depth
 
 
 def test_what_is_saved(data, runs, tmp_path):

@@ -12,7 +12,8 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.readers import colmap
 from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.readers.read import RANDOM_POINTS, read
+from surfkit.run.notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 BORUSZYN = Path(__file__).parents[2] / "examples" / "boruszyn"
@@ -274,7 +275,6 @@ def no_focal(farm):
         (other_size, "view_002.png: 40 x 20 px, but its camera 1 has 40 x 30"),
         (turned, "view_002.png: 30 x 40 px (turned by 90 degrees), but"),
         (no_picture, "view_002.png: not a whole picture"),
-        (no_points, "the model has no 3D points"),
         (no_poses, "the model has no image with a pose"),
         (bad_text, "the COLMAP model is damaged"),
         (no_camera, "the COLMAP model is damaged"),
@@ -284,6 +284,14 @@ def no_focal(farm):
 def test_damaged_folders(farm, damage, text):
     damage(farm)
     complaint(text, lambda: read(Data(farm)))
+
+
+def test_a_model_of_poses_alone_is_read_and_told_to_have_no_points(farm):
+    no_points(farm)
+    with collect_notes() as kept:
+        scene = read(Data(farm))
+    assert len(scene.cloud.xyz) == RANDOM_POINTS
+    assert [text for text in kept.texts if "no sparse points" in text and "`surfkit prepare points` makes" in text]
 
 
 def test_no_folder(tmp_path):
