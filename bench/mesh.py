@@ -117,7 +117,7 @@ class Ours:
 
     def fuse(self, depth: np.ndarray, color: np.ndarray, camera: Camera) -> None:
         maps = Maps(torch.from_numpy(color))
-        self.grid.fuse(picture(torch.from_numpy(depth), maps, camera, self.voxel), True)
+        self.grid.fuse(picture(torch.from_numpy(depth), maps, camera, self.voxel, 4 * self.voxel), True)
 
     def vertices(self) -> np.ndarray:
         piece = self.grid.surface(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput
@@ -12,6 +13,9 @@ from surfkit.core.schedule import Steps, log_linear
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
+
+UNKNOWN = 0.1
+"""Confidence of a depth prior below which it knows nothing of a pixel."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,15 @@ class NormalConsistency(Loss):
     depth: Literal["median", "expected"] = "median"
     """Which rendered depth is the surface."""
 
+    where: Literal["everywhere", "unknown"] = "everywhere"
+    """Pixels that count: all, or those of which a depth prior knows nothing, as on a road without texture. Where it
+    knows the depth, that says where the surface is, and its errors are not smoothed into place."""
+
+    @property
+    def needs_prior(self) -> bool:
+        """Whether depth priors say where it counts."""
+        return self.where == "unknown"
+
     def __post_init__(self) -> None:
         if self.weight < 0 or (self.end is not None and not (self.weight > 0 and self.end > 0)):
             raise BadInput(
@@ -47,6 +60,8 @@ class NormalConsistency(Loss):
 
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
+        if self.where == "unknown" and target.prior is not None:
+            depth = torch.where(target.prior.confidence < UNKNOWN, depth, 0.0)
         return disagreement(depth, maps.alpha, maps.normal, target.view.camera)
 
 

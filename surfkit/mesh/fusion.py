@@ -18,7 +18,7 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.floaters import drop_floaters
-from surfkit.mesh.lattice import LEAST_SLANT, MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
+from surfkit.mesh.lattice import MOST, SIDE, Corner, Grid, Lattice, Picture, Pieces
 from surfkit.mesh.native import grid
 from surfkit.mesh.overlap import Depths
 from surfkit.mesh.picture import weighed
@@ -177,7 +177,7 @@ def in_sight(camera: Camera, task: Task) -> Box:
     y = (np.array([0, camera.height]) - camera.cy) / camera.fy
     rays = np.array([[0, 0, 0], *([a, b, 1] for a in x for b in y)]) * task.limit
     corners = (rays - pose[:3, 3]) @ pose[:3, :3] / (task.lattice.voxel * SIDE)
-    margin = 1 + np.ceil(task.lattice.truncation / LEAST_SLANT / (task.lattice.voxel * SIDE))
+    margin = 1 + np.ceil(task.lattice.truncation / task.lattice.least_slant / (task.lattice.voxel * SIDE))
     low, high = np.floor(corners.min(0)) - margin, np.floor(corners.max(0)) + 1 + margin
     return Box(_corner(low), _corner(high))
 

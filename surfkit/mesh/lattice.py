@@ -16,10 +16,10 @@ FULL = 32
 """Weight of a pixel that looks straight at a surface and is no larger than a voxel."""
 REACH = 1.5
 """Blocks are made where a surface is nearer than this, in voxels, along any axis: cells around it must be whole."""
-LEAST_SLANT = 0.6
-"""Least slant of a pixel: where it shows a surface from the side, its normal says little about what lies behind."""
+STEEP, PLANE = 0.6, 0.15
+"""See `least_slant`."""
 JUMP = 2.0
-"""Depths of neighbouring pixels further apart than this, in voxels, do not belong to one surface."""
+"""Neighbouring pixels whose depths differ by more than this, in voxels along the normal, are not of one surface."""
 FADE = 1.0
 """Depth behind a surface, in voxels, from which the weight falls to 0 at the truncation: thin walls have two sides."""
 BITS = 17
@@ -27,6 +27,15 @@ MOST = 2 ** (BITS - 1)
 """Blocks from the origin along an axis that can be numbered."""
 
 Corner = tuple[int, int, int]
+
+
+def least_slant(voxel: float, truncation: float) -> float:
+    """The least slant of a pixel: a surface that is seen further aside counts as one that is seen at this.
+
+    What is seen aside is often round, so the plane of a pixel counts for no more than 1 / `PLANE` voxels of depth. With
+    a short truncation it is less, so smaller angles count, as those at which a road is seen. Never more than `STEEP`.
+    """
+    return min(STEEP, PLANE * truncation / voxel)
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,11 @@ class Lattice:
         z, y, x = np.indices((SIDE, SIDE, SIDE)).reshape(3, -1)
         turn = camera.world_to_camera[:3, :3].numpy()[:, :, None] * self.voxel
         return (turn[:, 0] * x + turn[:, 1] * y + turn[:, 2] * z).astype(np.float32)
+
+    @property
+    def least_slant(self) -> float:
+        """See `least_slant`."""
+        return least_slant(self.voxel, self.truncation)
 
     @property
     def lengths(self) -> list[float]:

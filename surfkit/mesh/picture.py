@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfkit.mesh.lattice import FULL, LEAST_SLANT, Picture
+from surfkit.mesh.lattice import FULL, Picture, least_slant
 from surfkit.native import module
 from surfkit.raster.api import Maps
 from surfkit.scene.camera import Camera
@@ -27,7 +27,7 @@ def depth_of(maps: Maps, which: Which) -> Tensor:
     return torch.where(torch.isfinite(depth) & (depth > 0), depth, 0.0)
 
 
-def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float) -> Picture:
+def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float, truncation: float) -> Picture:
     """What a view sees, with the weight of each pixel.
 
     A pixel counts by the cosine between its ray and the normal, and fully if it is no larger than a voxel at its depth,
@@ -38,24 +38,26 @@ def picture(depth: Tensor, maps: Maps, camera: Camera, voxel: float) -> Picture:
         maps: Colour, and normals if there are any.
         camera: Of the view.
         voxel: Local units.
+        truncation: Local units.
     """
     planes = [None if plane is None else plane.float().contiguous().numpy() for plane in (maps.color, maps.normal)]
     near, plain = voxel * min(camera.fx, camera.fy), depth.float().contiguous().numpy()
+    least = least_slant(voxel, truncation)
     if module() is None:
-        made, slant = shade(plain, planes[0], planes[1], camera, near)
+        made, slant = shade(plain, planes[0], planes[1], camera, near, least)
         return Picture(plain, made, camera, slant)
     made, slant = np.empty(plain.shape, np.uint32), np.empty(plain.shape, F)
     lens = [camera.fx, camera.fy, camera.cx, camera.cy]
-    module().shade(plain, *planes, lens, near, made, slant, module().kernels_in_use(), torch.get_num_threads())
+    module().shade(plain, *planes, lens, near, least, made, slant, module().kernels_in_use(), torch.get_num_threads())
     return Picture(plain, made, camera, slant)
 
 
 def shade(
-    depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camera: Camera, near: float
+    depth: np.ndarray, color: np.ndarray, normal: np.ndarray | None, camera: Camera, near: float, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(H, W) uint32 colours and weights, and (H, W) float32 slants, in numpy, with the bits of surfkit/mesh/cpu.
 
-    `near` is the depth at which a pixel is as large as a voxel.
+    `near` is the depth at which a pixel is as large as a voxel, `least` the least slant.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         share = F(near) / np.maximum(depth, F(1e-20))
@@ -66,7 +68,7 @@ def shade(
             y = ((np.arange(depth.shape[0], dtype=F) + F(0.5) - F(camera.cy)) / F(camera.fy))[:, None]
             along = -(normal[0] * x + normal[1] * y + normal[2])
             squares = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-            slant = np.fmax(along / np.fmax(np.sqrt(squares), F(1e-10)), F(LEAST_SLANT))
+            slant = np.fmax(along / np.fmax(np.sqrt(squares), F(1e-10)), F(least))
             length = np.sqrt(squares * (x * x + y * y + F(1)))
             upright = np.fmax(np.fmin(along / np.fmax(length, F(1e-10)), F(1)), F(0))
         weight = size * size * upright

@@ -91,8 +91,9 @@ class ReferenceGrid(HostGrid):
             inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u, v = np.where(inside, u, F(0)), np.where(inside, v, F(0))
         here = v.astype(np.int32), u.astype(np.int32)
-        depth, shade = sample(picture.depth, u, v, jump), picture.shade[here]
-        sdf = (depth - z) * picture.slants[here]
+        shade, slant = picture.shade[here], picture.slants[here]
+        depth = sample(picture.depth, u, v, slant, jump)
+        sdf = (depth - z) * slant
         fall = (truncation + sdf) * (F(1) / (truncation - fade))
         trust = np.where(inside & (depth > 0) & (sdf > -truncation), np.where(sdf < -fade, fall, F(1)), F(0))
         added = ((shade >> 24).astype(F) * trust + F(0.5)).astype(np.int32).astype(F)
@@ -209,7 +210,7 @@ def name_edges(voxels: np.ndarray, axis: np.ndarray | int) -> np.ndarray:
     return np.asarray(axis, np.int64) << 60 | z << 40 | y << 20 | x
 
 
-def sample(depth: np.ndarray, u: np.ndarray, v: np.ndarray, jump: np.float32) -> np.ndarray:
+def sample(depth: np.ndarray, u: np.ndarray, v: np.ndarray, slant: np.ndarray, jump: np.float32) -> np.ndarray:
     """Depth between four pixels, or that of the pixel itself where they do not lie on one surface."""
     height, width = depth.shape
     left, above = (u + F(0.5)).astype(np.int32) - 1, (v + F(0.5)).astype(np.int32) - 1
@@ -219,7 +220,7 @@ def sample(depth: np.ndarray, u: np.ndarray, v: np.ndarray, jump: np.float32) ->
     low, top = np.minimum.reduce([a, b, c, d]), np.maximum.reduce([a, b, c, d])
     upper, lower = a + (b - a) * share_x, c + (d - c) * share_x
     own = depth[v.astype(np.int32), u.astype(np.int32)]
-    smooth = (low > 0) & (top - low <= jump) & (own > 0)
+    smooth = (low > 0) & ((top - low) * slant <= jump) & (own > 0)
     return np.where(smooth, upper + (lower - upper) * share_y, own)
 
 

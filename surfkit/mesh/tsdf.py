@@ -177,10 +177,10 @@ class TSDF(Mesher):
             if (keep := subject.keep(at)) is not None:
                 depth = torch.where(keep, depth, 0.0)
             if self.trust is None:
-                return picture(depth, maps, view.camera, lengths.voxel)
+                return picture(depth, maps, view.camera, lengths.voxel, lengths.truncation)
             prior = subject.priors[at] if self._trusts_prior and subject.priors is not None else None
             trust = self.trust.within(maps, depth, prior)
-            seen = picture(torch.where(trust > 0, depth, 0.0), maps, view.camera, lengths.voxel)
+            seen = picture(torch.where(trust > 0, depth, 0.0), maps, view.camera, lengths.voxel, lengths.truncation)
             return replace(seen, shade=weighed(seen.shade, trust.numpy()))
 
         return see

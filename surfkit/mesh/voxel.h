@@ -49,23 +49,24 @@ inline Place place(const Lens& lens, float x, float y, float z) {
     return p;
 }
 
-// Whether a voxel that sees `depth` may lie before the end of the band, and whether in it. Interpolation changes a depth
-// by no more than the jump, so it moves nothing that lies further in front of or behind the band. `slant`: distance from
-// the plane of the pixel for each unit of depth.
+// Whether a voxel that sees `depth` may lie before the end of the band, and whether in it. Interpolation changes the
+// distance from the plane by no more than the jump, so it moves nothing that lies further in front of or behind the band.
+// `slant`: distance from the plane of the pixel for each unit of depth.
 inline int may_count(const Band& band, float depth, float z, float slant) {
-    return (depth > 0 ? 1 : 0) & ((depth - z + band.jump) * slant > -band.truncation ? 1 : 0);
+    return (depth > 0 ? 1 : 0) & ((depth - z) * slant + band.jump > -band.truncation ? 1 : 0);
 }
 inline int may_be_near(const Band& band, float depth, float z, float slant) {
-    return (depth - z - band.jump) * slant < band.truncation ? 1 : 0;
+    return (depth - z) * slant - band.jump < band.truncation ? 1 : 0;
 }
 
 // The depth between four pixels; `own`, that of the nearest one, where they do not lie on one surface.
-inline float between(const Band& band, float a, float b, float c, float d, float at_x, float at_y, float own) {
+inline float between(const Band& band, float a, float b, float c, float d, float at_x, float at_y, float own,
+                     float slant) {
     const float low_ab = a < b ? a : b, low_cd = c < d ? c : d, low = low_ab < low_cd ? low_ab : low_cd;
     const float top_ab = a > b ? a : b, top_cd = c > d ? c : d, top = top_ab > top_cd ? top_ab : top_cd;
     const float above = a + (b - a) * at_x, below = c + (d - c) * at_x;
     const float middle = above + (below - above) * at_y;
-    const int smooth = (low > 0) & (top - low <= band.jump) & (own > 0);
+    const int smooth = (low > 0) & ((top - low) * slant <= band.jump) & (own > 0);
     return smooth ? middle : own;
 }
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from surfkit.losses import L1, SSIM, Distortion, NormalConsistency
 from surfkit.losses.base import Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement, disagreement_reference, normals_of
+from surfkit.readers.depth_prior import DepthPrior
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 
@@ -107,6 +109,28 @@ def test_normal_consistency_is_zero_where_splats_lie_in_the_surface():
         assert NormalConsistency(depth=which)(maps, target()).abs() < 1e-5
     turned = Maps(alpha=maps.alpha, depth=depth, median=depth, normal=-maps.normal)
     assert NormalConsistency(depth="median")(turned, target()).item() == pytest.approx(2.0, abs=1e-5)
+
+
+def test_normals_count_where_a_prior_knows_nothing():
+    """With a prior of the left half, the loss is that of the right one: a normal needs all four depths around it."""
+    maps, everywhere, unknown = random_maps(), NormalConsistency(), NormalConsistency(where="unknown")
+    assert unknown.needs_prior and not everywhere.needs_prior
+    normal = maps.normal.clone().requires_grad_()
+    maps = replace(maps, normal=normal)
+    known = torch.zeros(CAMERA.height, CAMERA.width)
+    known[:, :20] = 0.5
+
+    def loss(confidence):
+        return unknown(maps, replace(target(), prior=DepthPrior(known, confidence, 1.0)))
+
+    assert unknown(maps, target()).item() == loss(0 * known).item() == loss(0.1 * known).item()
+    assert loss(0 * known).item() == pytest.approx(everywhere(maps, target()).item(), rel=1e-6)
+    assert loss(0 * known + 1).item() == 0
+    surface, valid = normals_of(maps.median, CAMERA)
+    error = (1 - (normal[:, 1:-1, 1:-1] * surface).sum(0) * maps.alpha[1:-1, 1:-1]) * valid
+    assert loss(known).item() == pytest.approx((error[:, 20:].sum() / error.numel()).item(), rel=1e-5)
+    (pull,) = torch.autograd.grad(loss(known), normal)
+    assert (pull[:, :, :21] == 0).all() and (pull[:, 1:-1, 21:-1] != 0).any(0).float().mean() > 0.5
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])  # the native pass, and plain torch

@@ -7,7 +7,7 @@ import pytest
 import torch
 from needs import needs, needs_native
 
-from surfkit.mesh.lattice import LEAST_SLANT, Lattice, Picture
+from surfkit.mesh.lattice import Lattice, Picture
 from surfkit.mesh.native import NativeGrid
 from surfkit.mesh.reference import ReferenceGrid
 from surfkit.native import module
@@ -23,7 +23,7 @@ def pictures(cameras, shape, seed=0):
     for camera in cameras:
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
-        slant = draw.uniform(LEAST_SLANT, 1.3, depth.shape).astype(np.float32)
+        slant = draw.uniform(0.3, 1.3, depth.shape).astype(np.float32)
         yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 

@@ -11,13 +11,14 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.mesh import fusion, native, tsdf
-from surfkit.mesh.lattice import LEAST_SLANT, SIDE, Lattice
+from surfkit.mesh.lattice import SIDE, Lattice, least_slant
 from surfkit.mesh.lengths import LEAST_CUT, without_hidden
 from surfkit.mesh.picture import depth_of, picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
 from surfkit.mesh.tiles import Box
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
+from surfkit.scene.camera import Camera
 
 from .shapes import around, look_at, maps_of, slope, sphere, subject, torus
 
@@ -137,13 +138,13 @@ def test_a_pixel_counts_by_its_angle_and_its_size():
     depth = torch.full((72, 96), 2.0)
     toward = -torch.nn.functional.normalize(camera.rays(), dim=0)
     flat = Maps(torch.zeros(3, 72, 96), torch.ones(72, 96), depth, depth, toward)
-    weights = [picture(depth, flat, camera, voxel).shade >> 24 for voxel in (2 / 90, 1 / 90)]
+    weights = [picture(depth, flat, camera, voxel, 4 * voxel).shade >> 24 for voxel in (2 / 90, 1 / 90)]
     assert (weights[0] == 32).all() and (weights[1] == 8).all()
     sideways = torch.nn.functional.normalize(toward + torch.linalg.cross(toward, torch.rand(3, 72, 96), dim=0), dim=0)
     cosines = (sideways * toward).sum(0)
-    aslant = picture(depth, replace(flat, normal=sideways), camera, 1.0).shade >> 24
+    aslant = picture(depth, replace(flat, normal=sideways), camera, 1.0, 4.0).shade >> 24
     assert np.allclose(aslant, np.round(32 * cosines.numpy()), atol=1)
-    behind = picture(depth, replace(flat, normal=-toward), camera, 1.0).shade >> 24
+    behind = picture(depth, replace(flat, normal=-toward), camera, 1.0, 4.0).shade >> 24
     assert (behind == 0).all()
     half = replace(flat, alpha=torch.full((72, 96), 0.4), depth=0.4 * depth)
     assert (depth_of(half, "expected") == 0).all() and torch.equal(depth_of(flat, "expected"), depth)
@@ -257,7 +258,7 @@ def test_distances_are_to_the_plane_that_a_pixel_shows():
     """The ground z = 0 seen at 45 degrees: along the rays it would be up to 1.8 times as far."""
     camera = look_at((1.0, 0.1, 1.0), (0.0, 0.1001, 0.0))
     maps = maps_of(camera, lambda points: points[..., 2])
-    found = picture(maps.median, maps, camera, 0.02)
+    found = picture(maps.median, maps, camera, 0.02, 0.08)
     off = []
     for some in (found, replace(found, slant=None)):
         grid = ReferenceGrid(Lattice(0.02, 0.08))
@@ -276,7 +277,7 @@ def test_a_tile_gets_all_views_that_reach_into_it():
     lattice = Lattice(0.01, 0.4)
     camera = look_at((0, 0, 2.0), (0, 0.0001, 0.0))
     task = fusion.Task(lattice, (camera,), lambda at: None, 1.0, True, 1, None)
-    lowest = 2.0 - 1.0 - lattice.truncation / LEAST_SLANT
+    lowest = 2.0 - 1.0 - lattice.truncation / lattice.least_slant
     assert fusion.in_sight(camera, task).low[2] * SIDE * lattice.voxel <= lowest
 
 
@@ -284,7 +285,7 @@ def test_a_surface_seen_from_the_side_has_no_holes():
     """With the least truncation, the shell behind the ground is thinner along the rays than a cell is wide."""
     camera = look_at((1.6, 0.1, 1.0), (0.0, 0.1001, 0.0))
     maps = maps_of(camera, lambda points: points[..., 2])
-    found, places = picture(maps.median, maps, camera, 0.03), []
+    found, places = picture(maps.median, maps, camera, 0.03, LEAST_CUT * 0.03), []
     for some in (found, replace(found, slant=None)):
         grid = ReferenceGrid(Lattice(0.03, LEAST_CUT * 0.03))
         assert grid.fuse(some, True)
@@ -298,19 +299,40 @@ def test_a_surface_seen_from_the_side_has_no_holes():
     assert places[0] == pytest.approx(np.pi * 0.3**2, rel=0.03) and places[1] < 0.9 * places[0]
 
 
+def test_a_road_seen_by_someone_who_walks_on_it_is_whole():
+    """At the far end, rows of pixels lie 2 voxels apart in depth, and rays meet the ground at 15 degrees."""
+    turn = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = turn, -turn @ torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
+    camera = Camera(pose, 400.0, 400.0, 75.0, -25.0, 150, 190)  # the lower middle of a photograph
+    maps = maps_of(camera, lambda points: points[..., 2])
+    voxel, cut = 0.04, LEAST_CUT * 0.04
+    road = native.grid(Lattice(voxel, cut))
+    assert road.fuse(picture(torch.where(maps.median < 20, maps.median, 0), maps, camera, voxel, cut), True)
+    piece = road.surface(1)
+    corners = piece.vertices[piece.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    middles = corners.mean(1)
+    for near, far in ((4, 5.5), (5.5, 7.5)):
+        there = (middles[:, 0] > near) & (middles[:, 0] < far) & (np.abs(middles[:, 1]) < 0.5)
+        assert area[there].sum() == pytest.approx(far - near, rel=0.03), (near, far)
+        assert np.abs(middles[there, 2]).max() < 0.01
+
+
 @needs_native
 def test_compiled_shades_are_those_of_numpy(monkeypatch):
     maps, camera = maps_of(around(1)[0], sphere), around(1)[0]
     noisy = replace(maps, color=maps.color + torch.randn(3, 72, 96), normal=maps.normal + 0.3 * torch.randn(3, 72, 96))
     noisy.color[0, 3, 4], noisy.normal[:, 36, 50] = torch.nan, 0
     for some in (noisy, replace(noisy, normal=None)):
-        one = picture(maps.depth, some, camera, 0.015)
+        one = picture(maps.depth, some, camera, 0.015, 0.03)
         monkeypatch.setattr("surfkit.mesh.picture.module", lambda: None)
-        other = picture(maps.depth, some, camera, 0.015)
+        other = picture(maps.depth, some, camera, 0.015, 0.03)
         monkeypatch.undo()
         assert np.array_equal(one.shade, other.shade) and len(np.unique(one.shade >> 24)) > 5
         assert np.array_equal(one.slants, other.slants) and one.slants.dtype == np.float32
-        assert (one.slants == 1).all() if some.normal is None else 0.6 == pytest.approx(one.slants.min())
+        least = 1 if some.normal is None else least_slant(0.015, 0.03)
+        assert one.slants.min() == pytest.approx(least) and (least < 1 or (one.slants == 1).all())
 
 
 def test_one_view_alone_counts_if_it_may():

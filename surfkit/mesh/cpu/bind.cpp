@@ -111,11 +111,12 @@ void add_mesh(nb::module_& m) {
     m.def(
         "shade",
         [](Floats depth, Floats color, std::optional<Floats> normal, std::vector<double> lens, double near,
-           nb::ndarray<uint32_t, nb::c_contig, nb::device::cpu> shade, Made slant, const std::string& kernels, int threads) {
+           double least, nb::ndarray<uint32_t, nb::c_contig, nb::device::cpu> shade, Made slant, const std::string& kernels,
+           int threads) {
             ShadeJob job{depth.data(),         color.data(),          normal ? normal->data() : nullptr,
                          (int)depth.shape(1),  (int)depth.shape(0),   (float)lens.at(0),
                          (float)lens.at(1),    (float)lens.at(2),     (float)lens.at(3),
-                         (float)near};
+                         (float)near,          (float)least};
             uint32_t* out = shade.data();
             float* slants = slant.data();
             const FuseKernels& k = named(kernels);
@@ -127,7 +128,7 @@ void add_mesh(nb::module_& m) {
             });
         },
         nb::arg("depth"), nb::arg("color"), nb::arg("normal").none(), nb::arg("lens"), nb::arg("near"),
-        nb::arg("shade"), nb::arg("slant"), nb::arg("kernels"), nb::arg("threads"));
+        nb::arg("least"), nb::arg("shade"), nb::arg("slant"), nb::arg("kernels"), nb::arg("threads"));
     m.def("draw_faces", [](Floats vertices, Whole faces, Made depth,
                            nb::ndarray<int32_t, nb::c_contig, nb::device::cpu> face, int threads) {
         FaceJob job{vertices.data(), faces.data(), (int64_t)faces.shape(0), depth.data(), face.data(),

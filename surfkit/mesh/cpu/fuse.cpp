@@ -66,7 +66,7 @@ inline void gather_neighbours(const FuseJob& job, Samples& s) {
 inline void interpolate(const FuseJob& job, Samples& s) {
     for (int i = 0; i < kLayer; i++)
         s.depth[i] = between(job.band, s.corner[0][i], s.corner[1][i], s.corner[2][i], s.corner[3][i], s.at_x[i],
-                             s.at_y[i], s.depth[i]);
+                             s.at_y[i], s.depth[i], s.slant[i]);
 }
 
 void fuse_block(const FuseJob& job, const float* first, uint32_t seed, Block& block) {
@@ -163,7 +163,7 @@ void shade_row(const ShadeJob& job, int row, uint32_t* shade, float* slant) {
         const float along = -(nx[i] * ray_x + ny[i] * ray_y + nz[i]);
         const float normal = nx[i] * nx[i] + ny[i] * ny[i] + nz[i] * nz[i], unit = __builtin_sqrtf(normal);
         const float steep = along / (unit > 1e-10f ? unit : 1e-10f);
-        slant[i] = turned ? (steep > kLeastSlant ? steep : kLeastSlant) : 1.0f;
+        slant[i] = turned ? (steep > job.least ? steep : job.least) : 1.0f;
         const float square = normal * (ray_x * ray_x + ray_y * ray_y + 1.0f);
         const float length = __builtin_sqrtf(square), cosine = along / (length > 1e-10f ? length : 1e-10f);
         const float upright = turned ? (cosine < 1 ? cosine : 1.0f) : 1.0f;

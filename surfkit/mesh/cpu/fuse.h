@@ -37,13 +37,13 @@ struct RowJob {
 };
 
 constexpr float kFullWeight = 32;
-constexpr float kLeastSlant = 0.6f;
+constexpr float kLeastSlant = 0.26f;  // with the shortest truncation; see lattice.py
 
 // The maps of a view, from which the shade and the slant of its pixels are made.
 struct ShadeJob {
     const float *depth, *color, *normal;  // (height, width), (3, height, width), the same or null
     int width, height;
-    float fx, fy, cx, cy, near;  // near: depth at which a pixel is as large as a voxel
+    float fx, fy, cx, cy, near, least;  // near: depth at which a pixel is as large as a voxel; least: of the slants
 };
 
 struct FuseKernels {

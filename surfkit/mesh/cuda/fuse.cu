@@ -66,7 +66,7 @@ fuse(View view, Buffer<const long long> keys, Buffer<const long long> rows, long
         if (!may_count(view.band, d, p.z, steep)) continue;
         if (may_be_near(view.band, d, p.z, steep))
             d = between(view.band, depth[p.above + p.left], depth[p.above + p.right], depth[p.below + p.left],
-                        depth[p.below + p.right], p.at_x, p.at_y, d);
+                        depth[p.below + p.right], p.at_x, p.at_y, d, steep);
         const unsigned seen = shade[p.pixel];
         const float added = added_weight(view.band, 1, d, p.z, steep, seen);
         if (!(added > 0)) continue;
