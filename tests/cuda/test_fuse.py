@@ -12,7 +12,7 @@ from surfkit.cuda.emulated import Emulated, KernelError
 from surfkit.cuda.nvrtc import nvrtc
 from surfkit.mesh.cuda import grid as module
 from surfkit.mesh.cuda.grid import SOURCE, GpuGrid, most_blocks, view_of
-from surfkit.mesh.lattice import BLOCK_BYTES, FADE, FULL, LEAST_SLANT, SIDE, Lattice, Picture
+from surfkit.mesh.lattice import BLOCK_BYTES, FADE, FULL, SIDE, Lattice, Picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
 from surfkit.scene.camera import Camera
 
@@ -29,7 +29,7 @@ def pictures(cameras, shape, seed=0):
     for camera in cameras:
         depth = seen(camera, shape)[0].astype(np.float32)
         color, weight = draw.integers(0, 2**24, depth.shape), draw.integers(0, 33, depth.shape)
-        slant = draw.uniform(LEAST_SLANT, 1.3, depth.shape).astype(np.float32)
+        slant = draw.uniform(0.3, 1.3, depth.shape).astype(np.float32)
         yield Picture(depth, (color | weight << 24).astype(np.uint32), camera, slant)
 
 
