@@ -13,9 +13,7 @@ from surfkit.core.schedule import Steps, log_linear
 from surfkit.losses.base import Loss, Target
 from surfkit.raster.api import Maps
 from surfkit.raster.normals import disagreement
-
-UNKNOWN = 0.1
-"""Confidence of a depth prior below which it knows nothing of a pixel."""
+from surfkit.readers.depth_prior import KNOWN
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class NormalConsistency(Loss):
     def __call__(self, maps: Maps, target: Target) -> Tensor:
         depth = maps.median if self.depth == "median" else maps.expected_depth()
         if self.where == "unknown" and target.prior is not None:
-            depth = torch.where(target.prior.confidence < UNKNOWN, depth, 0.0)
+            depth = torch.where(target.prior.confidence < KNOWN, depth, 0.0)
         return disagreement(depth, maps.alpha, maps.normal, target.view.camera)
 
 

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from surfkit.core.events import Warned, emit
 from surfkit.mesh.base import MeshInput
+from surfkit.readers.depth_prior import KNOWN
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import View
 from surfkit.scene.up_direction import up_of_views
 
-CONFIDENT = 0.1
-"""Confidence from which a depth map may know that a surface is there: of the sky it has none."""
 BIN_PX = 2.0
 """Width of the strips of the picture from the horizon to the zenith, pixels at the middle of the picture."""
 
@@ -39,7 +38,7 @@ def without_sky(subject: MeshInput) -> MeshInput:
         mask, prior = subject.keep(at), priors[at]
         if prior is None:
             return mask
-        solid = ~sky(subject.views[at].camera, prior.confidence >= CONFIDENT, up)
+        solid = ~sky(subject.views[at].camera, prior.confidence >= KNOWN, up)
         return solid if mask is None else mask & solid
 
     return replace(subject, keep=keep)

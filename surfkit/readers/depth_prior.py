@@ -41,6 +41,10 @@ WITH_NORMALS = "estimator:patch-match"
 """Choice of an estimator that gives normals."""
 
 
+KNOWN = 0.1
+"""Least confidence of a pixel of which a depth prior knows something."""
+
+
 @dataclass(frozen=True)
 class DepthPrior:
     """The depth prior of a photograph.

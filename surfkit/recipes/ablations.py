@@ -221,6 +221,7 @@ GRADIENT = Table(
 )
 
 NORMALS = NormalConsistency(weight=0.05, start=3_000, depth="median")
+WITHOUT_NORMALS = {name: loss for name, loss in surface.SURFACE.pretrain.losses.items() if name != "normal"}
 WITH_SKY = replace(surface.SURFACE.mesh, sky=True)
 PIXEL_MAPS = replace(WITH_SKY, oversampling=1.0)
 PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
@@ -236,7 +237,7 @@ SURFACE = Table(
         Row("+ stereo depth as a loss", DEPTH | {"depth": surface.SURFACE.depth}),
         Row("+ dense start", {"start": StereoStart(), "pretrain.densify": surface.SURFACE.pretrain.densify}),
         Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
-        Row("+ no normal consistency", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
+        Row("+ no normal consistency", {"pretrain.losses": WITHOUT_NORMALS}),
         Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
@@ -246,8 +247,9 @@ SURFACE = Table(
         Row("+ voxels smaller than a pixel", {"mesh": PIXEL_MAPS}),
         Row("+ depth maps of 1.5 times the size", {"mesh": WITH_SKY}),
         Row("+ sky left out", {"mesh": surface.SURFACE.mesh}),
+        Row("+ normal consistency where stereo knows nothing", {"pretrain.losses": surface.SURFACE.pretrain.losses}),
         Row("+ constant depth weight", {"pretrain.losses.depth": DepthRegression(start=10.0, end=10.0)}, kept=False),
-        Row("+ normal consistency", {"pretrain.losses.normal": NORMALS}, kept=False),
+        Row("+ normal consistency everywhere", {"pretrain.losses.normal": NORMALS}, kept=False),
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),

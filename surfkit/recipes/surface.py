@@ -10,6 +10,7 @@ from surfkit.densify.filters import Elongation
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.losses.depth import DepthRegression
 from surfkit.losses.photometric import L1, SSIM
+from surfkit.losses.surface import NormalConsistency
 from surfkit.mesh.agreement import Agreement
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
@@ -38,10 +39,12 @@ SURFACE = Recipe(
             "l1": L1(),
             "ssim": SSIM(),
             "depth": DepthRegression(start=10.0, end=1.0),
+            "normal": NormalConsistency(weight=0.015, start=0, where="unknown"),
         },
         # F1 at 0.5 m on shibuya-synth and PSNR on boruszyn, 1,000 steps: 0.787 and 20.6 dB as it is; with a weight that
         # stays 0.781 and 20.7, that falls to 0.1 0.789 and 20.4 (fields and roofs get rough), that stays, with normal
-        # consistency, 0.773 and 21.0. What keeps surfaces smooth keeps errors of stereo in place too.
+        # consistency, 0.773 and 21.0. What keeps surfaces smooth keeps errors of stereo in place too, so it counts
+        # where stereo knows nothing, as on the road that someone walks on, which is in shards without it.
         # Stereo leaves holes, where few views see or nothing has texture: densification fills them. Opacities are never
         # reset: what begins at stereo depth has no floaters to be rid of, and recovers slowly.
         densify=ADC(threshold=4e-4, reset_every=10_000_000, filters=(Elongation(),)),
