@@ -24,7 +24,8 @@ from surfkit.train.bars import bars
 @dataclass(frozen=True)
 class Points:
     """Match the photographs of a data set whose cameras are known, and triangulate points, which stereo and training
-    start from: for cameras of Metashape, Pix4D, RealityCapture or NeRF programs, whose files have none.
+    start from: for cameras of Metashape, Pix4D, RealityCapture or NeRF programs, whose files have none, and for COLMAP
+    models of poses alone.
 
     SCENE gets undistorted photographs in images/ and a COLMAP model in sparse/0, of the same cameras in the same
     coordinates. An interrupted command continues when it is given again.
