@@ -30,10 +30,15 @@ Corner = tuple[int, int, int]
 
 
 def least_slant(voxel: float, truncation: float) -> float:
-    """The least slant of a pixel: a surface that is seen further aside counts as one that is seen at this.
+    """The least slant of a pixel (see `Picture`): at smaller grazing angles, surfaces count as seen at this one.
 
-    What is seen aside is often round, so the plane of a pixel counts for no more than 1 / `PLANE` voxels of depth. With
-    a short truncation it is less, so smaller angles count, as those at which a road is seen. Never more than `STEEP`.
+    What is seen at a grazing angle is often round, so the plane of a pixel counts for no more than 1 / `PLANE` voxels
+    of depth. A short truncation takes less, so smaller angles count, as those at which a road is seen. Never more than
+    `STEEP`.
+
+    Args:
+        voxel: Local units.
+        truncation: Local units.
     """
     return min(STEEP, PLANE * truncation / voxel)
 

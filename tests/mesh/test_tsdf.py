@@ -1,6 +1,8 @@
 """The mesher: automatic lengths, metres, masks, tiles, and what it refuses."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -317,6 +319,13 @@ def test_a_road_seen_by_someone_who_walks_on_it_is_whole():
         there = (middles[:, 0] > near) & (middles[:, 0] < far) & (np.abs(middles[:, 1]) < 0.5)
         assert area[there].sum() == pytest.approx(far - near, rel=0.03), (near, far)
         assert np.abs(middles[there, 2]).max() < 0.0001
+
+
+def test_no_pixel_reaches_further_than_the_compiled_grid_looks():
+    """It leaves out blocks by the least slant that there can be, a constant in mesh/cpu/fuse.h."""
+    header = (Path(native.__file__).parent / "cpu" / "fuse.h").read_text()
+    (bound,) = re.findall(r"kLeastSlant = ([0-9.]+)f;", header)
+    assert 0.98 * least_slant(1.0, LEAST_CUT) < float(bound) <= least_slant(1.0, LEAST_CUT)
 
 
 @needs_native
