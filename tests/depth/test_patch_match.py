@@ -304,6 +304,24 @@ def test_a_window_of_which_nothing_counts_matches_nothing():
         assert planes.cost.max() <= 2, kernels
 
 
+def test_words_that_are_gathered_and_inserted_are_the_same(monkeypatch):
+    """Pixels of the window, grey values of another picture and its depth map; one of the two is what AVX-512 uses."""
+    if "avx512" not in module().kernels():
+        pytest.skip("needs a processor with AVX-512")
+    here, there = two_pictures(1)
+    known = [torch.rand(28, 38, generator=torch.Generator().manual_seed(0)) + 0.2]
+    terms, found = replace(STILL, parallax=40.0, jitter_px=1.0, consistency=0.2), {}
+    for kernels in ("avx512", "avx512_insert", "avx512_gather"):
+        monkeypatch.setattr(module(), "kernels_in_use", lambda kernels=kernels: kernels)
+        found[kernels] = Planes.at(np.full((24, 32), 0.7, np.float32), 1)
+        for seed in range(3):
+            improve(here, [there], found[kernels], terms, seed, known)
+    for planes in found.values():
+        for name in ("value", "cost", "each"):
+            np.testing.assert_array_equal(getattr(planes, name), getattr(found["avx512_insert"], name))
+    assert len(np.unique(found["avx512"].value)) > 100, "planes have been improved"
+
+
 def test_the_reprojection_error_counts_up_to_its_limit():
     here, there = two_pictures(1)
     plain, with_maps, with_wrong = (Planes.at(np.full((24, 32), 0.5, np.float32), 1) for _ in range(3))

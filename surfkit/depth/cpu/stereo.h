@@ -57,5 +57,6 @@ struct StereoKernels {
 const StereoKernels& stereo_kernels_baseline();
 const StereoKernels& stereo_kernels_avx2();
 const StereoKernels& stereo_kernels_avx512();
+const StereoKernels& stereo_kernels_avx512_gather();
 
 }  // namespace surfkit
