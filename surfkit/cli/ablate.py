@@ -142,8 +142,8 @@ class Ablate:
             say(f"note: {line}")
         if passed_over := mesh_alone(plan):
             which = f"{row_numbers(passed_over, labels)}, {' and '.join(passed_over)}"
-            say(f"note: left out is {which}: it draws no pictures, and meshes are compared with --gt alone")
-        if self.probe:
+            say(f"note: nothing compares meshes without --gt, so left out: {which}")
+        if self.probe and left:
             foretell(plan, left, self.probe)
 
 

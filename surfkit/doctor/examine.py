@@ -24,7 +24,7 @@ from surfkit.doctor.geometry import Geometry, seen_by, survey
 from surfkit.doctor.photographs import Photograph, Wanted, look_at
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import normals_warning, prepare_command
+from surfkit.readers.depth_prior import OFF, normals_warning, prepare_command
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
@@ -268,7 +268,7 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
         begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
         return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
     if not maps:
-        text = f"the recipe has a depth loss, and there are no depth priors, so it will be off; {make}"
+        text = f"the recipe uses depth priors, and there are no depth priors, so {OFF}; {make}"
         return [Finding("warning", "depth-priors", text)]
     found = []
     if missing := [shot.name for shot in train if shot.name not in maps]:

@@ -13,7 +13,6 @@ from torch import Tensor
 from surfkit.core.registry import Component
 from surfkit.raster.api import Maps, Splats
 from surfkit.readers.depth_prior import DepthPrior
-from surfkit.scene.align import SCALE_BAND
 from surfkit.scene.scene import View
 
 
@@ -81,15 +80,15 @@ class Loss(Component):
     `reads` names the maps that the term needs; they are only rendered when a term with a weight reads them. Depth
     priors are only read when a term has `needs_prior`, and their normals when one has `needs_normals` too; a photograph
     may still be without one, and a data set without normals. `scale_band` says which of them are aligned well enough:
-    the lowest and highest multiple of the median scale of all. A second view is only chosen and rendered in steps in
-    which a term with a weight has `needs_neighbour`, once for all of them.
+    the lowest and highest multiple of the median scale of all; None for a term that learns no depth. A second view is
+    only chosen and rendered in steps in which a term with a weight has `needs_neighbour`, once for all of them.
     """
 
     reads: ClassVar[tuple[str, ...]] = ("color",)
     needs_prior: ClassVar[bool] = False
     needs_neighbour: ClassVar[bool] = False
     needs_normals: ClassVar[bool] = False
-    scale_band: tuple[float, float] = SCALE_BAND
+    scale_band: tuple[float, float] | None = None
 
     @abstractmethod
     def weight_at(self, index: int, steps: int) -> float:

@@ -36,7 +36,8 @@ class NormalConsistency(Loss):
 
     where: Literal["everywhere", "unknown"] = "everywhere"
     """Pixels that count: all, or those of which a depth prior knows nothing, as on a road without texture. Where it
-    knows the depth, that says where the surface is, and its errors are not smoothed into place."""
+    knows the depth, that says where the surface is, and its errors are not smoothed into place. In a photograph without
+    a depth prior, all pixels count."""
 
     @property
     def needs_prior(self) -> bool:

@@ -148,6 +148,10 @@ def _model(folder: Path) -> tuple[list[Image], np.ndarray, np.ndarray, list[list
     rgb = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
     with np.errstate(over="ignore"):
         finite = np.isfinite(xyz.astype(np.float32)).all(1)
+    if not points and any(image.num_points3D for image in model.images.values()):
+        reject(
+            BadInput(f"{folder}: its images refer to 3D points, and the file of points has none; copy the model whole")
+        )
     if points and not finite.any():
         reject(BadInput(f"{folder}: no 3D point has finite coordinates; triangulate the model again"))
     elif not finite.all():

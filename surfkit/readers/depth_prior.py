@@ -35,7 +35,7 @@ HARDLY = 0.02
 """Below this share of trusted pixels, something is wrong with the input of the maps."""
 NAMED = 10
 """Photographs that a warning names."""
-OFF = "everything that needs them is switched off, such as the losses depth and normal-prior"
+OFF = "everything that learns from them is switched off, such as the losses depth and normal-prior"
 """Consequence of missing depth priors."""
 WITH_NORMALS = "estimator:patch-match"
 """Choice of an estimator that gives normals."""

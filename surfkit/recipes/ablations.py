@@ -34,7 +34,7 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.recipe import Recipe
 from surfkit.recipes import RECIPES, city, surface
 from surfkit.recipes.surface import STEREO
-from surfkit.report.ablation import Row, Table
+from surfkit.report.ablation import BASELINE, Row, Table
 from surfkit.start.stereo import StereoStart
 from surfkit.train.stage import Stage
 
@@ -73,7 +73,7 @@ DEPTH = {"pretrain.losses.depth": DepthRegression(start=0.5, end=0.0025)}
 
 def stereo_alone(on: str) -> Row:
     """The last row of a table: depth maps of stereo alone, fused, which any optimised surface has to beat."""
-    return Row("stereo alone", recipe=RECIPES["stereo"], kept=False, on=on, group="Without splats")
+    return Row("stereo alone", recipe=RECIPES["stereo"], kept=False, on=on, group=BASELINE)
 
 
 # What the second stage of CityGaussianV2 adds to its pretraining. Its losses and its densification are those of

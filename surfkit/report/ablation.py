@@ -15,6 +15,9 @@ from surfkit.pipeline import with_steps
 from surfkit.recipe import Recipe, unused, without_unused
 from surfkit.report.columns import COLUMNS
 
+BASELINE = "Without splats"
+"""Group of the rows that come last in a table, below those that packages add to it."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -89,7 +92,9 @@ def offered_tables() -> dict[str, Table]:
         if name not in tables:
             emit(Warned(f"plugin {owner} adds rows to table:{name}, which no package offers; they are left out"))
             continue
-        tables[name] = replace(tables[name], rows=(*tables[name].rows, *rows))
+        own = tables[name].rows
+        end = next((at for at, row in enumerate(own) if row.group == BASELINE), len(own))
+        tables[name] = replace(tables[name], rows=(*own[:end], *rows, *own[end:]))
     return tables
 
 

@@ -132,7 +132,7 @@ def ablate(plan: Plan, watch: Watch, before: Callable[[Plan, Sequence[Trial]], N
     Args:
         plan: What to run.
         watch: Is told how it goes.
-        before: Called with the trials that are to be run, before the first of them begins.
+        before: Called with the trials that are to be run, if any, before the first of them begins.
 
     Raises:
         BadInput: Nothing can be run as planned, or another process works in the folder; nothing has been written then.
@@ -145,7 +145,7 @@ def ablate(plan: Plan, watch: Watch, before: Callable[[Plan, Sequence[Trial]], N
         refuse_unusable(plan)
         refuse_other_data(plan)
     with locked(plan.out):
-        if left and before is not None:
+        if before is not None:
             before(plan, left)
         return Session(plan, watch).run(left)
 

@@ -116,7 +116,7 @@ def needs_normals(losses: Mapping[str, Loss]) -> bool:
 
 def scale_band(losses: Mapping[str, Loss]) -> tuple[float, float]:
     """The widest band of the scales of depth priors that any loss accepts; see `Loss.scale_band`."""
-    bands = [loss.scale_band for loss in losses.values() if loss.needs_prior] or [SCALE_BAND]
+    bands = [loss.scale_band for loss in losses.values() if loss.needs_prior and loss.scale_band] or [SCALE_BAND]
     return min(low for low, _ in bands), max(high for _, high in bands)
 
 

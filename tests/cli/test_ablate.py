@@ -170,13 +170,22 @@ def test_missing_depth_maps_are_told_once_before_the_table(scene, tmp_path, caps
     first = said.partition("run 1 of 1:")[0]
     make = f"make them with `surfkit prepare depth {scene}`"
     assert first == (
-        f"note: {scene} has no depth priors, so everything that needs them is switched off, such as the losses depth "
-        f"and normal-prior, in row 2; {make}\n"
+        f"note: {scene} has no depth priors, so everything that learns from them is switched off, such as the losses "
+        f"depth and normal-prior, in row 2; {make}\n"
     )
     kept = json.loads((tmp_path / "out" / "ablation.json").read_text())["data_sets"][0]["notes"]
     assert [note["rows"] for note in kept if note["text"].endswith(make)] == [["depth 0.1"]]
     page = (tmp_path / "out" / "ablation.md").read_text()
     assert page.count(make) == 1 and f"\n- row 2: {scene} has no depth priors" in page
+
+
+def test_rows_that_nothing_can_measure_are_named(scene, tmp_path, capsys):
+    """Also where no other row is left to run."""
+    rows = [{"label": "fused", "change": {"method": {"use": "stereo"}}}]
+    (tmp_path / "mine.json").write_text(json.dumps({"name": "mine", "base": "stereo", "rows": rows}))
+    words = [str(tmp_path / "mine.json"), "--data", str(scene), "--out", str(tmp_path / "out")]
+    assert main(["ablate", *words]) == 0
+    assert capsys.readouterr().err == "note: nothing compares meshes without --gt, so left out: all rows, fused\n"
 
 
 def test_nothing_is_made_to_show_a_table_without_runs(scene, monkeypatch, tmp_path, capsys):

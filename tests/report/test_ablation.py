@@ -223,7 +223,8 @@ def test_packages_add_rows_to_tables_of_others(monkeypatch):
     class Plugin:
         @hookimpl
         def surfkit_rows(self):
-            return {"methods": (Row("ours", {"seed": 3}),), "lost": (Row("nowhere"),)}
+            ours = (Row("ours", {"seed": 3}),)
+            return {"methods": ours, "trim": ours, "lost": (Row("nowhere"),)}
 
     told = []
     monkeypatch.setattr(ablation, "emit", told.append)
@@ -234,6 +235,8 @@ def test_packages_add_rows_to_tables_of_others(monkeypatch):
         reload()
     rows = tables["methods"].rows
     assert rows[: len(METHODS.rows)] == METHODS.rows and rows[-1] == Row("ours", {"seed": 3})
+    labels = [row.label for row in tables["trim"].rows]
+    assert labels[-2:] == ["ours", "stereo alone"], "what has no splats stays apart from what has"
     assert "lost" not in tables
     assert [event.text for event in told] == [
         "plugin stand-in adds rows to table:lost, which no package offers; they are left out"

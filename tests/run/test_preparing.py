@@ -202,7 +202,7 @@ def test_without_preparing_the_loss_is_off_and_a_dense_start_is_refused(farm, re
     metrics = run(sparse, farm, tmp_path / "b", caches=CacheSettings(maps=None))
     (note,) = record(tmp_path / "b")["notes"]
     assert (
-        "has no depth priors, so everything that needs them is switched off" in note
+        "has no depth priors, so everything that learns from them is switched off" in note
         and metrics["prepare_cpu_seconds"] is None
     )
     assert not seen and not (own_cache / "depth").exists()

@@ -77,6 +77,12 @@ def test_the_largest_of_several_models_is_used(farm):
     assert len(read(Data(farm)).train) == 4, "a lone sparse/1 does too"
 
 
+def test_points_that_images_refer_to_must_be_there(farm):
+    (farm / "sparse" / "0" / "points3D.txt").write_text("")
+    with pytest.raises(BadInput, match="sparse/0: its images refer to 3D points, and the file of points has none"):
+        read(Data(farm))
+
+
 def test_exif_that_turns_photographs_is_ignored_and_said(farm):
     """As COLMAP does, so that sizes and pixels are those stored."""
     turn = Image.Exif()

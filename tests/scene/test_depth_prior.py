@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
-from surfkit.losses import L1, DepthRegression, NormalPrior
+from surfkit.losses import L1, DepthRegression, NormalConsistency, NormalPrior
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, map_path, normal_path, write_map, write_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
@@ -202,7 +202,7 @@ def test_what_cannot_be_used_is_listed_once(farm):
     priors, notes = priors_of(data, scene)
     assert (
         priors is None
-        and "everything that needs them is switched off" in notes[0]
+        and "everything that learns from them is switched off" in notes[0]
         and f"no value in it: {names[4]}" in notes[0]
     )
 
@@ -217,6 +217,8 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
         f"1 of 5 photographs train without a depth prior: its scale is far from that of the other images: {view.name}"
     ]
     assert sum(prior is None for prior in priors) == 1
+    where = NormalConsistency(where="unknown")  # uses priors, and learns no depth
+    assert scale_band({"depth": DepthRegression(scale_band=(0.5, 2.0)), "normal": where}) == (0.5, 2.0)
     losses = {"depth": DepthRegression(scale_band=(0.15, 50.0)), "prior": NormalPrior()}
     assert scale_band(losses) == (0.15, 50.0) and scale_band({"l1": L1()}) == (0.2, 5.0)
     assert len(alignment(data, scene, band=scale_band(losses)).fits) == 5
@@ -224,7 +226,7 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
 
 def test_without_any_map_the_warning_says_what_to_run(farm):
     data, scene, _ = farm
-    off = "so everything that needs them is switched off, such as the losses depth and normal-prior"
+    off = "so everything that learns from them is switched off, such as the losses depth and normal-prior"
     for normals, more in ((False, ""), (True, " estimator:patch-match")):
         priors, notes = priors_of(data, scene, normals)
         assert priors is None and notes == [
