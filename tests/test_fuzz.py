@@ -16,10 +16,10 @@ CASES = 16
 TARGETS = (
     "splats-compressed-ply", "splats-gltf", "splats-gltf-spz", "splats-ply", "splats-sog", "splats-splat",
     "splats-spz", "splats-spz-4", "splats-surfkit",
-    "colmap-text", "colmap-binary", "photographs", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
+    "colmap-text", "colmap-binary", "photographs", "surface", "lenses-and-masks", "depth-arrays", "depth-pictures", "nerfstudio",
     "points-as-text", "blender", "matrixcity", "odm", "bundler", "metashape", "openmvg", "pix4d", "realitycapture",
     "recipe", "run", "stopped-run", "blocks", "comparison", "outputs", "memory", "numbers-evaluate", "numbers-prepare",
-    "numbers-mesh", "numbers-tetra", "numbers-train", "numbers-doctor",
+    "numbers-stereo", "numbers-mesh", "numbers-tetra", "numbers-train", "numbers-doctor",
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from matplotlib import font_manager  # noqa: F401 (makes its folders of settings and fonts now, while no case runs)
 
@@ -23,7 +24,7 @@ from .targets import MEMORY, OUTPUT, TARGETS
 
 HELD = 400 << 20
 """Bytes of memory that a case may add to the most that was held before."""
-WRITTEN = ("out", "data/undistorted", "data/estimated_depths")
+WRITTEN = ("out", "cache", "data/undistorted", "data/estimated_depths")
 """Where commands may write, below the folder of a case."""
 
 
@@ -88,6 +89,7 @@ class Fuzz:
                 limited(),
                 self.remembered(parse),
                 giving_out(others.get(MEMORY)),
+                patch.dict(os.environ, SURFKIT_CACHE=str(self.here / "cache")),
             ):
                 status = main(words)
         except BaseException as error:

@@ -96,6 +96,15 @@ SWEEP = tuple(
         "jump-cost", "tolerance", "edge", "agree",
     )
 )  # fmt: skip
+STEREO = "prepare depth {here}/data --device cpu estimator:patch-match --estimator.rounds 1"
+PATCHES = tuple(
+    f"--estimator.{name}"
+    for name in (
+        "longest", "scale", "neighbours", "angle", "best", "window", "spread", "smoothness", "brightness", "passes",
+        "consistency", "rounds", "coarsest", "tolerance-px", "agree",
+    )
+)  # fmt: skip
+SURFACE = f"train recipe:surface --steps 2 {SMALL} --data {{here}}/data --out {{here}}/out"
 DELIVERY = ("--lods", "--clusters", "--least-triangles", "--memory", "--metres-per-unit", "--crop-box 0 0 0 1 1")
 EXPORTS = (".ply", ".compressed.ply", ".glb", ".sog", ".splat", ".spz", ".surfkit")
 
@@ -125,6 +134,7 @@ TARGETS = {
     "colmap-text": Target(colmap, (TRAIN, DEEP), MODEL),
     "colmap-binary": Target(lambda here: colmap(here, binary=True), (TRAIN, DEEP), MODEL),
     "photographs": Target(colmap, (TRAIN,), ("data/images/*",)),
+    "surface": Target(colmap, (SURFACE,), ("data/images/*", *MODEL)),
     "lenses-and-masks": Target(
         lenses, (TRAIN, DEEP), ("data/masks/*", "data/images/*1.png", "data/sparse/0/cameras.txt")
     ),
@@ -169,6 +179,7 @@ TARGETS = {
         tuple(f"--{name}" for name in ("samples tau voxel visible radius far seed".split())),
     ),
     "numbers-prepare": Target(colmap, (PREPARE,), (), (*SWEEP, *READING)),
+    "numbers-stereo": Target(colmap, (STEREO,), (), (*PATCHES, *READING)),
     "numbers-mesh": Target(
         run_folder,
         ("mesh {here}/out --device cpu",),

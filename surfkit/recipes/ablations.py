@@ -253,7 +253,7 @@ SURFACE = Table(
         Row("+ stereo normals", {"pretrain.losses.prior": NormalPrior(start=0.05, end=0.05)}, kept=False),
         Row("+ reprojection", {"pretrain.losses.reprojection": Reprojection()}, kept=False),
         Row("+ warped patches", {"pretrain.losses.patches": WarpedPatches()}, kept=False),
-        Row("stereo alone (recipe:stereo)", {"method": STEREO.method}, kept=False),
+        Row("stereo alone", {"method": STEREO.method}, kept=False),
     ),
 )
 
