@@ -17,9 +17,10 @@ TARGETS = (
     "splats-compressed-ply", "splats-gltf", "splats-gltf-spz", "splats-ply", "splats-sog", "splats-splat",
     "splats-spz", "splats-spz-4", "splats-surfkit",
     "colmap-text", "colmap-binary", "photographs", "surface", "lenses-and-masks", "depth-arrays", "depth-pictures",
-    "nerfstudio", "points-as-text", "blender", "matrixcity", "odm", "bundler", "metashape", "openmvg", "pix4d", "realitycapture",
-    "recipe", "run", "stopped-run", "blocks", "comparison", "outputs", "memory", "numbers-evaluate", "numbers-prepare",
-    "numbers-stereo", "numbers-mesh", "numbers-tetra", "numbers-train", "numbers-doctor",
+    "nerfstudio", "points-as-text", "blender", "matrixcity", "odm", "bundler", "metashape", "openmvg", "pix4d",
+    "realitycapture", "recipe", "run", "stopped-run", "blocks", "comparison", "outputs", "memory",
+    "numbers-evaluate", "numbers-prepare", "numbers-stereo", "numbers-mesh", "numbers-tetra", "numbers-train",
+    "numbers-doctor",
 )  # fmt: skip
 
 

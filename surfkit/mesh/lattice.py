@@ -16,8 +16,10 @@ FULL = 32
 """Weight of a pixel that looks straight at a surface and is no larger than a voxel."""
 REACH = 1.5
 """Blocks are made where a surface is nearer than this, in voxels, along any axis: cells around it must be whole."""
-STEEP, PLANE = 0.6, 0.15
-"""See `least_slant`."""
+LEAST_SLANT = 0.6
+"""With a truncation of 4 voxels or more."""
+SLANT_OF_VOXEL = 0.15
+"""Least slant for each voxel of a shorter truncation."""
 JUMP = 2.0
 """Neighbouring pixels whose depths differ by more than this, in voxels along the normal, are not of one surface."""
 FADE = 1.0
@@ -32,15 +34,15 @@ Corner = tuple[int, int, int]
 def least_slant(voxel: float, truncation: float) -> float:
     """The least slant of a pixel (see `Picture`): at smaller grazing angles, surfaces count as seen at this one.
 
-    What is seen at a grazing angle is often round, so the plane of a pixel counts for no more than 1 / `PLANE` voxels
-    of depth. A short truncation takes less, so smaller angles count, as those at which a road is seen. Never more than
-    `STEEP`.
+    What is seen at a grazing angle is often round, and leaves the plane of a pixel. The plane is used as far as the
+    truncation reaches, along the ray truncation / slant: with a short truncation at most 1 / `SLANT_OF_VOXEL` voxels,
+    at angles as small as those at which a road is seen; with a longer one further, at angles above `LEAST_SLANT`.
 
     Args:
         voxel: Local units.
         truncation: Local units.
     """
-    return min(STEEP, PLANE * truncation / voxel)
+    return min(LEAST_SLANT, SLANT_OF_VOXEL * truncation / voxel)
 
 
 @dataclass(frozen=True)
