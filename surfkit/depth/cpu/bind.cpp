@@ -29,7 +29,7 @@ using Pairs = nb::ndarray<const uint16_t, nb::c_contig, nb::device::cpu>;
 
 #if defined(SURFKIT_X86)
 // Intel processors with half-precision AVX-512 (Sapphire Rapids and later) gather sixteen words in less than half of the
-// time that insertions take. Earlier ones do not since their microcode keeps gathered data from leaking.
+// time that insertions take. Earlier ones have microcode against Gather Data Sampling, which makes that instruction slow.
 bool gathers_quickly() {
     unsigned a, b, c, d;
     constexpr unsigned kHalfPrecision = 1u << 23;
