@@ -125,9 +125,9 @@ class NativeRender(Render):
     ) -> Gradients:
         arrays = self._pass.arrays
         rows = len(arrays[0]) if rows is None else rows
-        grads = [torch.zeros_like(a[:rows]) for a in arrays]
-        signal = torch.zeros(rows, 2)
-        chosen_signal = None if chosen is None else torch.zeros(rows, 2)
+        grads = [torch.empty_like(a[:rows]) for a in arrays]
+        signal = torch.empty(rows, 2)
+        chosen_signal = None if chosen is None else torch.empty(rows, 2)
         self._pass.native.backward(
             arrays,
             self._cotangents(total),

@@ -234,18 +234,25 @@ SPLAT_FN void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double
     const auto end = [&](double high, int tiles) {
         return (int)clamped(round_down((high - rim) / kTile) + 1, 0.0, (double)tiles);
     };
-    const splat::Outline<double> o = splat::outline(b);
     const double disc = b.r2 > 0 ? square_root(b.r2) : 0, dx = b.r2 > 0 ? b.dx : b.mx, dy = b.r2 > 0 ? b.dy : b.my;
-    const int y0 = first(splat::smallest(b.my - o.hy, dy - disc), tiles_y),
-              y1 = end(splat::largest(b.my + o.hy, dy + disc), tiles_y);
-    const int left = first(splat::smallest(b.mx - o.hx, dx - disc), tiles_x),
-              right = end(splat::largest(b.mx + o.hx, dx + disc), tiles_x);
+    const double hx = square_root(b.hxx), hy = square_root(b.hyy);
+    const double x0 = splat::smallest(b.mx - hx, dx - disc), x1 = splat::largest(b.mx + hx, dx + disc),
+                 y0 = splat::smallest(b.my - hy, dy - disc), y1 = splat::largest(b.my + hy, dy + disc);
+    const int left = first(x0, tiles_x), right = end(x1, tiles_x), top = first(y0, tiles_y), bottom = end(y1, tiles_y);
     if (left >= right) return;
-    for (int y = y0; y < y1; y++) {
+    // Most splats are small. In a single row or column their box tells all, but for what lies between pixel centres.
+    const bool single = bottom - top == 1 || right - left == 1;
+    if (single && x1 - x0 < 2 * kTile && y1 - y0 < 2 * kTile) {
+        for (int y = top; y < bottom; y++)
+            for (int x = left; x < right; x++) f(y * tiles_x + x);
+        return;
+    }
+    const splat::Outline<double> o = splat::outline(b);
+    for (int y = top; y < bottom; y++) {
         double low, high;
         if (!splat::bound_span(b, o, y * kTile + rim, (y + 1) * kTile - rim, low, high)) continue;
-        const int x1 = end(high, tiles_x);
-        for (int x = first(low, tiles_x); x < x1; x++) f(y * tiles_x + x);
+        const int last = end(high, tiles_x);
+        for (int x = first(low, tiles_x); x < last; x++) f(y * tiles_x + x);
     }
 }
 

@@ -242,7 +242,7 @@ SURFACE = Table(
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),
         Row("+ higher learning rates, lower ones of positions", {"pretrain.rates": surface.SURFACE.pretrain.rates}),
-        Row("+ harmonics of degree 2", {"primitive": surface.SURFACE.primitive}),
+        Row("+ harmonics of degree 1", {"primitive": surface.SURFACE.primitive}),
         Row("+ mesh ends at the rim, depth that nobody confirms counts within", {"mesh": PIXEL_VOXELS}),
         Row("+ voxels smaller than a pixel", {"mesh": PIXEL_MAPS}),
         Row("+ depth maps of 1.5 times the size", {"mesh": WITH_SKY}),

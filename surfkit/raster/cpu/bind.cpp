@@ -193,16 +193,10 @@ void add_raster(nb::module_& m) {
         const int64_t* row = rows.data();
         nb::gil_scoped_release free;
         parallel(wide ? (n + kRowsOfAdam - 1) / kRowsOfAdam : 0, threads, [&](int64_t piece) {
-            const int64_t end = std::min(n, (piece + 1) * kRowsOfAdam);
-            for (int64_t r = piece * kRowsOfAdam; r < end;) {  // rows that follow one another are one stretch of memory
-                const int64_t begin = r, at = row[begin] * wide;
-                for (bool next = true; next; next = r < end && row[r] == row[begin] + r - begin) {
-                    for (int64_t k = 0; k < wide; k++) m2[row[r] * wide + k] *= decay[r];
-                    r++;
-                }
-                kernels().adam((r - begin) * wide, p + at, g + begin * wide, m1 + at, m2 + at, (float)rate,
-                               (float)(1 - beta1), (float)(1 - beta2), (float)second_correction, (float)epsilon);
-            }
+            const int64_t at = piece * kRowsOfAdam;
+            kernels().adam_rows(row + at, std::min(kRowsOfAdam, n - at), wide, decay + at, p, g + at * wide, m1, m2,
+                                (float)rate, (float)(1 - beta1), (float)(1 - beta2), (float)second_correction,
+                                (float)epsilon);
         });
     });
     m.def("adam", [](Array value, Array gradient, Array first, Array second, double rate, double beta1, double beta2,

@@ -239,5 +239,19 @@ void adam(int64_t count, float* value, const float* gradient, float* first, floa
     }
 }
 
+void adam_rows(const int64_t* rows, int64_t count, int64_t wide, const float* kept, float* value, const float* gradient,
+               float* first, float* second, float rate, float share1, float share2, float second_correction,
+               float epsilon) {
+    for (int64_t r = 0; r < count;) {  // rows that follow one another are one stretch of memory
+        const int64_t begin = r, at = rows[begin] * wide;
+        for (bool next = true; next; next = r < count && rows[r] == rows[begin] + r - begin) {
+            for (int64_t k = 0; k < wide; k++) second[rows[r] * wide + k] *= kept[r];
+            r++;
+        }
+        adam((r - begin) * wide, value + at, gradient + begin * wide, first + at, second + at, rate, share1, share2,
+             second_correction, epsilon);
+    }
+}
+
 }  // namespace
 }  // namespace surfkit

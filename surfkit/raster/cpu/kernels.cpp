@@ -252,10 +252,8 @@ void backward_tile(const Tile& tile, const Planes& total_planes, const Planes& c
             ray[b].template step<K>(local, s, signal, grid.x[b], grid.y[b], here, fixed, adder);
         }
         if (fixed) continue;
-        float row[Adder::width];
-        sum_lanes(adder.s, Adder::width, row);
-        Adder::recentre(row, sx, sy);
-        std::memcpy(out, row, sizeof row);
+        sum_lanes(adder.s, Adder::width, out);
+        Adder::recentre(out, sx, sy);
         touched_slots[tile.job.entries[k].slot] = 1;
     }
 }
@@ -482,7 +480,8 @@ const Kernels& SURFKIT_TABLE(SURFKIT_KERNELS)() {
                                shade_some,
                                shade_some_backward,
                                add_rows,
-                               adam};
+                               adam,
+                               adam_rows};
     return table;
 }
 

@@ -108,6 +108,11 @@ struct Kernels {
     bool (*add_rows)(const float* rows, const uint8_t* touched, int64_t count, int width, double* sums);
     void (*adam)(int64_t count, float* value, const float* gradient, float* first, float* second, float rate,
                  float share1, float share2, float second_correction, float epsilon);
+    // The same for `count` rows of `wide` numbers, whose second moments are first multiplied by `kept`; kept and gradient
+    // have these rows alone.
+    void (*adam_rows)(const int64_t* rows, int64_t count, int64_t wide, const float* kept, float* value,
+                      const float* gradient, float* first, float* second, float rate, float share1, float share2,
+                      float second_correction, float epsilon);
 };
 
 const Kernels& kernels_avx512();

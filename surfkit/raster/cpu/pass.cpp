@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cstring>
 #include <limits>
+#include <numeric>
 #include <stdexcept>
 
 #include "../../native/pool.h"
@@ -160,6 +161,9 @@ void Pass::project(const SplatArrays& splats, int threads, bool* seen, float* ra
 void Pass::bin(int threads) {
     std::vector<uint32_t> at;  // records, in the order of the splats
     std::vector<float> keys;
+    const int64_t seen = std::accumulate(seen_in_.begin(), seen_in_.end(), (int64_t)0);
+    at.reserve(seen);
+    keys.reserve(seen);
     int64_t pairs = 0;
     for (size_t c = 0; c < seen_in_.size(); c++)
         for (int64_t r = c * kChunk; r < (int64_t)c * kChunk + seen_in_[c]; r++) {
@@ -169,7 +173,6 @@ void Pass::bin(int threads) {
             pairs += tiles_[r];
         }
     const std::vector<uint32_t> order = order_of(keys);
-    const int64_t seen = (int64_t)at.size();
     const int tiles = tiles_x_ * tiles_y_;
     if (pairs > std::numeric_limits<uint32_t>::max())
         throw std::length_error("more than 2^32 pairs of a splat and a tile in one view");
@@ -319,7 +322,20 @@ void Pass::backward(const SplatArrays& splats, const Planes& total, const Planes
             }
         }
     };
+    const auto clear = [&](int64_t from, int64_t to) {
+        const auto zero = [&](float* values, int wide) {
+            if (values && from < to) std::fill(values + wide * from, values + wide * to, 0.0f);
+        };
+        zero(out.means, 3);
+        zero(out.quats, 4);
+        zero(out.scales, columns);
+        zero(out.opacities, 1);
+        zero(out.sh, 3 * splats.coefficients);
+        zero(out.signal, 2);
+        zero(out.chosen, 2);
+    };
     parallel((int64_t)seen_in_.size(), threads, [&](int64_t c) {
+        clear(c * kChunk, std::min(rows, (c + 1) * kChunk));
         const int64_t end = c * kChunk + seen_in_[c];
         for (int64_t r = c * kChunk; r < end; r += kGroup) group(r, std::min(end, r + kGroup));
     });
