@@ -77,9 +77,8 @@ def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) ->
 
 def require_finite_gradients(index: int, view: str, grads: Mapping[str, Tensor]) -> None:
     """Diverged if Adam would make values of a step that are not finite: a gradient, or its square, is not."""
-    squares = {name: torch.dot(grad.reshape(-1), grad.reshape(-1)) for name, grad in grads.items()}
-    for name, square in as_numbers(squares).items():
-        if not math.isfinite(square):
+    for name, norm in as_numbers({name: torch.linalg.vector_norm(grad) for name, grad in grads.items()}).items():
+        if not math.isfinite(norm):
             raise Diverged(index, view, f"the gradients of the {name} are not finite, or too large")
 
 
