@@ -29,7 +29,7 @@ RATES["means"] = LearningRate(0.8e-4, 0.8e-6)
 
 SURFACE = Recipe(
     about="The most accurate surface: 2DGS that begins at stereo depth, stays near it, and is fused where views agree",
-    # Harmonics of degree 2 take a tenth more time in training, with the same F1, and have 0.2 dB less on boruszyn.
+    # Harmonics of degree 2 take a tenth more time in training, with the same F1 and 0.1 dB more.
     primitive=Surfel2D(sh_degree=1),
     depth=PatchMatch(),
     # In alleys, where no depth is trusted, training keeps right points that it has and finds few by itself.
