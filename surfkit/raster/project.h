@@ -241,6 +241,7 @@ SPLAT_FN void each_tile(const Bound<double>& b, int tiles_x, int tiles_y, double
     const int left = first(x0, tiles_x), right = end(x1, tiles_x), top = first(y0, tiles_y), bottom = end(y1, tiles_y);
     if (left >= right) return;
     // Most splats are small. In a single row or column their box tells all, but for what lies between pixel centres.
+    // Large ones may be single only because the image ends there; of these the box holds far too much.
     const bool single = bottom - top == 1 || right - left == 1;
     if (single && x1 - x0 < 2 * kTile && y1 - y0 < 2 * kTile) {
         for (int y = top; y < bottom; y++)

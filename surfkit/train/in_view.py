@@ -31,7 +31,7 @@ class InView:
     def of(cls, primitive: Primitive, params: Columns, camera: Camera, rasterizer: Rasterizer, near: float) -> InView:
         """The points that may touch a pixel of a view."""
         splats = primitive.activate(params, 0)
-        return cls(places(rasterizer.in_view(splats, camera, near)), splats)
+        return cls(true_rows(rasterizer.in_view(splats, camera, near)), splats)
 
     def of_columns(self, columns: Columns) -> Columns:
         """(R, ...) of each of (N, ...)."""
@@ -43,8 +43,8 @@ class InView:
         return found.index_copy_(0, self.rows, values)
 
 
-def places(mask: Tensor) -> Tensor:
-    """(R,) int64 places of the true ones of (N,) bool; on a CPU numpy finds them in an eighth of torch's time."""
+def true_rows(mask: Tensor) -> Tensor:
+    """(R,) int64 indices of the true values of (N,) bool; on a CPU numpy finds them in an eighth of torch's time."""
     if mask.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(mask.numpy()))
     return mask.nonzero()[:, 0]

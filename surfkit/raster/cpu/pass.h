@@ -24,7 +24,7 @@ class Pass {
 
     void forward(Level level, const Planes& out, int threads);
     // `absolute`: the pixels' shares of the chosen signal are summed without their signs. `out` has `rows` rows: those
-    // of the first so many splats.
+    // of the first so many splats. All of it is written, zeros where a splat adds nothing.
     void backward(const SplatArrays& splats, const Planes& total, const Planes* chosen, bool absolute, int64_t rows,
                   const GradientArrays& out, int threads);
     void contribution(float alpha_power, float open_power, float* sum, int64_t* count, int threads);
