@@ -40,7 +40,7 @@ PACK = Path(__file__).resolve().parents[1].parent / "shared/data/shibuya-synth"
 NATIVE, QUICK, TORCH = "patch-match", "the same, quick", "plane-sweep"
 ENGINES: dict[str, Callable[..., DepthEstimator]] = {
     NATIVE: PatchMatch,
-    QUICK: partial(PatchMatch, rounds=1, passes=3, best=2),
+    QUICK: partial(PatchMatch, rounds=1, passes=3),
     TORCH: PlaneSweep,
 }
 SWEPT = 480

@@ -91,7 +91,7 @@ SURFACE_BLOCKS = replace(
 SURFACE_SHORT = replace(
     SURFACE,
     about="A first look at the surface, for runs of some hundred steps: stereo at half the size, fewer points",
-    depth=PatchMatch(scale=2, best=2, passes=3, rounds=1),
+    depth=PatchMatch(scale=2, passes=3, rounds=1),
     start=replace(SURFACE.start, spacing_px=5.0),
     mesh=replace(SURFACE.mesh, voxel_px=1.2, oversampling=1.0),
 )
