@@ -94,7 +94,7 @@ class PatchMatch(DepthEstimator):
 
     best: int = 2
     """Source photographs that a plane is scored by: those that match best, out of twice as many that match best at the
-    pixel and around it. Of these, one that matches much worse than the best counts little. Three take 1.2 times as
+    pixel and around it. Of these, one that matches much worse than the best counts little. Three take 1.15 times as
     long, and fewer pixels are trusted."""
 
     window: int = 7
