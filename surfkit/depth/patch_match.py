@@ -95,7 +95,7 @@ class PatchMatch(DepthEstimator):
     best: int = 2
     """Source photographs that a plane is scored by: those that match best, out of twice as many that match best at the
     pixel and around it. Of these, one that matches much worse than the best counts little. Three take 1.15 times as
-    long, and fewer pixels are trusted."""
+    long and trust fewer pixels, which are more often right; that helps in photographs from the ground."""
 
     window: int = 7
     """Side of the matching window, pixels; odd. Smaller windows keep edges sharp, larger ones are less sensitive to
