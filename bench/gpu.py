@@ -161,7 +161,7 @@ def matching(device: torch.device, rounds: int) -> dict[str, float]:
     planes = Planes.at(draw.uniform(0.5, 1.5, value.shape).astype(np.float32), 16)
     planes.each[:] = draw.integers(0, 256, planes.each.shape)
     known = [torch.full(value.shape, 1.0, device=device)] * 16
-    terms = Terms(0.2, 2, 80, 0.25, 0.015, 0.2, 15, 1.5, samples=32, best=3, window=7, survey=False)
+    terms = Terms(0.2, 2, 80, 0.25, 0.015, 0.2, 15, 1.5, samples=32, best=2, window=7, survey=False)
     use = GpuPasses(device).improve if device.type == "cuda" else improve
 
     def moved() -> None:
