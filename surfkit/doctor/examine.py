@@ -28,7 +28,7 @@ from surfkit.readers.depth_prior import OFF, normals_warning, prepare_command
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
-from surfkit.scene.groups import groups_warning
+from surfkit.scene.groups import groups_warning, untied, untied_warning
 from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
@@ -107,6 +107,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_masks(gathered, known),
         *_split(gathered),
         *_groups(gathered),
+        *_untied(gathered),
         *_exposure(gathered, known, recipe),
         *_priors(data, gathered, recipe),
     ]
@@ -227,6 +228,14 @@ def _groups(gathered: Gathered) -> list[Finding]:
     largest, *others = gathered.capture.groups or [()]
     text = groups_warning(gathered.capture.groups)
     return [Finding("warning", "unconnected", text, tuple(name for names in others for name in names))] if text else []
+
+
+def _untied(gathered: Gathered) -> list[Finding]:
+    """Photographs that show no sparse point."""
+    names = [shot.name for shot in gathered.capture.shots]
+    found = untied(names, gathered.capture.groups)
+    text = untied_warning(found, len(names))
+    return [Finding("warning", "untied", text, tuple(found))] if text else []
 
 
 def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Photographs that sparse points connect, and a warning about those that none does."""
+"""Photographs that sparse points connect, and warnings about those that none does."""
 
 from __future__ import annotations
 
@@ -53,4 +53,31 @@ def groups_warning(groups: Sequence[Sequence[str]]) -> str | None:
         f"the photographs fall into {len(groups)} groups without common sparse points, of {', '.join(sizes[:-1])} and "
         f"{sizes[-1]}: nothing in them tells how the groups lie to one another; look at all cameras in a viewer, and "
         "where they do not fit, match photographs across the groups, or train on each group by itself"
+    )
+
+
+def untied(names: Sequence[str], groups: Sequence[Sequence[str]]) -> list[str]:
+    """Those of the photographs that show no sparse point; none where nothing is known.
+
+    Args:
+        names: Of all photographs.
+        groups: See `groups_warning`.
+    """
+    tied = {name for group in groups for name in group}
+    return [name for name in names if name not in tied] if tied else []
+
+
+def untied_warning(untied: Sequence[str], count: int) -> str | None:
+    """A warning about photographs that show no sparse point; None where there are none.
+
+    Args:
+        untied: Their names.
+        count: Of all photographs.
+    """
+    if not untied:
+        return None
+    return (
+        f"{len(untied)} of {count} photographs show no sparse point, {untied[0]!r} for one: they get no depth map, and "
+        "nothing tells whether their cameras are where they should be, but what they show becomes surface all the "
+        "same; look at them, and delete from the model those that show nothing of use"
     )

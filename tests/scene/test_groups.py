@@ -9,8 +9,10 @@ from surfkit.cli import main
 from surfkit.cli.recipes import recipes
 from surfkit.doctor.examine import examine
 from surfkit.readers.data import Data
+from surfkit.readers.read import read
+from surfkit.run.notes import collect_notes
 from surfkit.scene import groups
-from surfkit.scene.groups import connect_groups, groups_warning
+from surfkit.scene.groups import connect_groups, groups_warning, untied, untied_warning
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(kind="grid", views=16, width=24, height=18, points=400)
@@ -55,6 +57,31 @@ def test_the_line_names_sizes_and_one_photograph_of_each_smaller_group():
     assert "\n" not in many
 
 
+def test_photographs_without_a_point_are_in_no_group_and_are_named():
+    names, groups = list("abcdef"), [["e", "a"], ["c"]]
+    assert untied(names, groups) == ["b", "d", "f"]
+    assert untied(names, []) == untied(names, [names]) == []
+    assert untied_warning([], 6) is None
+    text = untied_warning(["b", "d", "f"], 6)
+    assert text.startswith("3 of 6 photographs show no sparse point, 'b' for one: ") and "\n" not in text
+
+
+def untie(model, number):
+    """Take the observations of one image out of a model in text."""
+    rows = [row.split(" ") for row in (model / "points3D.txt").read_text().splitlines()]
+    for words in rows:
+        pairs = [pair for pair in zip(words[8::2], words[9::2], strict=True) if int(pair[0]) != number]
+        words[8:] = [word for pair in pairs for word in pair]
+    (model / "points3D.txt").write_text("\n".join(" ".join(words) for words in rows) + "\n")
+    lines = (model / "images.txt").read_text().splitlines()
+    for at in range(0, len(lines), 2):
+        if int(lines[at].split(" ")[0]) == number:
+            words = lines[at + 1].split(" ")
+            words[2::3] = ["-1"] * len(words[2::3])
+            lines[at + 1] = " ".join(words)
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+
+
 def split(model, of):
     """Take the observations out of a model in text that connect groups: each point stays in the photographs of one.
 
@@ -84,9 +111,9 @@ def made():
     return photograph(FLIGHT)
 
 
-def told(folder):
+def told(folder, what="unconnected"):
     found = examine(Data(folder), recipes()["2dgs"], quick=True).diagnosis.findings
-    return [finding for finding in found if finding.what == "unconnected"]
+    return [finding for finding in found if finding.what == what]
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -94,6 +121,19 @@ def test_connected_photographs_and_those_without_observations_are_not_told(made,
     write_colmap(tmp_path / "with", made, tracks=True, binary=binary)
     write_colmap(tmp_path / "without", made, binary=binary)
     assert told(tmp_path / "with") == told(tmp_path / "without") == []
+    assert told(tmp_path / "with", "untied") == told(tmp_path / "without", "untied") == []
+
+
+def test_doctor_and_readers_tell_photographs_without_a_point(made, tmp_path):
+    write_colmap(tmp_path, made, tracks=True)
+    untie(tmp_path / "sparse/0", 12)
+    line = "1 of 16 photographs show no sparse point, 'view_011.png' for one: "
+    (finding,) = told(tmp_path, "untied")
+    assert finding.level == "warning" and finding.text.startswith(line) and finding.names == ("view_011.png",)
+    assert not told(tmp_path)
+    with collect_notes() as kept:
+        read(Data(tmp_path))
+    assert [text for text in kept.texts if text.startswith(line)]
 
 
 def test_doctor_and_train_tell_groups_and_training_goes_on(made, tmp_path, capsys):
