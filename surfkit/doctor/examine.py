@@ -28,7 +28,7 @@ from surfkit.readers.depth_prior import OFF, normals_warning, prepare_command
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
-from surfkit.scene.groups import groups_warning, untied, untied_warning
+from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
@@ -232,9 +232,9 @@ def _groups(gathered: Gathered) -> list[Finding]:
 
 def _untied(gathered: Gathered) -> list[Finding]:
     """Photographs that show no sparse point."""
-    names = [shot.name for shot in gathered.capture.shots]
-    found = untied(names, gathered.capture.groups)
-    text = untied_warning(found, len(names))
+    train = {shot.name for shot in gathered.train}
+    found = [name for name in gathered.capture.untied if name in train]
+    text = untied_warning(found)
     return [Finding("warning", "untied", text, tuple(found))] if text else []
 
 

@@ -60,6 +60,12 @@ class Capture:
     groups: Sequence[Sequence[str]] = ()
     numbered: bool = False
 
+    @property
+    def untied(self) -> list[str]:
+        """Names of the photographs that show no sparse point; none where the layout keeps no observations."""
+        tied = {name for group in self.groups for name in group}
+        return [shot.name for shot in self.shots if shot.name not in tied] if tied else []
+
 
 @dataclass(frozen=True)
 class Tracks:

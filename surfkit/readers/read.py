@@ -23,7 +23,7 @@ from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
-from surfkit.scene.groups import groups_warning, untied, untied_warning
+from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
@@ -44,8 +44,9 @@ def read(data: Data) -> Scene:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as {name_of(reader)}; it could also be read with --layout {others}"))
     capture = read_capture(data, reader)
-    names = [shot.name for shot in capture.shots]
-    for text in (groups_warning(capture.groups), untied_warning(untied(names, capture.groups), len(names))):
+    held_out = data.held_out(capture)
+    untied = [name for name in capture.untied if name not in held_out]
+    for text in (groups_warning(capture.groups), untied_warning(untied)):
         if text:
             emit(Warned(text))
     return build_scene(data, capture)

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from surfkit.core.check import few
+
 BATCH = 20_000
 """Points between two checks whether all photographs are connected."""
 SHOWN = 4
@@ -56,28 +58,17 @@ def groups_warning(groups: Sequence[Sequence[str]]) -> str | None:
     )
 
 
-def untied(names: Sequence[str], groups: Sequence[Sequence[str]]) -> list[str]:
-    """Those of the photographs that show no sparse point; none where nothing is known.
-
-    Args:
-        names: Of all photographs.
-        groups: See `groups_warning`.
-    """
-    tied = {name for group in groups for name in group}
-    return [name for name in names if name not in tied] if tied else []
-
-
-def untied_warning(untied: Sequence[str], count: int) -> str | None:
-    """A warning about photographs that show no sparse point; None where there are none.
+def untied_warning(untied: Sequence[str]) -> str | None:
+    """A warning about photographs to train on that show no sparse point; None where there are none.
 
     Args:
         untied: Their names.
-        count: Of all photographs.
     """
     if not untied:
         return None
+    one = len(untied) == 1
     return (
-        f"{len(untied)} of {count} photographs show no sparse point, {untied[0]!r} for one: they get no depth map, and "
-        "nothing tells whether their cameras are where they should be, but what they show becomes surface all the "
-        "same; look at them, and delete from the model those that show nothing of use"
+        f"{len(untied)} photograph{'' if one else 's'} to train on show{'s' if one else ''} no sparse point, "
+        f"{few(untied)}: nothing in the model confirms where they were taken, and stereo makes no depth maps of them, "
+        "but what they show becomes surface all the same; match them again, or delete from the model what is of no use"
     )

@@ -12,7 +12,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene import groups
-from surfkit.scene.groups import connect_groups, groups_warning, untied, untied_warning
+from surfkit.scene.groups import connect_groups, groups_warning, untied_warning
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 FLIGHT = Flight(kind="grid", views=16, width=24, height=18, points=400)
@@ -57,13 +57,11 @@ def test_the_line_names_sizes_and_one_photograph_of_each_smaller_group():
     assert "\n" not in many
 
 
-def test_photographs_without_a_point_are_in_no_group_and_are_named():
-    names, groups = list("abcdef"), [["e", "a"], ["c"]]
-    assert untied(names, groups) == ["b", "d", "f"]
-    assert untied(names, []) == untied(names, [names]) == []
-    assert untied_warning([], 6) is None
-    text = untied_warning(["b", "d", "f"], 6)
-    assert text.startswith("3 of 6 photographs show no sparse point, 'b' for one: ") and "\n" not in text
+def test_photographs_without_a_point_are_named():
+    assert untied_warning([]) is None
+    assert untied_warning(["b"]).startswith("1 photograph to train on shows no sparse point, 'b': ")
+    text = untied_warning(["b", "d", "f"])
+    assert text.startswith("3 photographs to train on show no sparse point, 'b', 'd', 'f': ") and "\n" not in text
 
 
 def untie(model, number):
@@ -126,14 +124,16 @@ def test_connected_photographs_and_those_without_observations_are_not_told(made,
 
 def test_doctor_and_readers_tell_photographs_without_a_point(made, tmp_path):
     write_colmap(tmp_path, made, tracks=True)
+    untie(tmp_path / "sparse/0", 9)  # held out
+    assert not told(tmp_path, "untied")
     untie(tmp_path / "sparse/0", 12)
-    line = "1 of 16 photographs show no sparse point, 'view_011.png' for one: "
+    line = "1 photograph to train on shows no sparse point, 'view_011.png': "
     (finding,) = told(tmp_path, "untied")
     assert finding.level == "warning" and finding.text.startswith(line) and finding.names == ("view_011.png",)
     assert not told(tmp_path)
     with collect_notes() as kept:
         read(Data(tmp_path))
-    assert [text for text in kept.texts if text.startswith(line)]
+    assert len([text for text in kept.texts if text.startswith(line)]) == 1
 
 
 def test_doctor_and_train_tell_groups_and_training_goes_on(made, tmp_path, capsys):
