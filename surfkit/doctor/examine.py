@@ -232,8 +232,7 @@ def _groups(gathered: Gathered) -> list[Finding]:
 
 def _untied(gathered: Gathered) -> list[Finding]:
     """Photographs that show no sparse point."""
-    train = {shot.name for shot in gathered.train}
-    found = [name for name in gathered.capture.untied if name in train]
+    found = gathered.capture.untied(gathered.held_out)
     text = untied_warning(found)
     return [Finding("warning", "untied", text, tuple(found))] if text else []
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,11 +60,15 @@ class Capture:
     groups: Sequence[Sequence[str]] = ()
     numbered: bool = False
 
-    @property
-    def untied(self) -> list[str]:
-        """Names of the photographs that show no sparse point; none where the layout keeps no observations."""
+    def untied(self, held_out: Collection[str]) -> list[str]:
+        """Names of the photographs to train on that show no sparse point; none where the layout keeps no observations.
+
+        Args:
+            held_out: Names of those that are not trained on.
+        """
         tied = {name for group in self.groups for name in group}
-        return [shot.name for shot in self.shots if shot.name not in tied] if tied else []
+        names = [shot.name for shot in self.shots if shot.name not in held_out]
+        return [name for name in names if name not in tied] if tied else []
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,7 @@ def read(data: Data) -> Scene:
         others = ", ".join(name for name, other in fitting.items() if other != reader)
         emit(Warned(f"{data.path}: read as {name_of(reader)}; it could also be read with --layout {others}"))
     capture = read_capture(data, reader)
-    held_out = data.held_out(capture)
-    untied = [name for name in capture.untied if name not in held_out]
+    untied = capture.untied(data.held_out(capture))
     for text in (groups_warning(capture.groups), untied_warning(untied)):
         if text:
             emit(Warned(text))
