@@ -19,7 +19,7 @@ from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.plane_sweep import PlaneSweep
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation, Prepared
 from surfkit.evaluate.images.pictures import colour_depth, write_picture
 from surfkit.raster.select import Device, torch_device
@@ -42,14 +42,15 @@ class Depth:
     """Estimate depth maps of the training photographs, for the depth loss; writes DATA/estimated_depths.
 
     An interrupted command continues when it is given again. Damaged photographs are passed over. Two methods are
-    multi-view stereo and need no network weights: `estimator:plane-sweep` and `estimator:patch-match`. The network
-    `estimator:depth-anything-v2` looks at one photograph at a time.
+    multi-view stereo and need no network weights: `estimator:patch-match`, the default, which gives normals too, and
+    `estimator:plane-sweep`, which is slower, and also runs where surfkit was installed without a C++ compiler. The
+    network `estimator:depth-anything-v2` looks at one photograph at a time.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
     """Data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or another layout."""
 
-    estimator: Annotated[DepthEstimator, choice(DepthEstimator)] = PlaneSweep()
+    estimator: Annotated[DepthEstimator, choice(DepthEstimator)] = PatchMatch()
     """Method that estimates depth."""
 
     again: bool = False

@@ -46,7 +46,7 @@ class Photos:
 
     SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
     positions in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one
-    with other settings or photographs does again only what depends on them. `depth:plane-sweep` or another estimator
+    with other settings or photographs does again only what depends on them. `depth:patch-match` or another estimator
     makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
@@ -69,7 +69,7 @@ class Photos:
 
     def __post_init__(self) -> None:
         if self.depth is None and self.device != "auto":
-            raise BadInput(f"--device {self.device} is for depth maps, and none are made; add depth:plane-sweep")
+            raise BadInput(f"--device {self.device} is for depth maps, and none are made; add depth:patch-match")
 
     @property
     def scene(self) -> Path:

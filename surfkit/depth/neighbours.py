@@ -10,16 +10,15 @@ from scipy.sparse import csr_matrix
 from surfkit.core.events import Progress, emit
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS
 from surfkit.scene.observations import Observations
+from surfkit.scene.parallax import degrees_between, worth
 from surfkit.scene.scene import View
 
-NARROW, WIDE = 1 / 3, 1.5
-"""Width of the weight of a pair below and above the preferred angle, as shares of that angle."""
 SAME_SIDE = 0.8
 """Share of its weight that a view loses when another stands in the same direction: both see the same occlusions."""
 LEAST = 0.1
 """A pair with a weight of fewer than this many well placed points is not compared."""
 CANDIDATES = 40
-"""Number of views, those with most shared points, whose angles are computed."""
+"""Number of views, those with most shared points and not taken from the same place, that are looked at."""
 OUTLIERS = 0.01
 """Share of the sparse points that may lie closer than the depths tried, and farther away."""
 
@@ -27,8 +26,7 @@ OUTLIERS = 0.01
 def neighbours(views: Sequence[View], observations: Observations, count: int, angle: float) -> list[list[int]]:
     """For each view, positions of up to `count` views to compare it with, best first.
 
-    A pair is worth the sum over the points that both see of exp(-(a - angle)^2 / 2 s^2), where a is the angle between
-    the two rays, and s is small below the best angle, which gives no parallax, and large above, where views differ.
+    A pair is worth the sum, over the points that both see, of the worth of the angle between the two rays.
 
     Args:
         views: V views.
@@ -49,14 +47,14 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
         part = slice(*shared.indptr[at : at + 2])
         others, counts = shared.indices[part], shared.data[part]
         order = np.lexsort((others, -counts))
-        candidates = [int(other) for other in others[order] if other != at][:CANDIDATES]
-        worth = {
-            other: _worth(
-                observations.xyz[np.intersect1d(seen[at], seen[other], assume_unique=True)], centres[[at, other]], angle
-            )
-            for other in candidates
-        }
-        chosen.append(_spread(worth, {other: centres[other] - centres[at] for other in worth}, count))
+        worths: dict[int, float] = {}
+        for other in (int(other) for other in others[order] if other != at):
+            both = np.intersect1d(seen[at], seen[other], assume_unique=True)
+            if value := _worth(observations.xyz[both], centres[at], centres[other], angle):
+                worths[other] = value
+            if len(worths) == CANDIDATES:
+                break
+        chosen.append(_spread(worths, {other: centres[other] - centres[at] for other in worths}, count))
         emit(Progress("choosing what to compare", at + 1, len(views)))
     return chosen
 
@@ -77,9 +75,9 @@ def depth_range(view: View, observations: Observations, margin: float) -> tuple[
     return float(max(low - more, low / 3)), float(high + more)
 
 
-def _spread(worth: dict[int, float], baselines: dict[int, np.ndarray], count: int) -> list[int]:
+def _spread(worths: dict[int, float], baselines: dict[int, np.ndarray], count: int) -> list[int]:
     """Up to `count` of the views, best first; a view in the same direction as a chosen one weighs less."""
-    left = {other: value for other, value in worth.items() if value > LEAST}
+    left = {other: value for other, value in worths.items() if value > LEAST}
     chosen: list[int] = []
     while left and len(chosen) < count:
         best = max(left, key=lambda other: (left[other], -other))
@@ -92,9 +90,6 @@ def _spread(worth: dict[int, float], baselines: dict[int, np.ndarray], count: in
     return chosen
 
 
-def _worth(xyz: np.ndarray, centres: np.ndarray, angle: float) -> float:
-    rays = xyz - centres[:, None]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    between = np.degrees(np.arccos((rays[0] * rays[1]).sum(-1).clip(-1, 1)))
-    spread = angle * np.where(between < angle, NARROW, WIDE)
-    return float(np.exp(-((between - angle) ** 2) / (2 * spread**2)).sum())
+def _worth(xyz: np.ndarray, one: np.ndarray, other: np.ndarray, angle: float) -> float:
+    there = xyz[np.isfinite(xyz).all(1)]  # some programs write points that lie nowhere
+    return float(worth(degrees_between(there, one, other), angle).sum())

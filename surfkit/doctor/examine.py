@@ -264,7 +264,7 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     if not train or not (stereo or needs_priors(losses)):
         return []
     normals = needs_normals(losses)
-    make = prepare_command(data, normals)
+    make = prepare_command(data)
     try:
         maps = depth_maps(data, gathered)
     except BadInput as error:

@@ -10,11 +10,10 @@ import numpy as np
 from torch import Tensor
 
 from surfkit.scene.camera import Camera
+from surfkit.scene.parallax import degrees_between, worth
 
 PROBES = 12
 """Pixels along each side of a view whose points are projected into other views."""
-NARROW, WIDE = 1 / 3, 1.5
-"""Width of the weight of a view below and above the preferred angle, as shares of that angle."""
 WIDEST = 45.0
 """Degrees between rays from which on a view is not compared."""
 CANDIDATES = 128
@@ -44,8 +43,8 @@ class Depths:
 def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
     """Positions of up to `count` views that see much of what a view sees, best first.
 
-    A view is worth, for each point of the first that lies in its picture, exp(-(a - angle)^2 / 2 s^2), where a is the
-    angle between both rays; less where views that are chosen already see the point, so that all points get their share.
+    A view is worth, for each point of the first that lies in its picture, what the angle between both rays is worth;
+    less where views that are chosen already see the point, so that all points get their share.
 
     Args:
         at: Position of the view.
@@ -57,16 +56,16 @@ def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
     if not len(points):
         return []
     near = _near(at, depths.centres, float(np.quantile(np.linalg.norm(points - eye, axis=1), 0.9)))
-    worth = np.array([_worth(points, eye, depths.cameras[other], angle) for other in near])
+    worths = np.array([_worth(points, eye, depths.cameras[other], angle) for other in near])
     covered, chosen = np.zeros(len(points)), []
     while len(chosen) < min(count, len(near)):
-        gains = (worth / (1 + covered)).sum(1)
+        gains = (worths / (1 + covered)).sum(1)
         best = int(gains.argmax())
         if gains[best] <= LEAST * len(points):
             break
         chosen.append(near[best])
-        covered += worth[best]
-        worth[best] = 0
+        covered += worths[best]
+        worths[best] = 0
     return chosen
 
 
@@ -97,8 +96,5 @@ def _worth(points: np.ndarray, eye: np.ndarray, other: Camera, angle: float) -> 
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = other.fx * x / z + other.cx, other.fy * y / z + other.cy
         inside = (z > 0) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height)
-    rays = [points - eye, points - other.centre.numpy()]
-    one, two = (ray / np.linalg.norm(ray, axis=1, keepdims=True).clip(1e-300) for ray in rays)
-    between = np.degrees(np.arccos((one * two).sum(1).clip(-1, 1)))
-    spread = angle * np.where(between < angle, NARROW, WIDE)
-    return np.where(inside & (between < WIDEST), np.exp(-((between - angle) ** 2) / (2 * spread**2)), 0)
+    between = degrees_between(points, eye, other.centre.numpy())
+    return np.where(inside & (between < WIDEST), worth(between, angle), 0)

@@ -37,10 +37,6 @@ NAMED = 10
 """Photographs that a warning names."""
 OFF = "everything that learns from them is switched off, such as the losses depth and normal-prior"
 """Consequence of missing depth priors."""
-WITH_NORMALS = "estimator:patch-match"
-"""Choice of an estimator that gives normals."""
-
-
 KNOWN = 0.1
 """Least confidence of a pixel of which a depth prior knows something."""
 
@@ -195,7 +191,7 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
     """
     maps = prior_files(data, scene)
     if not maps:
-        remedy = f"; {prepare_command(data, normals)}" if data.priors is None else ""
+        remedy = f"; {prepare_command(data)}" if data.priors is None else ""
         emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)
@@ -343,12 +339,12 @@ def normals_warning(data: Data, files: Sequence[DepthFile]) -> str | None:
     without = sum(not normal_path(file.path).exists() for file in files)
     if not without:
         return None
-    remedy = f"make others with `surfkit prepare depth {data.path} {WITH_NORMALS} --again`"
+    remedy = f"make others with `surfkit prepare depth {data.path} --again`"
     remedy = remedy if data.priors is None else "depth:patch-match makes some that have"
     what = f"{without} of {len(files)} depth priors have no normals"
     return f"{what}, and the loss normal-prior learns nothing from those; {remedy}"
 
 
-def prepare_command(data: Data, normals: bool = False) -> str:
-    """Which command makes depth priors, with normals if a loss needs them."""
-    return f"make them with `surfkit prepare depth {data.path}{f' {WITH_NORMALS}' if normals else ''}`"
+def prepare_command(data: Data) -> str:
+    """Which command makes depth priors, with normals."""
+    return f"make them with `surfkit prepare depth {data.path}`"

@@ -9,7 +9,6 @@ from surfkit.readers.depth_prior import OFF, prepare_command, prior_files
 from surfkit.readers.read import read
 from surfkit.report.rows import Trial
 from surfkit.run.folder import Run, read_record
-from surfkit.train.material import needs_normals
 
 
 def lines_on_depth(trials: Sequence[Trial], labels: Sequence[str]) -> list[str]:
@@ -24,11 +23,10 @@ def lines_on_depth(trials: Sequence[Trial], labels: Sequence[str]) -> list[str]:
         wanting = [trial for trial in trials if trial.data == data and _wants_maps(trial)]
         if not wanting or prior_files(data, read(data)):
             continue
-        losses = [stage.losses for trial in wanting for _, stage, _ in trial.recipe.stages()]
         rows = row_numbers({trial.label for trial in wanting}, labels)
         fail = {each.label for each in wanting if each.recipe.method.needs_prior or each.recipe.start.needs_prior}
         begin = f"; {row_numbers(fail, labels)} will fail, as training begins at depth maps" if fail else ""
-        make = prepare_command(data, any(map(needs_normals, losses)))
+        make = prepare_command(data)
         found.append(f"{data.path} has no depth priors, so {OFF}, in {rows}{begin}; {make}")
     return found
 

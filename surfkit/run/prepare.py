@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import dump, read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
@@ -16,7 +16,7 @@ from surfkit.depth.keep import key_of, maps
 from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation
 from surfkit.mesh.base import Mesher
 from surfkit.raster.select import Device, torch_device
-from surfkit.readers.depth_files import FOLDER
+from surfkit.readers.depth_files import FOLDER, DepthFile, read_record
 from surfkit.readers.depth_prior import prior_files
 from surfkit.readers.fingerprint import Fingerprint, fingerprint
 from surfkit.readers.made_maps import is_there, located
@@ -49,7 +49,10 @@ def with_maps(
         BadInput: The run began with maps that are gone and may not be made again, or they cannot be made.
     """
     before = read_data(run.out).priors if run.record.exists() else None
-    if not run.wants_priors or prior_files(run.data, scene) or (begun and before is None):
+    if not run.wants_priors or (begun and before is None):
+        yield run
+    elif files := prior_files(run.data, scene):
+        tell_of_others(run, files)
         yield run
     elif before is not None and is_finished(run):
         yield with_priors(run, before)
@@ -122,6 +125,24 @@ def made_maps(
         if made.without:
             emit(Warned(f"the others give no depth: they are damaged, {WITHOUT_DEPTH}"))
         yield folder
+
+
+def tell_of_others(run: Run, files: Mapping[str, DepthFile]) -> None:
+    """Say so where surfkit made the maps of the data set otherwise than the recipe would, as its settings are unused.
+
+    Args:
+        run: The run.
+        files: Its maps.
+    """
+    folder, own = run.data.path / FOLDER, run.recipe.depth
+    if own is None or not all(file.path.is_relative_to(folder) for file in files.values()):
+        return
+    made = read_record(run.data.path).get("estimator")
+    if made in (None, dump(own)):
+        return
+    use, wanted = made["use"], name_of(own)
+    how = f"with {use}, not with {wanted}" if use != wanted else f"with other settings of {wanted} than the recipe has"
+    emit(Warned(f"{folder} has depth maps, made {how}: the run uses these; move the folder away to have others made"))
 
 
 def with_priors(run: Run, folder: Path) -> Run:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.readers.depth_prior import WITH_NORMALS, Alignment, alignment, prior_bytes, prior_files, read_priors
+from surfkit.readers.depth_prior import Alignment, alignment, prior_bytes, prior_files, read_priors
 from surfkit.readers.read import observations
 from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
@@ -73,7 +73,7 @@ def remedy(run: Run, scene: Scene) -> str:
     if run.data.priors is not None:
         return "see whether photographs and cameras belong together, and which points they share"
     if prior_files(run.data, scene):
-        return f"make others with `surfkit prepare depth {run.data.path} {WITH_NORMALS} --again`"
+        return f"make others with `surfkit prepare depth {run.data.path} --again`"
     if observations(run.data, scene).is_empty:
         return f"`surfkit prepare points {run.data.path}` makes a data set with the points that stereo needs"
     let = "let the run make them, without --no-prepare and with depth:patch-match"

@@ -15,6 +15,7 @@ from surfkit.scene.crop import box, write_crop
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 RUN = "--steps 2 --device cpu --pictures-every 1 --primitive.sh-degree 1 --cache 1MB"
+SWEEP = "prepare depth {m}/data estimator:plane-sweep"
 CUT = "partition:quantile-grid --partition.blocks 2 1 assign:picture-share"
 SHAPES = ("null", "[1]", "7", '"x"', "{}", "[" * 100_000 + "]" * 100_000, '{"a":' * 500 + "1" + "}" * 500)
 pytestmark = pytest.mark.usefixtures("small_pictures")
@@ -29,7 +30,7 @@ def made(tmp_path_factory):
     write_crop(path / "crop.json", box((-50.0, -50.0, -50.0, 50.0, 50.0, 50.0)))
     for out, more in (("run", ""), ("blocks", CUT)):
         assert main(f"train recipe:2dgs {RUN} {more} --data {path}/data --out {path}/{out}".split()) == 0
-    assert main(f"prepare depth {path}/data --device cpu --estimator.max-planes 8".split()) == 0
+    assert main(f"{SWEEP.format(m=path)} --device cpu --estimator.max-planes 8".split()) == 0
     shutil.copy(path / "run" / "mesh.ply", path / "truth.ply")
     assert main(f"evaluate {path}/run --gt {path}/truth.ply --tau 0.5 --draws 1 --crop none".split()) == 0
     return path
@@ -64,7 +65,7 @@ BLOCKS = f"train recipe:2dgs {RUN} {CUT} --data {{m}}/data --out {{m}}/blocks"
         ("blocks/blocks/plan.json", "status {m}/blocks", ""),
         ("blocks/blocks/plan.json", "tune {m}/blocks 0 --device cpu", ""),
         ("blocks/blocks/000/state.json", "status {m}/blocks", "{}"),
-        ("data/estimated_depths/depth.json", "prepare depth {m}/data --device cpu", ""),
+        ("data/estimated_depths/depth.json", f"{SWEEP} --device cpu", ""),
     ],
 )
 def test_json_of_another_shape_is_one_line(made, capsys, name, words, taken):
@@ -145,19 +146,31 @@ def test_links_to_themselves_and_folders_are_one_line(made, capsys, tmp_path):
         (f"{GT} --crop none --voxel 1e300", r"--voxel 1e\+300: .* spans .* must lie between"),
         (f"{GT} --crop none --far 1e-300", r"--far 1e-300: .* must lie between"),
         (f"{GT} --crop none --radius nan", "radius"),
-        ("prepare depth {m}/data --again --estimator.window 999", "window is 999; it must lie between 3 and 51"),
         (
-            "prepare depth {m}/data --again --estimator.window 19",
+            f"{SWEEP} --again --estimator.window 999",
+            "window is 999; it must lie between 3 and 51",
+        ),
+        (
+            f"{SWEEP} --again --estimator.window 19",
             r"window is 19, and .* is 24 x 18 .* to 18",
         ),
         (
-            "prepare depth {m}/data --estimator.neighbours 1000000",
+            f"{SWEEP} --estimator.neighbours 1000000",
             r"neighbours is .* must lie between 1 and 40",
         ),
-        ("prepare depth {m}/data --estimator.longest 100000000000000000000", "longest is .* between 1 and 20000"),
-        (f"prepare depth {{m}}/data --estimator.longest {10**400}", "longest is 10+; it must lie between 1 and 20000"),
-        ("prepare depth {m}/data --estimator.max-planes 1000000000", "max_planes is .* between 3 and 10000"),
-        ("prepare depth {m}/data --estimator.margin nan", "margin is nan"),
+        (
+            f"{SWEEP} --estimator.longest 100000000000000000000",
+            "longest is .* between 1 and 20000",
+        ),
+        (
+            f"{SWEEP} --estimator.longest {10**400}",
+            "longest is 10+; it must lie between 1 and 20000",
+        ),
+        (
+            f"{SWEEP} --estimator.max-planes 1000000000",
+            "max_planes is .* between 3 and 10000",
+        ),
+        (f"{SWEEP} --estimator.margin nan", "margin is nan"),
         (
             "prepare depth {m}/data --again estimator:patch-match --estimator.longest 100000000000000000000",
             "longest is .* between 32 and 20000",
@@ -189,11 +202,11 @@ def test_numbers_that_cannot_be_meant_are_refused(made, capsys, words, message):
 
 def test_costs_that_do_not_fit_into_memory_are_refused(made, capsys, monkeypatch):
     monkeypatch.setattr("surfkit.depth.plane_sweep.free_bytes", lambda: 10_000)
-    status, lines = said(capsys, f"prepare depth {made}/data --again --device cpu")
+    status, lines = said(capsys, f"{SWEEP.format(m=made)} --again --device cpu")
     assert status == 2 and len(lines) == 1 and "give --estimator.longest" in lines[0]
     monkeypatch.undo()
     longest = lines[0].partition("--estimator.longest ")[2].split()[0]
-    assert main(f"prepare depth {made}/data --again --device cpu --estimator.max-planes 8".split()) == 0
+    assert main(f"{SWEEP.format(m=made)} --again --device cpu --estimator.max-planes 8".split()) == 0
     assert 1 <= int(longest) < 24
 
 

@@ -16,9 +16,7 @@ from surfkit.testing.synthetic import Flight, photograph, write_colmap
 pytestmark = needs_native
 SETTINGS = "recipe:surface mesh:none --steps 1 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
 HARDLY = "of the pixels of the depth maps are trusted; see whether the photographs are mirrored"
-OTHERS = (
-    "there are none that can be used; make others with `surfkit prepare depth {farm} estimator:patch-match --again`"
-)
+OTHERS = "there are none that can be used; make others with `surfkit prepare depth {farm} --again`"
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from surfkit.readers.depth_files import map_path
 from surfkit.run import stage
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
-SMALL = ("--test-every", "4", "--estimator.longest", "48")
+SMALL = ("estimator:plane-sweep", "--test-every", "4", "--estimator.longest", "48")
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_damaged_photographs_alone_are_one_line_and_no_map_is_lost(farm, capsys)
 @needs_native
 def test_an_estimate_goes_on_though_a_photograph_was_damaged_meanwhile(farm, monkeypatch, capsys):
     """Also the state of photographs that are not estimated yet was made with the damaged one."""
-    words = ["prepare", "depth", str(farm), "estimator:patch-match", "--test-every", "4", "--estimator.passes", "1"]
+    words = ["prepare", "depth", str(farm), "--test-every", "4", "--estimator.passes", "1"]
     estimate = PatchMatch.estimate
 
     def interrupted(self, given, wanted):

@@ -370,7 +370,7 @@ def test_what_depends_on_the_recipe(farm):
 
 def test_depth_priors_without_the_normals_that_a_loss_wants(farm):
     wanting = evolve(recipes()["2dgs"], "pretrain.losses.more", NormalPrior())
-    assert "estimator:patch-match" in told(farm, wanting)["depth-priors"][0].text
+    assert "surfkit prepare depth" in told(farm, wanting)["depth-priors"][0].text
     sweeping, matching = (told(farm, evolve(wanting, "depth", estimator)) for estimator in (PlaneSweep(), PatchMatch()))
     assert "depth:patch-match does" in sweeping["prior-normals"][0].text
     assert "prior-normals" not in matching
@@ -381,7 +381,7 @@ def test_depth_priors_without_the_normals_that_a_loss_wants(farm):
     (lacking,) = told(farm, wanting)["prior-normals"]
     assert lacking.level == "warning" and lacking.text == (
         "10 of 14 depth priors have no normals, and the loss normal-prior learns nothing from those; "
-        f"make others with `surfkit prepare depth {farm} estimator:patch-match --again`"
+        f"make others with `surfkit prepare depth {farm} --again`"
     )
     assert told(farm, "citygs2-coarse") == {}, "its loss looks at depth alone"
     for name in names:

@@ -18,6 +18,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.lock import USED, is_used, locked, mark_used
 from surfkit.core.tree import evolve
 from surfkit.depth.keep import make_room
+from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.execute import Pool
 from surfkit.losses import DepthRegression, NormalPrior
@@ -63,6 +64,12 @@ def contents(folder):
 
 def maps(cache):
     return {path.name: path.read_bytes() for path in sorted(cache.rglob("estimated_depths/*.npy"))}
+
+
+def own_maps(farm):
+    """Let a data set have the maps of SWEEP."""
+    words = "estimator:plane-sweep --estimator.longest 32 --estimator.neighbours 2 --estimator.max-planes 16"
+    assert main(f"prepare depth {farm.path} {words}".split()) == 0
 
 
 def record(out):
@@ -234,16 +241,35 @@ def test_a_run_that_began_without_maps_goes_on_without(farm, recipe, tmp_path, o
 
 
 def test_maps_of_the_data_set_come_first(farm, recipe, tmp_path, own_cache, monkeypatch):
-    words = ["--estimator.longest", "32", "--estimator.neighbours", "2", "--estimator.max-planes", "16"]
-    assert main(["prepare", "depth", str(farm.path), *words]) == 0
+    own_maps(farm)
     seen = counting(monkeypatch)
     metrics = run(recipe, farm, tmp_path / "own")
+    assert record(tmp_path / "own")["notes"] == []
     assert not seen and not (own_cache / "depth").exists() and metrics["prepare_cpu_seconds"] is None
     shutil.rmtree(farm.path / "estimated_depths")
     run(recipe, farm, tmp_path / "made")
     assert len(seen) == 7
     ends = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("own", "made")]
     assert ends[0] == ends[1]
+
+
+def test_maps_of_the_data_set_that_were_made_otherwise_are_told(farm, recipe, tmp_path):
+    own_maps(farm)
+    for at, (depth, how) in enumerate(
+        (
+            (replace(SWEEP, window=7), "with other settings of plane-sweep than the recipe has"),
+            (PatchMatch(), "with plane-sweep, not with patch-match"),
+            (None, None),
+        )
+    ):
+        for _ in range(2):  # the second time, nothing is left to do
+            run(replace(recipe, depth=depth), farm, tmp_path / f"run{at}")
+        told = f"has depth maps, made {how}: the run uses these; move the folder away to have others made"
+        notes = record(tmp_path / f"run{at}")["notes"]
+        assert notes == ([] if how is None else [f"{farm.path / 'estimated_depths'} {told}"])
+    (farm.path / "estimated_depths" / "depth.json").write_text('{"aligned": true}')  # of another program
+    run(recipe, farm, tmp_path / "foreign")
+    assert record(tmp_path / "foreign")["notes"] == []
 
 
 def test_a_model_without_tracks_trains_without_maps(tmp_path, recipe, own_cache):

@@ -227,10 +227,10 @@ def test_a_scale_far_from_the_others_is_a_failure(farm):
 def test_without_any_map_the_warning_says_what_to_run(farm):
     data, scene, _ = farm
     off = "so everything that learns from them is switched off, such as the losses depth and normal-prior"
-    for normals, more in ((False, ""), (True, " estimator:patch-match")):
+    for normals in (False, True):
         priors, notes = priors_of(data, scene, normals)
         assert priors is None and notes == [
-            f"{data.path} has no depth priors, {off}; make them with `surfkit prepare depth {data.path}{more}`"
+            f"{data.path} has no depth priors, {off}; make them with `surfkit prepare depth {data.path}`"
         ]
 
 
@@ -241,7 +241,7 @@ def test_priors_without_normals_are_warned_of_where_a_loss_wants_some(farm):
     priors, notes = priors_of(data, scene, normals=True)
     assert priors[0].normal is None and notes == [
         "5 of 5 depth priors have no normals, and the loss normal-prior learns nothing from those; "
-        f"make others with `surfkit prepare depth {data.path} estimator:patch-match --again`"
+        f"make others with `surfkit prepare depth {data.path} --again`"
     ]
     up = np.stack([0 * exact[scene.train[0].name]] * 2 + [-np.ones_like(exact[scene.train[0].name])])
     for view in scene.train[1:]:
