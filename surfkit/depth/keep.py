@@ -10,6 +10,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
@@ -29,7 +31,9 @@ DROPPED = ".dropped-"
 """What names of folders begin with that are being deleted."""
 
 
-def key_of(estimator: DepthEstimator, scene: Scene, prints: Fingerprint, tracks: Observations) -> str:
+def key_of(
+    estimator: DepthEstimator, scene: Scene, prints: Fingerprint, tracks: Observations, device: torch.device
+) -> str:
     """The name of the maps of the training views of a scene: another one when anything differs that they are made from.
 
     Args:
@@ -37,8 +41,10 @@ def key_of(estimator: DepthEstimator, scene: Scene, prints: Fingerprint, tracks:
         scene: With the training views.
         prints: Of its photographs, cameras and masks.
         tracks: Its observations.
+        device: Where they are made: maps of a GPU are as good as those of a CPU, and have other bits.
     """
-    parts = [str(dump(estimator)), str(estimator.version), repr(float(scene.frame.scale))]
+    parts = [] if device.type == "cpu" else [device.type]
+    parts += [str(dump(estimator)), str(estimator.version), repr(float(scene.frame.scale))]
     parts += [digest(tracks.xyz), digest(tracks.error_px)]
     for view in scene.train:
         known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
@@ -79,7 +85,7 @@ def maps(
             use.enter_context(mark_used(folder))
             with full_cache_in_one_line(folder):
                 fresh, made = make_missing(preparation, scene, tracks)
-        if fresh and (left := make_room(folder, budget_bytes)) > budget_bytes:
+        if (left := make_room(folder, budget_bytes)) > budget_bytes and fresh:
             most = f"more than the {budget_bytes / 1e9:.2g} GB of --prepare-cache"
             emit(Warned(f"depth maps that are in use take {left / 1e9:.2g} GB, {most}, and are kept"))
         yield folder, made
@@ -141,12 +147,12 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
         if not is_known:
             write_record(folder, preparation.record(preparation.material(scene, tracks)))
         return False, replace(made, maps=count)
-    given, damaged = without_damaged(preparation.material(scene, tracks))
-    preparation.open(given)
+    given, damaged, passing = without_damaged(preparation.material(scene, tracks))
+    preparation.open(preparation.record(given))
     wanted = [at for at, name in enumerate(names) if name in lacking and name not in damaged]
-    made = replace(made, maps=count, without=(*made.without, *sorted(damaged & lacking)))
+    made = replace(made, maps=count, without=(*made.without, *sorted((damaged - passing) & lacking)))
     write_made(folder, made)
-    begun, before, total = time.process_time(), made.cpu_seconds, len(names) - len(made.without)
+    begun, before, total = time.process_time(), made.cpu_seconds, count + len(wanted)
     emit(Progress("depth maps", count, total))
     for done, step in enumerate(preparation.run(scene, given, wanted), 1):
         none = (step.view.name,) if step.coverage is None else ()

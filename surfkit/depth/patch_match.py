@@ -11,6 +11,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -163,7 +165,7 @@ class PatchMatch(DepthEstimator):
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         pairs = neighbours(given.views, given.observations, self.neighbours, self.angle)
         work = Work(self, given, pairs, wanted)
-        for at in wanted:
+        for at in in_turn(pairs, wanted):
             found = work.last.map(at)
             yield Estimate(at, None, None) if found is None else self.trusted(work, at, found)
             work.finish(at)
@@ -376,6 +378,19 @@ class Work:
             window=settings.window,
             survey=False,
         )
+
+
+def in_turn(pairs: Sequence[Sequence[int]], wanted: Sequence[int]) -> list[int]:
+    """The wanted views, those that are compared with one another close together (Cuthill and McKee 1969).
+
+    Maps of a view are kept until the last view is done that is compared with it, so the disk that they take is that of
+    a line through the scene and not of a scene whose photographs are named in any order.
+    """
+    ends = np.cumsum([0, *map(len, pairs)])
+    others = np.concatenate([np.asarray(each, np.int32) for each in pairs]) if ends[-1] else np.zeros(0, np.int32)
+    graph = csr_matrix((np.ones(len(others), np.int8), others, ends), (len(pairs), len(pairs)))
+    order, chosen = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True), set(wanted)
+    return [at for at in order.tolist() if at in chosen]
 
 
 def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
@@ -30,7 +30,7 @@ from surfkit.readers.depth_files import (
     write_record,
 )
 from surfkit.readers.depth_prior import TRUSTED
-from surfkit.readers.fingerprint import digest
+from surfkit.readers.fingerprint import content_of, digest
 from surfkit.readers.read import observations
 from surfkit.scene.observations import Observations
 from surfkit.scene.photos import view_photo
@@ -38,8 +38,9 @@ from surfkit.scene.scene import Scene, View
 
 WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one place"
 """What photographs do that are compared and give no depth."""
-MADE_FROM = "made_from"
-"""In the record, and a file in the folder for work: from which cameras and sparse points, as a digest."""
+MADE_FROM, PHOTOGRAPHS = "made_from", "photographs"
+"""In the record: from which cameras and sparse points, as a digest, which is also a file in the folder for work; and of
+each photograph the content of its files."""
 
 
 @dataclass(frozen=True)
@@ -118,33 +119,40 @@ class Preparation:
             BadInput: There are maps that something else made, or other settings; or no photograph can be read.
         """
         root, views = self.place, given.views
-        record, before, whole = self.record(given), read_record(root), given
+        record, before = self.record(given), read_record(root)
         paths = [map_path(root, view.name) for view in views]
-        if not again and before != record and (before or any(path.exists() for path in paths)):
+        if not again and not are_alike(before, record) and (before or any(path.exists() for path in paths)):
             raise BadInput(
                 f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
             )
+        if not again and (names := replaced(before, record, views)):
+            raise BadInput(
+                f"{root / FOLDER} holds depth maps made before {few(names)} {'was' if len(names) == 1 else 'were'} "
+                "replaced by other photographs of the same name; --again makes all maps anew"
+            )
         damaged: set[str] = set()
         if again or self.lacking(scene):
-            given, damaged = without_damaged(given)
+            given, damaged, _ = without_damaged(given)
         if again:
             for path in paths:
                 path.unlink(missing_ok=True)
                 confidence_path(path).unlink(missing_ok=True)
                 normal_path(path).unlink(missing_ok=True)
-        if before != record or again:
+        if again or not are_alike(before, record):
             shutil.rmtree(self.work, ignore_errors=True)
-        self.open(whole)
+        known = {} if again else before.get(PHOTOGRAPHS) or {}
+        now = record[PHOTOGRAPHS].items()
+        record[PHOTOGRAPHS] = {name: known.get(name, it) for name, it in now if name in known or name not in damaged}
+        self.open(record)
         return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
 
     def is_outdated(self, given: DepthInput) -> bool:
         """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""
-        before = read_record(self.place)
-        return bool(before) and before != self.record(given)
+        before, now = read_record(self.place), self.record(given)
+        return bool(before) and (not are_alike(before, now) or bool(replaced(before, now, given.views)))
 
-    def open(self, given: DepthInput) -> None:
+    def open(self, record: Mapping[str, Any]) -> None:
         """Make the folders, and say what the maps are."""
-        record = self.record(given)
         if read_record(self.place) != record:
             write_record(self.place, record)
         self.work.mkdir(parents=True, exist_ok=True)
@@ -163,6 +171,7 @@ class Preparation:
             "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
             "matched": [view.name for view in views] if self.estimator.matched else None,
             MADE_FROM: made_from(given),
+            PHOTOGRAPHS: {view.name: content_of(view) for view in views},
         }
 
     def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
@@ -207,6 +216,21 @@ def made_from(given: DepthInput) -> str:
     return digest("\0".join(parts))
 
 
+def are_alike(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+    """Whether two records differ in nothing, or in the content of photographs alone."""
+    return {**before, PHOTOGRAPHS: None} == {**now, PHOTOGRAPHS: None}
+
+
+def replaced(before: Mapping[str, Any], now: Mapping[str, Any], views: Sequence[View]) -> list[str]:
+    """Names of photographs that have another content than when maps were made, and can be read.
+
+    Those that were damaged since are none of them: what was made from them is still right.
+    """
+    known = before.get(PHOTOGRAPHS) or {}
+    other = [view for view in views if known.get(view.name, now[PHOTOGRAPHS][view.name]) != now[PHOTOGRAPHS][view.name]]
+    return [view.name for view in other if fault_of(view) is None]
+
+
 def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """How maps were made whose record is another one, in a few words; it is empty if surfkit did not make them."""
     if not before:
@@ -215,37 +239,41 @@ def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return "with other settings"
     if before.get("surfkit") != now["surfkit"]:
         return f"by surfkit {before.get('surfkit', 'of another version')}"
-    if MADE_FROM not in before and {**before, MADE_FROM: now[MADE_FROM]} == now:
+    if MADE_FROM not in before and are_alike({**before, MADE_FROM: now[MADE_FROM]}, now):
         return "by an earlier surfkit, which did not note of which cameras"
-    if {**before, MADE_FROM: None} == {**now, MADE_FROM: None}:
+    if are_alike({**before, MADE_FROM: None}, {**now, MADE_FROM: None}):
         return "from other cameras or sparse points"
     return "of other photographs, or of other sizes"
 
 
-def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str]]:
+def fault_of(view: View) -> BadInput | None:
+    """Why a photograph cannot be read, if it cannot."""
+    try:
+        view_photo(view)
+    except BadInput as error:
+        return error
+    return None
+
+
+def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str], set[str]]:
     """The same input, but that nothing is compared with damaged photographs; and their names.
 
-    A note names each of them. All photographs keep their positions.
+    A note names each of them. All photographs keep their positions. Last are the names of those that the system could
+    not read, as happens when too many files are open or a share is away, and that may be whole.
 
     Raises:
         BadInput: No photograph can be read.
     """
 
-    def fault(view: View) -> str | None:
-        try:
-            view_photo(view)
-        except BadInput as error:
-            return str(error)
-        return None
-
-    views, damaged = given.views, set()
+    views, damaged, passing = given.views, set(), set()
     with ThreadPoolExecutor(4) as pool:
-        for at, (view, error) in enumerate(zip(views, pool.map(fault, views), strict=True)):
+        for at, (view, error) in enumerate(zip(views, pool.map(fault_of, views), strict=True)):
             emit(Progress("looking at photographs", at + 1, len(views)))
             if error is not None:
                 emit(Warned(f"no depth map is made of a damaged photograph: {error}"))
                 damaged.add(view.name)
+                passing |= {view.name} if getattr(error.__cause__, "errno", None) is not None else set()
     if len(damaged) == len(views):
         raise BadInput(f"none of the {len(views)} photographs can be read, {views[0].path} for one")
     whole = {name: seen for name, seen in given.observations.seen.items() if name not in damaged}
-    return replace(given, observations=replace(given.observations, seen=whole)), damaged
+    return replace(given, observations=replace(given.observations, seen=whole)), damaged, passing

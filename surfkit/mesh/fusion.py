@@ -187,6 +187,12 @@ def _corner(at: np.ndarray) -> Corner:
     return x, y, z
 
 
+def forget_spooled(scratch: Path) -> None:
+    """Delete from a folder what `spooled` left there in a process that was killed."""
+    for left in scratch.glob(TILES):
+        shutil.rmtree(left, ignore_errors=True)
+
+
 @contextmanager
 def spooled(task: Task) -> Iterator[Task]:
     """The task with what every view sees on disk, so that it is drawn once however often it is looked at, and compared

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from surfkit.scene.camera import Camera
@@ -39,6 +40,11 @@ class Depths:
         """(V, 3) float64 positions of the cameras."""
         return np.stack([camera.centre.numpy() for camera in self.cameras])
 
+    @cached_property
+    def places(self) -> cKDTree:
+        """The same, to be asked which are near."""
+        return cKDTree(self.centres)
+
 
 def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
     """Positions of up to `count` views that see much of what a view sees, best first.
@@ -55,7 +61,7 @@ def overlapping(at: int, depths: Depths, count: int, angle: float) -> list[int]:
     points, eye = probes(depths.cameras[at], depths.read(at)), depths.centres[at]
     if not len(points):
         return []
-    near = _near(at, depths.centres, float(np.quantile(np.linalg.norm(points - eye, axis=1), 0.9)))
+    near = nearby(at, depths, float(np.quantile(np.linalg.norm(points - eye, axis=1), 0.9)))
     worths = np.array([_worth(points, eye, depths.cameras[other], angle) for other in near])
     covered, chosen = np.zeros(len(points)), []
     while len(chosen) < min(count, len(near)):
@@ -81,11 +87,12 @@ def probes(camera: Camera, depth: Tensor) -> np.ndarray:
     return (local - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _near(at: int, centres: np.ndarray, distance: float) -> list[int]:
+def nearby(at: int, depths: Depths, distance: float) -> list[int]:
     """Other views that stand near enough to see what lies at a distance at less than `WIDEST`, evenly thinned."""
-    apart = np.linalg.norm(centres - centres[at], axis=1)
-    order = np.argsort(apart, kind="stable")
-    found = [int(i) for i in order[apart[order] <= 2 * np.tan(np.radians(WIDEST / 2)) * distance] if i != at]
+    eye, reach = depths.centres[at], 2 * np.tan(np.radians(WIDEST / 2)) * distance
+    around = np.array(depths.places.query_ball_point(eye, reach, return_sorted=True), np.int64)
+    apart = np.linalg.norm(depths.centres[around] - eye, axis=1)
+    found = [int(i) for i in around[np.argsort(apart, kind="stable")] if i != at]
     return found[:: -(-len(found) // CANDIDATES)] if found else []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,10 +92,23 @@ def estimate(splats: Splats, voxel: float, within: tuple[np.ndarray, np.ndarray]
     means = means[((means >= within[0]) & (means <= within[1])).all(1)]
     for level in range(BITS_OF_CELL + 1):
         along = 2**level
-        cells = np.unique(np.floor(means / (voxel * SIDE * along)).astype(np.int64), axis=0)
+        cells = different(np.floor(means / (voxel * SIDE * along)).astype(np.int64))
         if len(means) >= DENSE * len(cells):
             break
     return Estimate(cells, along, THICK * along**2)
+
+
+def different(cells: np.ndarray) -> np.ndarray:
+    """The different rows of (n, 3) int64, in their order."""
+    if not len(cells):
+        return cells
+    low, sides = cells.min(0), tuple((np.ptp(cells, axis=0) + 1).tolist())
+    if math.prod(sides) >= 2**63:
+        return np.unique(cells, axis=0)
+    names = np.unique(
+        np.ravel_multi_index(tuple((cells - low).T), sides)
+    )  # sorting numbers is faster than sorting rows
+    return np.stack(np.unravel_index(names, sides), 1) + low
 
 
 BITS_OF_CELL = 12

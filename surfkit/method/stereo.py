@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from surfkit.core.check import BadInput
 from surfkit.mesh.base import MeshInput
+from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.stereo import Stereo, points
 from surfkit.method.base import Method, MethodInput, Reconstruction
 from surfkit.primitives.model import NEAR
@@ -37,6 +38,7 @@ class StereoFusion(Method):
         def draw(view: object) -> Maps:
             return Maps()  # the mesher puts the depth maps in its place
 
+        forget_spooled(given.folder)
         subject = MeshInput(
             splats=points((), draw),
             views=given.scene.train,

@@ -158,6 +158,6 @@ def groups_of(shots: Sequence[Shot], seen: Mapping[str, tuple[np.ndarray, np.nda
     places = np.repeat(np.arange(len(names)), [len(seen[name][0]) for name in names])
     order = np.argsort(rows, kind="stable")
     starts = np.flatnonzero(np.diff(rows[order], prepend=-1))
-    tracks = np.split(places[order], starts[1:])
-    shuffled = (tracks[at].tolist() for at in np.random.default_rng(0).permutation(len(tracks)))
+    ends, places = np.append(starts[1:], len(rows)), places[order]
+    shuffled = (places[starts[at] : ends[at]].tolist() for at in np.random.default_rng(0).permutation(len(starts)))
     return [[names[at] for at in group] for group in connect_groups(len(names), shuffled)]

@@ -139,6 +139,12 @@ def _beside_changed(old: Mapping[str, Stamp], new: Mapping[str, Stamp]) -> str |
     return None
 
 
+def content_of(view: View) -> str:
+    """A digest of what the files of a photograph and its mask hold, as far as a fingerprint looks at them."""
+    stamps = [_stamp(path, None) for path in (view.path, view.mask) if path is not None]
+    return digest([(stamp.size, stamp.content) for stamp in stamps])
+
+
 def digest(value: Any) -> str:
     """Twenty hex digits for plain data, arrays and dataclasses of them.
 

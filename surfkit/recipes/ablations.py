@@ -226,6 +226,7 @@ WITH_SKY = replace(surface.SURFACE.mesh, sky=True)
 PIXEL_MAPS = replace(WITH_SKY, oversampling=1.0)
 PIXEL_VOXELS = replace(PIXEL_MAPS, voxel_px=1.0)
 CONFIRMED = replace(PIXEL_VOXELS, least_views=0.1, trust=Agreement(alone=0.1))
+SHORT = replace(TSDF(), truncation_voxels=CONFIRMED.truncation_voxels, largest_px=CONFIRMED.largest_px)
 # What is kept is what recipe:surface has, so that its last kept row is that recipe. Stereo alone is fused in the same
 # way; it has no splats, and so no PSNR.
 SURFACE = Table(
@@ -238,6 +239,7 @@ SURFACE = Table(
         Row("+ dense start", {"start": StereoStart(), "pretrain.densify": surface.SURFACE.pretrain.densify}),
         Row("+ stronger depth loss", {"pretrain.losses.depth": surface.SURFACE.pretrain.losses["depth"]}),
         Row("+ no normal consistency", {"pretrain.losses": WITHOUT_NORMALS}),
+        Row("+ shorter truncation, no splats above 64 pixels", {"mesh": SHORT}),
         Row("+ fusion by agreement", {"mesh": CONFIRMED}),
         Row("+ start where no depth is trusted", {"start": surface.SURFACE.start}),
         Row("+ steps for the points in view", {"pretrain.update": surface.SURFACE.pretrain.update}),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from surfkit.evaluate.images.pictures import write_picture
 from surfkit.mesh.base import Mesh, Mesher, MeshInput, require_plain
 from surfkit.mesh.clean import Report, clean
 from surfkit.mesh.files import Format, write_mesh
-from surfkit.mesh.fusion import TILES
+from surfkit.mesh.fusion import forget_spooled
 from surfkit.mesh.shade import from_above, shaded, up_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.mesh.stereo import points
@@ -165,8 +164,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         BadInput: There is no surface, or nothing is left of it.
     """
     began, frame, volume = time.perf_counter(), subject.frame, delivery.volume()
-    for left in run.out.glob(TILES):
-        shutil.rmtree(left)  # of a process that was killed
+    forget_spooled(run.out)
     raw = mesher if isinstance(mesher, Mesh) else mesher.mesh(subject)
     facts = plain_facts(maker_of(run, mesher), raw)
     inside = None if volume is None else lambda local: volume.inside(frame.to_input(local))

@@ -117,7 +117,7 @@ def made_maps(
         emit(Warned(notice))
     if (folder := run.data.path / FOLDER).is_dir():
         emit(Warned(f"{folder} has no map of these photographs, so others are made"))
-    key = key_of(run.recipe.depth, scene, prints, tracks)
+    key = key_of(run.recipe.depth, scene, prints, tracks, preparation.device)
     with maps(preparation, scene, tracks, key, caches.maps_bytes()) as (folder, made):
         count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
         what, cost = f"depth maps of {count} photographs", f"{made.cpu_seconds:.0f} s of CPU time"

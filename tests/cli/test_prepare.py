@@ -171,9 +171,27 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     record.write_text(json.dumps({key: value for key, value in whole.items() if key != "made_from"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     assert "by an earlier surfkit, which did not note of which cameras; --again" in capsys.readouterr().err
+    record.write_text(json.dumps({key: value for key, value in whole.items() if key != "photographs"}))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0, "of before contents were noted"
+    assert json.loads(record.read_text()) == whole
     record.write_text(json.dumps(whole | {"surfkit": "0.0.1"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     assert "made by surfkit 0.0.1; --again" in capsys.readouterr().err
+
+
+def test_maps_of_photographs_that_were_replaced_are_refused(farm, capsys):
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    first, photo = maps(farm), farm / "images" / "view_001.png"
+    with Image.open(photo) as picture:
+        turned = picture.rotate(180)
+    turned.save(photo)
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 2
+    told = capsys.readouterr().err
+    assert "holds depth maps made before 'view_001.png' was replaced by other photographs of the same name" in told
+    assert maps(farm) == first
+    assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 0
+    assert maps(farm)["view_001.png.npy"] != first["view_001.png.npy"]
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
 
 
 @pytest.mark.parametrize(

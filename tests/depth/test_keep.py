@@ -10,14 +10,16 @@ import pytest
 import torch
 from needs import needs_native
 
-from surfkit.core.check import Fault
+from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
-from surfkit.depth import keep
+from surfkit.depth import keep, prepare
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.prepare import Preparation
 from surfkit.readers.data import Data
-from surfkit.readers.made_maps import folder_of
+from surfkit.readers.fingerprint import fingerprint
+from surfkit.readers.made_maps import folder_of, read_made
 from surfkit.readers.read import observations, read
+from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
@@ -132,3 +134,42 @@ def test_maps_larger_than_the_budget_are_told(farm, own_cache):
     count, (told,) = made(farm, budget=1_000)
     assert count == 7 and told.endswith("GB, more than the 1e-06 GB of --prepare-cache, and are kept")
     assert made(farm, budget=1_000) == (7, []), "told when they were made"
+
+
+def test_a_photograph_that_cannot_be_read_for_a_while_is_tried_again(farm, tmp_path):
+    """Too many open files, or a share that is away, say nothing of the photograph."""
+    farm = Data(Path(shutil.copytree(farm.path, tmp_path / "farm")))
+    first, _ = made(farm)
+    whole = files(folder_of("some"))
+    shutil.rmtree(folder_of("some"))
+
+    def away(view):
+        if view.name == "view_003.png":
+            raise BadInput(f"{view.path}: cannot be read") from OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+        return view_photo(view)
+
+    with mock.patch.object(prepare, "view_photo", away):
+        assert made(farm)[0] == first - 1
+    assert read_made(folder_of("some")).without == ()
+    assert made(farm)[0] == first and files(folder_of("some")).keys() == whole.keys()
+    broken = farm.path / "images" / "view_003.png"
+    broken.write_bytes(broken.read_bytes()[:400])
+    shutil.rmtree(folder_of("some"))
+    assert made(farm)[0] == first - 1 and read_made(folder_of("some")).without == ("view_003.png",)
+
+
+def test_maps_of_a_gpu_are_others_than_those_of_a_cpu(farm):
+    scene = read(farm)
+    named = [
+        keep.key_of(FAST, scene, fingerprint(scene), observations(farm, scene), torch.device(device))
+        for device in ("cpu", "cuda:0", "cuda:1")
+    ]
+    assert named[0] != named[1] == named[2]
+
+
+def test_a_smaller_budget_holds_also_where_no_map_is_made(farm):
+    made(farm)
+    other = folder_of("some").with_name("other")
+    shutil.copytree(folder_of("some"), other)
+    assert made(farm)[1] == [] and other.exists()
+    assert made(farm, budget=1) == made(farm) and not other.exists(), "its own maps stay"

@@ -12,7 +12,7 @@ from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
 from surfkit.depth.neighbours import neighbours
-from surfkit.depth.patch_match import PatchMatch, Work
+from surfkit.depth.patch_match import PatchMatch, Work, in_turn
 from surfkit.depth.plane_map import Map, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.native import module
@@ -412,16 +412,28 @@ def test_maps_that_nobody_needs_any_more_are_deleted(farm, tmp_path):
     settings = PatchMatch(coarsest=60, passes=1, neighbours=2, best=1, longest=60)
     found, most, pairs = {}, 0, neighbours(scene.train, tracks, 2, settings.angle)
     given = DepthInput(scene.train, tracks, CPU, tmp_path / "all")
+    left = in_turn(pairs, range(20))
     for estimate in settings.estimate(given, range(20)):
-        found[estimate.at] = estimate
-        left = set(range(estimate.at, 20))
+        assert estimate.at == left[0]
         there = {int(path.stem) for path in (given.work / "comparing-depth-maps-round-2").glob("*.planes")}
-        assert there >= {at for at in left for at in (at, *pairs[at])} & set(range(estimate.at))
+        assert there >= {at for at in left for at in (at, *pairs[at])} & found.keys()
+        found[left.pop(0)] = estimate
         most = max(most, len(list(given.work.rglob("*.planes"))))
     assert 5 < most < 30 and not [path for path in given.work.rglob("*") if path.is_file()]
     alone = DepthInput(scene.train, tracks, CPU, tmp_path / "alone")
     (again,) = settings.estimate(alone, [9])
     assert torch.equal(again.inverse, found[9].inverse) and torch.equal(again.confidence, found[9].confidence)
+
+
+def test_photographs_are_estimated_beside_those_that_they_are_compared_with():
+    """However they are named: maps are kept until the last that is compared with them is done."""
+    row = np.random.default_rng(0).permutation(40).tolist()  # of a flight along a line
+    place = {at: index for index, at in enumerate(row)}
+    pairs = [[row[i] for i in (place[at] - 1, place[at] + 1) if 0 <= i < 40] for at in range(40)]
+    order = in_turn(pairs, range(40))
+    assert order in (row, row[::-1])
+    assert in_turn(pairs, [3, 9]) == [at for at in order if at in (3, 9)]
+    assert sorted(in_turn([[], [2], []], range(3))) == [0, 1, 2]
 
 
 def test_photographs_are_made_smaller_once(farm, tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from needs import needs
 from scipy.spatial import Delaunay
 
 from surfkit.core.check import BadInput
+from surfkit.evaluate.geometry.comparison import usual_visible
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
 from surfkit.evaluate.geometry.visibility import visible, visible_counts
@@ -165,6 +166,21 @@ def test_a_wall_hides_what_is_behind_it():
         assert shown == pytest.approx(expected[1], abs=0.02)  # without the wall all of it is seen
     beside = behind + [0, 12, 0]
     assert not visible_counts(beside, [view], frame, 0.1).all()  # out of the picture
+
+
+def test_more_photographs_do_not_make_the_volume_smaller():
+    """Of a flight that is as wide as before and longer, all that was in the volume still is."""
+    x, y = np.meshgrid(np.arange(-30, 330, 0.5), np.arange(-8, 8, 0.5))
+    ground = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
+
+    def volume(count):
+        views = [overhead(at, 0, 10) for at in np.linspace(0, 1.5 * (count - 1), count)]
+        wanted = CropSettings(usual_visible(count), "z", 2.0, 0.25)
+        return visible_crop(ground, views, Frame(np.zeros(3), 1.0), np.eye(4), wanted)
+
+    few, many = volume(100)[1], volume(200)[1]
+    assert many == pytest.approx(2 * few, rel=0.05)
+    assert [usual_visible(count) for count in (1, 87, 100, 101, 50_000)] == [0.05, 0.05, 0.05, 5, 5]
 
 
 def test_the_volume_ends_where_the_views_do():

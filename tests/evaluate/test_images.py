@@ -6,6 +6,8 @@ import math
 import pytest
 import torch
 
+from surfkit.core.check import BadInput
+from surfkit.evaluate.images import measure
 from surfkit.evaluate.images.measure import evaluate_views, frames_per_second, psnr
 from surfkit.raster.api import Maps
 from surfkit.testing.synthetic import Flight, photograph
@@ -38,6 +40,24 @@ def test_every_view_and_the_means():
     assert images["psnr"] == pytest.approx(sum(v["psnr"] for v in images["per_image"].values()) / 5)
     assert 19 < images["psnr"] < 21 and result["fps"] > 0
     json.dumps(result, allow_nan=False)
+
+
+def test_a_photograph_or_mask_that_cannot_be_read_is_passed_over(monkeypatch):
+    class Files(list):
+        def __getitem__(self, at):
+            if at == self.damaged:
+                raise BadInput(f"{at}: not a whole picture")
+            return super().__getitem__(at)
+
+    skipped = []
+    monkeypatch.setattr(measure, "emit", skipped.append)
+    photos, masks = Files(PHOTOS), Files([torch.ones(24, 32, dtype=torch.bool)] * 5)
+    photos.damaged, masks.damaged = 1, 3
+    images = evaluate_views(VIEWS, photos, drawn, masks=masks)["images"]
+    assert list(images["per_image"]) == [VIEWS[at].name for at in (0, 2, 4)]
+    assert [(event.name, event.reason) for event in skipped] == [
+        (VIEWS[at].name, f"{at}: not a whole picture") for at in (1, 3)
+    ]
 
 
 def test_the_right_photograph_scores_highest():

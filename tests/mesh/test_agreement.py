@@ -10,7 +10,7 @@ from needs import needs_native
 from surfkit.core.check import BadInput
 from surfkit.mesh import native, tsdf
 from surfkit.mesh.agreement import Agreement, compare, compare_in_torch
-from surfkit.mesh.overlap import Depths, overlapping
+from surfkit.mesh.overlap import Depths, nearby, overlapping
 from surfkit.mesh.picture import weighed
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps
@@ -183,6 +183,18 @@ def test_neighbours_look_from_the_wanted_angle_and_see_the_same():
     every = overlapping(0, views, 8, 12.0)
     assert not {1, 6, 7} & set(every) and every[:2] == first, "from half a degree aside, nothing confirms anything"
     assert overlapping(7, views, 8, 12.0) == []
+
+
+def test_nearby_views_are_those_of_a_search_through_all():
+    places = np.random.default_rng(0).uniform(-10, 10, (300, 3)).round(1)  # some as far away as others
+    cameras = [look_at(tuple(place), tuple(place + [0.1, 0.2, 1])) for place in places]
+    views = Depths(cameras, lambda at: torch.zeros(1, 1))
+    for at, reach in ((0, 0.0), (3, 4.0), (7, 30.0)):
+        apart = np.linalg.norm(views.centres - views.centres[at], axis=1)
+        order = np.argsort(apart, kind="stable")
+        most = 2 * np.tan(np.radians(22.5)) * reach
+        found = [int(i) for i in order if apart[i] <= most and i != at]
+        assert nearby(at, views, reach) == found[:: -(-len(found) // 128) or 1]
 
 
 def test_alpha_spread_and_priors_tell():

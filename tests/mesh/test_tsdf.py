@@ -17,7 +17,7 @@ from surfkit.mesh.lattice import SIDE, Lattice, least_slant
 from surfkit.mesh.lengths import LEAST_CUT, without_hidden
 from surfkit.mesh.picture import depth_of, picture
 from surfkit.mesh.reference import ReferenceGrid, unpack
-from surfkit.mesh.tiles import Box
+from surfkit.mesh.tiles import Box, different
 from surfkit.mesh.tsdf import TSDF
 from surfkit.raster.api import Maps, Splats
 from surfkit.scene.camera import Camera
@@ -201,6 +201,14 @@ def test_the_estimate_is_of_the_right_size():
             made.fuse(view, False)
         found = estimate(given.splats, voxel, (np.full(3, -2.0), np.full(3, 2.0))).total
         assert 0.6 < found / made.blocks < 2.5, (voxel, found, made.blocks)
+
+
+def test_blocks_are_counted_once_however_far_apart_they_are():
+    draw = np.random.default_rng(0)
+    for spread in (3, 10**6, 2**40):
+        cells = draw.integers(-spread, spread, (500, 3)).repeat(2, 0)
+        assert np.array_equal(different(cells), np.unique(cells, axis=0))
+    assert different(np.zeros((0, 3), np.int64)).shape == (0, 3)
 
 
 def test_progress_is_told():

@@ -349,13 +349,23 @@ def test_recipes_of_before_are_read_as_splatting(data, tmp_path):
     assert plain.pop("method") == {"use": "splats"} and load(Recipe, plain) == SURFACE
 
 
-def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys):
+def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys, monkeypatch):
     """The same triangles as `mesh:stereo` makes for a run of splats, and a clear word where there are no maps."""
     mesher = Stereo(min_confidence=0.1, fusion=TSDF())
     splats = evolve(Recipe(depth=SWEEP, pretrain=replace(Recipe().pretrain, steps=1), mesh=mesher), "seed", 0)
     run(splats, data, tmp_path / "splats")
     alone = Recipe(depth=SWEEP, method=StereoFusion(mesher=mesher))
+    left = tmp_path / "alone" / "method" / ".tiles-killed"
+
+    def killed(self, given):
+        left.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Stereo, "mesh", killed)
+        run(alone, data, tmp_path / "alone")
     metrics = run(alone, data, tmp_path / "alone")
+    assert not left.exists()
     assert (tmp_path / "alone" / "mesh.ply").read_bytes() == (tmp_path / "splats" / "mesh.ply").read_bytes()
     assert metrics["points"] is None and metrics["prepare_cpu_seconds"] > 0
     assert not (tmp_path / "alone" / "pretrain").exists()

@@ -36,8 +36,9 @@ AUTO_TAU = 1.5
 """Of the mean distance between neighbours in the truth (CityGaussianV2)."""
 OFF, FAR_OFF = 2.0, 10.0
 """Thresholds by which half of both clouds miss each other where frames or units may differ, and where they must."""
-SHARE = 0.05
-"""Of the training views, that must see a point of the truth by default."""
+SHARE, ENOUGH = 0.05, 5
+"""Of the training views, that must see a point of the truth by default; and the number that is enough in any case: how
+many photographs show a place depends on their overlap, not on the size of the survey."""
 RESIZED = 0.02
 """Change of scale by ICP above which a warning is printed."""
 SHORTEST, FURTHEST = 1e-7, 1e4
@@ -87,7 +88,7 @@ class Comparison:
 
     visible: float | None = None
     """Training views that must see a point for it to be in the volume of `--crop auto`: a share of all up to 1, or a
-    number from 2 on. Default: a share of 0.05."""
+    number from 2 on. Default: a share of 0.05, at most 5 of them."""
 
     radius: float | None = None
     """Radius of the alpha shape around the visible ground, in units of the ground truth. Default: 2 % of the
@@ -304,8 +305,13 @@ def volume(
             "--crop auto needs the photographs: name a run folder, give --views with a run folder or a data set, or "
             "give --crop a file of Tanks and Temples, or --crop none"
         )
-    wanted = CropSettings(settings.visible or SHARE, settings.up or "z", settings.radius, tau)
+    wanted = CropSettings(settings.visible or usual_visible(len(views)), settings.up or "z", settings.radius, tau)
     return visible_crop(truth, views, frame, matrix, wanted)
+
+
+def usual_visible(views: int) -> float:
+    """Which views must see a point, as `CropSettings` has it, where nothing is said."""
+    return SHARE if SHARE * views <= ENOUGH else ENOUGH
 
 
 def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:

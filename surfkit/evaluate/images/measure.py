@@ -84,7 +84,7 @@ def evaluate_views(
 ) -> dict[str, Any]:
     """Mean PSNR and SSIM, both of each view under "per_image", and frames a second; None where there are no views.
 
-    A photograph that cannot be read is left out, and `PhotoSkipped` tells so.
+    A photograph that cannot be read, or whose mask cannot, is left out, and `PhotoSkipped` tells so.
 
     Args:
         views: Held-out views.
@@ -100,11 +100,11 @@ def evaluate_views(
     per_image = {}
     for at, view in enumerate(views):
         try:
-            photo = photos[at]
+            photo, mask = photos[at], None if masks is None else masks[at]
         except BadInput as error:
             emit(PhotoSkipped(view.name, str(error)))
             continue
-        maps, mask = draw(view), None if masks is None else masks[at]
+        maps = draw(view)
         if mask is None or mask.any():
             render, target = maps.color.clamp(0, 1), photo.to(maps.color) / 255
             mask = None if mask is None else mask.to(render.device)

@@ -28,7 +28,7 @@ def measure_parts(
 ) -> dict[str, dict[str, Any]]:
     """PSNR and SSIM of each part, as means over photographs that count by their pixels in it, and its share of all.
 
-    A photograph that cannot be read is left out, and `PhotoSkipped` tells so.
+    A photograph that cannot be read, or whose mask cannot, is left out, and `PhotoSkipped` tells so.
 
     Args:
         found: What the photographs show.
@@ -41,11 +41,10 @@ def measure_parts(
     total = 0
     for counted in found:
         try:
-            photo = photo_of(counted)
+            photo, keep = photo_of(counted), mask_of(counted)
         except BadInput as error:
             emit(PhotoSkipped(counted.view.name, str(error)))
             continue
-        keep = mask_of(counted)
         render = draw(counted.view).color.cpu().clamp(0, 1)
         target = photo.to(render) / 255
         total += target[0].numel() if keep is None else int(keep.sum())
