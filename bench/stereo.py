@@ -97,12 +97,19 @@ class Group:
         return found
 
 
+def estimator_of(engine: str, side: int, best: int | None) -> DepthEstimator:
+    """The estimator of an engine for maps of a longest side; `best` is a setting of patch-match, None leaves it."""
+    return ENGINES[engine](longest=side, **({} if best is None or engine == TORCH else {"best": best}))
+
+
 def alone(engine: str, side: int, folder: Path, options: argparse.Namespace) -> dict:
     """Time, memory, quality and digest, in a process that does nothing else; the maps go into the folder."""
-    Group(options.data, 3, WARM, folder).maps(ENGINES[engine](longest=WARM))
+    Group(options.data, 3, WARM, folder).maps(estimator_of(engine, WARM, options.best))
     some, kept = Group(options.data, options.views, side, folder), []
     before = rss()
-    seconds = cpu_seconds(lambda: kept.append(some.maps(ENGINES[engine](longest=side))), options.rounds, warm=0)
+    seconds = cpu_seconds(
+        lambda: kept.append(some.maps(estimator_of(engine, side, options.best))), options.rounds, warm=0
+    )
     peak, maps = rss() - before, kept[-1]
     np.save(folder / f"{engine}-{side}.npy", maps)
     return {
@@ -152,6 +159,7 @@ def apart(engine: str, side: int, threads: int, folder: Path, options: argparse.
     """What `alone` gives in a process of its own."""
     words = ["--part", engine, str(side), str(folder), "--threads", str(threads), "--data", str(options.data)]
     words += ["--views", str(options.views), "--rounds", str(options.rounds)]
+    words += [] if options.best is None else ["--best", str(options.best)]
     calm = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}  # threads that wait would count as work
     done = subprocess.run([sys.executable, __file__, *words], stdout=subprocess.PIPE, text=True, check=True, env=calm)
     return json.loads(done.stdout.splitlines()[-1])
@@ -198,6 +206,10 @@ def main() -> None:
     parser.add_argument("--sides", type=int, nargs="+", default=[480, 960, 1920], help="longest sides, pixels")
     parser.add_argument("--rounds", type=int, default=3, help="the median of so many counts")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument(
+        "--best", type=int, help="photographs that score a plane in patch-match; its default if left out"
+    )
+    parser.add_argument("--name", default="stereo", help="of the file in bench/results")
     parser.add_argument("--part", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -210,7 +222,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         figures = measured(options, Path(folder))
     about = {"data": options.data.resolve().name, "rounds": options.rounds}
-    print(f"wrote {save('stereo', about | figures)}")
+    about |= {} if options.best is None else {"best": options.best}
+    print(f"wrote {save(options.name, about | figures)}")
 
 
 if __name__ == "__main__":

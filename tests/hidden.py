@@ -1,6 +1,6 @@
 """Collects the suite as machines would that lack a package, or where one does not load.
 
-    python tests/hidden.py FOLDER [FAULT:PACKAGE[,PACKAGE...]]...
+    python tests/hidden.py FOLDER[:FOLDER...] [FAULT:PACKAGE[,PACKAGE...]]...
 
 A FAULT is `missing`, or what importing the package raises: `ImportError` or `OSError`. All that is slow to import is
 loaded once, and a process is forked from there for every case, which begins with a line `== CASE` and ends with a line
@@ -51,17 +51,17 @@ def hide(fault: str, packages: Sequence[str]) -> None:
         sys.meta_path.insert(0, Broken(packages, RAISED[fault](LIBUSB)))
 
 
-def asking(folder: str) -> list[str]:
+def asking(folders: Sequence[str]) -> list[str]:
     """The files of tests that ask for an optional package, and one that does not.
 
     To lack one package more is nothing new to others, which are collected where all are missing.
     """
-    paths = sorted(Path(folder).rglob("test_*.py"))
+    paths = sorted(path for folder in folders for path in Path(folder).rglob("test_*.py"))
     return [str(path) for path in paths if path.name == "test_check.py" or re.search(r"\bneeds\(", path.read_text())]
 
 
-def main(folder: str, cases: Sequence[str], compiled: str) -> None:
-    """Collect the tests of a folder in each case; `compiled` is a folder for the files that Python makes of them."""
+def main(folders: Sequence[str], cases: Sequence[str], compiled: str) -> None:
+    """Collect the tests of folders in each case; `compiled` is a folder for the files that Python makes of them."""
     import pytest
 
     import surfkit
@@ -81,7 +81,7 @@ def main(folder: str, cases: Sequence[str], compiled: str) -> None:
             gc.disable()  # it would walk through all that the parent has loaded
             hide(fault, packages.split(","))
             words = ["--collect-only", "-qq", "--tb=short", "--assert=plain", "-p", "no:cacheprovider"]
-            status = pytest.main([*words, *(asking(folder) if packages in optional else [folder])])
+            status = pytest.main([*words, *(asking(folders) if packages in optional else folders)])
             sys.stdout.flush()
             os._exit(status)
         print(f"== {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])}", flush=True)
@@ -89,4 +89,4 @@ def main(folder: str, cases: Sequence[str], compiled: str) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as compiled:
-        main(sys.argv[1], sys.argv[2:], compiled)
+        main(sys.argv[1].split(os.pathsep), sys.argv[2:], compiled)

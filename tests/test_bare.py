@@ -20,6 +20,8 @@ from surfkit.core.optional import INSTALLED_AS
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 TESTS = Path(__file__).parent
+PLUGINS = TESTS.parent / "plugins"
+SUITE = (TESTS, PLUGINS)
 TOOLS = {"mkdocs-material", "nvidia-cuda-nvrtc", "pre-commit", "pytest", "pytest-xdist", "ruff"}
 """Packages that no test imports."""
 EXTRAS = [line for line in importlib.metadata.requires("surfkit") if "extra ==" in line]
@@ -35,7 +37,7 @@ CASES += [f"ImportError:{EVERYTHING},{NATIVE}", f"OSError:{EVERYTHING}"]
 @pytest.fixture(scope="module")
 def collected():
     """By case, what pytest said, and its exit status."""
-    words = [sys.executable, str(TESTS / "hidden.py"), str(TESTS), *CASES]
+    words = [sys.executable, str(TESTS / "hidden.py"), os.pathsep.join(map(str, SUITE)), *CASES]
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     env |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "OMP_NUM_THREADS": "1"}
     said = subprocess.run(words, cwd=TESTS.parent, env=env, capture_output=True, text=True, check=True).stdout
@@ -47,7 +49,7 @@ def collected():
 def test_the_suite_is_collected(collected, case):
     text, status = collected[case]
     assert status == 0, text[-3000:]
-    assert "tests/core/test_check.py: " in text
+    assert "tests/core/test_check.py: " in text and ("plugins/" in text or "," not in case)
     for file, package in {
         "test_fuzz.py": "hypothesis",
         "execute/test_ray.py": "ray",
@@ -72,7 +74,8 @@ def unguarded(source):
 
 
 def test_tests_ask_for_optional_packages_in_one_way():
-    found = {str(path.relative_to(TESTS)): list(unguarded(path.read_text())) for path in TESTS.rglob("*.py")}
+    files = [path for folder in (TESTS, *PLUGINS.glob("*/tests")) for path in folder.rglob("*.py")]
+    found = {str(path.relative_to(PLUGINS.parent)): list(unguarded(path.read_text())) for path in files}
     assert not {name: wrong for name, wrong in found.items() if wrong}
     seen = "import os, ray\nfrom trimesh.creation import box\ndef f():\n    open3d = pytest.importorskip('open3d')"
     assert list(unguarded(seen)) == ["ray", "trimesh.creation", "importorskip"]

@@ -204,11 +204,11 @@ def test_classes_by_views_are_those_of_exact_rays():
         inside = (local[:, 2] > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
         counts += inside & exact_visible(truth + [0, 0, 0.02], -pose[:3, :3].T @ pose[:3, 3])
     exact = np.searchsorted(SEEN_FROM, counts, "right") - 1
-    assert min(np.bincount(exact, minlength=4)) > 100
+    assert min(np.bincount(exact, minlength=5)) > 100
     # the box and the ball are thinned to voxels, so that a few points of theirs lie within
     ground = truth[:, 2] == 0
     assert (views.truth == exact)[ground].mean() > 0.9
-    assert np.abs(views.truth - exact)[ground].max() <= 2
+    assert (np.abs(views.truth - exact)[ground] <= 1).mean() > 0.99
 
 
 def test_the_rim_of_a_plate_is_near_an_edge_and_its_middle_is_not():

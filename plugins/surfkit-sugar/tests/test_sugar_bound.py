@@ -19,6 +19,7 @@ from surfkit import BadInput, Mesh, Mesher, MeshInput, Recipe, Splats, Stage, co
 from surfkit.blocks.schedule import Compute
 from surfkit.core.registry import plugins
 from surfkit.densify.adc import ADC
+from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.export.ply import read_splats
 from surfkit.mesh.poisson import require_open3d
 from surfkit.mesh.simplify import require_simplification
@@ -299,7 +300,7 @@ def test_a_run_gives_the_moved_mesh_and_splats_that_lie_on_it(finished):
     centres = scene.frame.to_input(vertices[faces].mean(1).double())
     assert np.allclose(points.double(), centres, atol=1e-5)
     assert torch.allclose(params["means"], vertices[faces].mean(1), atol=1e-6), "also where nothing is drawn"
-    written = read_mesh(finished / "mesh.ply")
+    written = read_surface(finished / "mesh.ply").vertices()
     assert np.allclose(sorted(written.tolist()), sorted(scene.frame.to_input(vertices.double()).tolist()), atol=1e-5)
     metrics = json.loads((finished / "metrics.json").read_text())
     assert metrics["before"]["refine0"]["points"] == 200 and metrics["points"] == 98
@@ -322,9 +323,3 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(finished, data, tmp_path, m
     for name in ("point_cloud.ply", "mesh.ply", "refine0/before.json"):
         assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
     assert metrics["before"] == json.loads((finished / "metrics.json").read_text())["before"]
-
-
-def read_mesh(path) -> np.ndarray:
-    import trimesh
-
-    return np.asarray(trimesh.load(path, process=False).vertices)

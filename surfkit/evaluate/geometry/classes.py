@@ -29,8 +29,8 @@ LEVEL_COSINE = 0.5
 NONE = -1
 """Class of a point that belongs to none."""
 SURFACES = ("roof", "facade", "ground")
-VIEWS = ("0-1", "2", "3-5", "6 or more")
-SEEN_FROM = (0, 2, 3, 6)
+VIEWS = ("0", "1", "2", "3-5", "6 or more")
+SEEN_FROM = (0, 1, 2, 3, 6)
 """Views that a point of each class is seen by, or more."""
 EDGES = ("near", "away")
 SEAMS = ("near", "elsewhere")

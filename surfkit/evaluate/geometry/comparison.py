@@ -99,7 +99,7 @@ class Comparison:
     of a georeferenced frame, otherwise the vertical direction that the cameras suggest."""
 
     classes: bool = True
-    """Also compute precision, recall and F1 for classes of points: roofs, facades, ground; seen by 0-1, 2, 3-5, 6 or
+    """Also compute precision, recall and F1 for classes of points: roofs, facades, ground; seen by 0, 1, 2, 3-5, 6 or
     more training views; near depth edges and away from them; near block borders (--seams)."""
 
     far: float | None = None
