@@ -79,7 +79,8 @@ class Depth:
         """Estimate what is not there, and return what was estimated.
 
         Args:
-            renew: Estimate maps again that surfkit made otherwise: with other settings, or of other cameras.
+            renew: Estimate maps again that surfkit made otherwise: with other settings, of other cameras, or of
+                photographs that have changed since.
 
         Raises:
             BadInput: There are maps that are not to be replaced, or nothing can be estimated.
@@ -94,8 +95,7 @@ class Depth:
         with locked(self.folder):
             sweep(self.folder)
             with bars():
-                again = self.again or (renew and preparation.is_outdated(given))
-                given, wanted = preparation.begin(scene, given, again)
+                given, wanted = preparation.begin(scene, given, self.again, renew)
             if there := len(views) - len(preparation.lacking(scene)):
                 print(f"{there} of {len(views)} photographs have depth maps already", file=sys.stderr)
             done = with_progress(preparation.run(scene, given, wanted), len(wanted))

@@ -185,7 +185,7 @@ def maps_before(scene: Path) -> dict[str, Any] | None:
 
 
 def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
-    """Say that the depth maps of a scene were made from other cameras than it has now, if so."""
+    """Say that the depth maps of a scene were made from other cameras or photographs than it has now, if so."""
     data = Data(scene)
     try:
         preparation = DepthMaps(data, load(DepthEstimator, maps.get("estimator")), torch.device("cpu"))
@@ -193,8 +193,8 @@ def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
     except BadInput:  # of an estimator that is not here, or that the photographs do not suit any more
         outdated = True
     if outdated:
-        text = f"{scene / FOLDER} has depth maps of other cameras, which training would use; depth:NAME renews them"
-        emit(Warned(text))
+        what = "has depth maps of other cameras or photographs, which training would use"
+        emit(Warned(f"{scene / FOLDER} {what}; depth:NAME renews them"))
 
 
 def _view(photo: Photo, width: int, height: int) -> View:

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import torch
 
-from surfkit.core.check import BadInput, Fault
+from surfkit.core.check import BadInput, Fault, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import DISK_FULL, sweep
 from surfkit.core.lock import USED, is_used, lock_holder, locked, mark_used
 from surfkit.depth.base import DepthEstimator
-from surfkit.depth.prepare import Preparation, without_damaged
+from surfkit.depth.prepare import Preparation, fault_of, without_damaged
 from surfkit.readers.depth_files import FOLDER, RECORD, is_whole, map_path, read_record, write_record
 from surfkit.readers.fingerprint import Fingerprint, digest
 from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
@@ -82,6 +82,7 @@ def maps(
     with ExitStack() as use:
         with hold_folder(folder, preparation.data.path):
             sweep(folder)
+            forget_incomplete(folder, scene)
             use.enter_context(mark_used(folder))
             with full_cache_in_one_line(folder):
                 fresh, made = make_missing(preparation, scene, tracks)
@@ -147,20 +148,35 @@ def make_missing(preparation: Preparation, scene: Scene, tracks: Observations) -
         if not is_known:
             write_record(folder, preparation.record(preparation.material(scene, tracks)))
         return False, replace(made, maps=count)
-    given, damaged, passing = without_damaged(preparation.material(scene, tracks))
+    given, damaged, unread = without_damaged(preparation.material(scene, tracks))
     preparation.open(preparation.record(given))
     wanted = [at for at, name in enumerate(names) if name in lacking and name not in damaged]
-    made = replace(made, maps=count, without=(*made.without, *sorted((damaged - passing) & lacking)))
+    without = (*made.without, *sorted(damaged & lacking))
+    made = replace(made, maps=count, without=without, unread=tuple(sorted({*made.unread, *unread})))
     write_made(folder, made)
     begun, before, total = time.process_time(), made.cpu_seconds, count + len(wanted)
     emit(Progress("depth maps", count, total))
     for done, step in enumerate(preparation.run(scene, given, wanted), 1):
         none = (step.view.name,) if step.coverage is None else ()
         spent = before + time.process_time() - begun
-        made = Made(made.maps + 1 - len(none), spent, (*made.without, *none))
+        made = replace(made, maps=made.maps + 1 - len(none), cpu_seconds=spent, without=(*made.without, *none))
         write_made(folder, made)
         emit(Progress("depth maps", count + done, total))
     return True, made
+
+
+def forget_incomplete(folder: Path, scene: Scene) -> None:
+    """Delete maps, if unused, that were made without photographs which could not be read then, and can be now.
+
+    Each depends on the photographs that it was compared with, and the name of the folder says that these were all.
+    """
+    unread = set(read_made(folder).unread)
+    found = [view.name for view in scene.train if view.name in unread and fault_of(view) is None]
+    if not found or is_used(folder):
+        return
+    emit(Warned(f"{few(found)} could not be read before, and can be now: all depth maps are made anew"))
+    shutil.rmtree(folder / FOLDER, ignore_errors=True)
+    write_made(folder, Made())
 
 
 def damaged_maps(preparation: Preparation, scene: Scene) -> list[str]:
@@ -203,9 +219,10 @@ def make_room(mine: Path, budget_bytes: int) -> int:
 def folder_bytes(folder: Path) -> int:
     """Bytes of the files in a folder."""
     found = 0
-    for path in folder.rglob("*"):
-        with suppress(OSError):  # another process has just deleted it
-            found += path.stat().st_size if path.is_file() else 0
+    for place, _, names in os.walk(folder):  # which passes over what another process has just deleted
+        for name in names:
+            with suppress(OSError):
+                found += os.stat(os.path.join(place, name)).st_size
     return found
 
 

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from surfkit.core.events import Progress, emit
 from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS
 from surfkit.scene.observations import Observations
-from surfkit.scene.parallax import degrees_between, worth
+from surfkit.scene.parallax import degrees_between, least_apart, worth
 from surfkit.scene.scene import View
 
 SAME_SIDE = 0.8
@@ -46,9 +47,11 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
     for at in range(len(views)):
         part = slice(*shared.indptr[at : at + 2])
         others, counts = shared.indices[part], shared.data[part]
+        apart = np.linalg.norm(centres[others] - centres[at], axis=1)
+        far = (others != at) & (apart >= least_apart(_nearest(observations.xyz[seen[at]], centres[at]), angle))
         order = np.lexsort((others, -counts))
         worths: dict[int, float] = {}
-        for other in (int(other) for other in others[order] if other != at):
+        for other in (int(other) for other in others[order[far[order]]]):
             both = np.intersect1d(seen[at], seen[other], assume_unique=True)
             if value := _worth(observations.xyz[both], centres[at], centres[other], angle):
                 worths[other] = value
@@ -57,6 +60,19 @@ def neighbours(views: Sequence[View], observations: Observations, count: int, an
         chosen.append(_spread(worths, {other: centres[other] - centres[at] for other in worths}, count))
         emit(Progress("choosing what to compare", at + 1, len(views)))
     return chosen
+
+
+def in_turn(pairs: Sequence[Sequence[int]], wanted: Sequence[int]) -> list[int]:
+    """The wanted views, those that are compared with one another close together (Cuthill and McKee 1969).
+
+    Maps of a view are kept until the last view is done that is compared with it, so the disk that they take is that of
+    a line through the scene and not of a scene whose photographs are named in any order.
+    """
+    ends = np.cumsum([0, *map(len, pairs)])
+    others = np.concatenate([np.asarray(each, np.int32) for each in pairs]) if ends[-1] else np.zeros(0, np.int32)
+    graph = csr_matrix((np.ones(len(others), np.int8), others, ends), (len(pairs), len(pairs)))
+    order, chosen = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True), set(wanted)
+    return [at for at in order.tolist() if at in chosen]
 
 
 def depth_range(view: View, observations: Observations, margin: float) -> tuple[float, float] | None:
@@ -88,6 +104,12 @@ def _spread(worths: dict[int, float], baselines: dict[int, np.ndarray], count: i
             cosine = a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12)
             left[other] *= 1 - SAME_SIDE * max(cosine, 0)
     return chosen
+
+
+def _nearest(xyz: np.ndarray, place: np.ndarray) -> float:
+    """Distance from a place that all points but a few outliers exceed; 0 where there is no point."""
+    distances = np.linalg.norm(xyz[np.isfinite(xyz).all(1)] - place, axis=1)
+    return float(np.quantile(distances, OUTLIERS)) if len(distances) else 0.0
 
 
 def _worth(xyz: np.ndarray, one: np.ndarray, other: np.ndarray, angle: float) -> float:

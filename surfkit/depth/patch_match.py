@@ -11,8 +11,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
@@ -23,7 +21,7 @@ from surfkit.depth.consistency import agreement, at_edge
 from surfkit.depth.cuda.passes import GpuPasses
 from surfkit.depth.matching import ray_map
 from surfkit.depth.native import Grey, Planes, Terms, improve, require_native
-from surfkit.depth.neighbours import depth_range, neighbours
+from surfkit.depth.neighbours import depth_range, in_turn, neighbours
 from surfkit.depth.plane_map import Map, inverse_of, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep, refuse_wide_window
 from surfkit.scene.camera import Camera
@@ -378,19 +376,6 @@ class Work:
             window=settings.window,
             survey=False,
         )
-
-
-def in_turn(pairs: Sequence[Sequence[int]], wanted: Sequence[int]) -> list[int]:
-    """The wanted views, those that are compared with one another close together (Cuthill and McKee 1969).
-
-    Maps of a view are kept until the last view is done that is compared with it, so the disk that they take is that of
-    a line through the scene and not of a scene whose photographs are named in any order.
-    """
-    ends = np.cumsum([0, *map(len, pairs)])
-    others = np.concatenate([np.asarray(each, np.int32) for each in pairs]) if ends[-1] else np.zeros(0, np.int32)
-    graph = csr_matrix((np.ones(len(others), np.int8), others, ends), (len(pairs), len(pairs)))
-    order, chosen = reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True), set(wanted)
-    return [at for at in order.tolist() if at in chosen]
 
 
 def parallax_of(here: Grey, others: Sequence[Grey], planes: Planes) -> float:

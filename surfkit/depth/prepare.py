@@ -40,7 +40,7 @@ WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one 
 """What photographs do that are compared and give no depth."""
 MADE_FROM, PHOTOGRAPHS = "made_from", "photographs"
 """In the record: from which cameras and sparse points, as a digest, which is also a file in the folder for work; and of
-each photograph the content of its files."""
+each photograph the content of its file."""
 
 
 @dataclass(frozen=True)
@@ -107,31 +107,36 @@ class Preparation:
                 f"`surfkit prepare points {self.data.path}` makes a data set with such points"
             )
 
-    def begin(self, scene: Scene, given: DepthInput, again: bool) -> tuple[DepthInput, list[int]]:
+    def begin(self, scene: Scene, given: DepthInput, again: bool, renew: bool = False) -> tuple[DepthInput, list[int]]:
         """What the estimator works from without damaged photographs, and the positions that are still to be estimated.
 
         Args:
             scene: Of the data set.
             given: What the estimator would work from if all photographs were whole.
             again: Whether to delete the maps that are there.
+            renew: Whether to delete them if surfkit made them otherwise.
 
         Raises:
-            BadInput: There are maps that something else made, or other settings; or no photograph can be read.
+            BadInput: There are maps that something else made, or other settings, or from photographs that have changed
+                since; or no photograph can be read.
         """
         root, views = self.place, given.views
         record, before = self.record(given), read_record(root)
         paths = [map_path(root, view.name) for view in views]
-        if not again and not are_alike(before, record) and (before or any(path.exists() for path in paths)):
+        alike, names = are_alike(before, record), [] if again else replaced(before, record, views)
+        again = again or (renew and bool(before) and (not alike or bool(names)))
+        if not again and not alike and any((root / FOLDER).rglob("*.npy")):
             raise BadInput(
                 f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
             )
-        if not again and (names := replaced(before, record, views)):
+        if not again and names:
             raise BadInput(
                 f"{root / FOLDER} holds depth maps made before {few(names)} {'was' if len(names) == 1 else 'were'} "
-                "replaced by other photographs of the same name; --again makes all maps anew"
+                "changed, or replaced by other photographs of the same name; --again makes all maps anew"
             )
+        known = {} if again else before.get(PHOTOGRAPHS) or {}
         damaged: set[str] = set()
-        if again or self.lacking(scene):
+        if again or self.lacking(scene) or not known.keys() >= {view.name for view in views}:
             given, damaged, _ = without_damaged(given)
         if again:
             for path in paths:
@@ -140,7 +145,6 @@ class Preparation:
                 normal_path(path).unlink(missing_ok=True)
         if again or not are_alike(before, record):
             shutil.rmtree(self.work, ignore_errors=True)
-        known = {} if again else before.get(PHOTOGRAPHS) or {}
         now = record[PHOTOGRAPHS].items()
         record[PHOTOGRAPHS] = {name: known.get(name, it) for name, it in now if name in known or name not in damaged}
         self.open(record)
@@ -164,14 +168,14 @@ class Preparation:
     def record(self, given: DepthInput) -> dict[str, Any]:
         """What depth.json says of the maps."""
         views = given.views
-        return {
+        content = {} if self.root else {PHOTOGRAPHS: {view.name: content_of(view) for view in views}}
+        return content | {  # of maps in the cache, the name of the folder tells it
             "estimator": dump(self.estimator),
             "surfkit": own_version(),
             "aligned": self.estimator.aligned,
             "longest": max((max(view.camera.width, view.camera.height) for view in views), default=0),
             "matched": [view.name for view in views] if self.estimator.matched else None,
             MADE_FROM: made_from(given),
-            PHOTOGRAPHS: {view.name: content_of(view) for view in views},
         }
 
     def run(self, scene: Scene, given: DepthInput, wanted: Sequence[int]) -> Iterator[Prepared]:
@@ -228,7 +232,7 @@ def replaced(before: Mapping[str, Any], now: Mapping[str, Any], views: Sequence[
     """
     known = before.get(PHOTOGRAPHS) or {}
     other = [view for view in views if known.get(view.name, now[PHOTOGRAPHS][view.name]) != now[PHOTOGRAPHS][view.name]]
-    return [view.name for view in other if fault_of(view) is None]
+    return [view.name for view, fault in faults_of(other) if fault is None]
 
 
 def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -255,6 +259,14 @@ def fault_of(view: View) -> BadInput | None:
     return None
 
 
+def faults_of(views: Sequence[View]) -> Iterator[tuple[View, BadInput | None]]:
+    """The same of many photographs, with progress."""
+    with ThreadPoolExecutor(4) as pool:
+        for at, (view, fault) in enumerate(zip(views, pool.map(fault_of, views), strict=True), 1):
+            emit(Progress("looking at photographs", at, len(views)))
+            yield view, fault
+
+
 def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str], set[str]]:
     """The same input, but that nothing is compared with damaged photographs; and their names.
 
@@ -264,16 +276,14 @@ def without_damaged(given: DepthInput) -> tuple[DepthInput, set[str], set[str]]:
     Raises:
         BadInput: No photograph can be read.
     """
-
-    views, damaged, passing = given.views, set(), set()
-    with ThreadPoolExecutor(4) as pool:
-        for at, (view, error) in enumerate(zip(views, pool.map(fault_of, views), strict=True)):
-            emit(Progress("looking at photographs", at + 1, len(views)))
-            if error is not None:
-                emit(Warned(f"no depth map is made of a damaged photograph: {error}"))
-                damaged.add(view.name)
-                passing |= {view.name} if getattr(error.__cause__, "errno", None) is not None else set()
+    views, damaged, unread = given.views, set(), set()
+    for view, fault in faults_of(views):
+        if fault is not None:
+            passing = getattr(fault.__cause__, "errno", None) is not None
+            emit(Warned(f"no depth map is made of a {'' if passing else 'damaged '}photograph: {fault}"))
+            damaged.add(view.name)
+            unread |= {view.name} if passing else set()
     if len(damaged) == len(views):
         raise BadInput(f"none of the {len(views)} photographs can be read, {views[0].path} for one")
     whole = {name: seen for name, seen in given.observations.seen.items() if name not in damaged}
-    return replace(given, observations=replace(given.observations, seen=whole)), damaged, passing
+    return replace(given, observations=replace(given.observations, seen=whole)), damaged, unread

@@ -102,13 +102,12 @@ def different(cells: np.ndarray) -> np.ndarray:
     """The different rows of (n, 3) int64, in their order."""
     if not len(cells):
         return cells
-    low, sides = cells.min(0), tuple((np.ptp(cells, axis=0) + 1).tolist())
+    low = cells.min(0)
+    sides = tuple(int(a) - int(b) + 1 for a, b in zip(cells.max(0), low, strict=True))  # without end, as int64 is not
     if math.prod(sides) >= 2**63:
         return np.unique(cells, axis=0)
-    names = np.unique(
-        np.ravel_multi_index(tuple((cells - low).T), sides)
-    )  # sorting numbers is faster than sorting rows
-    return np.stack(np.unravel_index(names, sides), 1) + low
+    names = np.ravel_multi_index(tuple((cells - low).T), sides)
+    return np.stack(np.unravel_index(np.unique(names), sides), 1) + low  # numbers are sorted faster than rows
 
 
 BITS_OF_CELL = 12

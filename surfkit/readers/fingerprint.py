@@ -140,9 +140,9 @@ def _beside_changed(old: Mapping[str, Stamp], new: Mapping[str, Stamp]) -> str |
 
 
 def content_of(view: View) -> str:
-    """A digest of what the files of a photograph and its mask hold, as far as a fingerprint looks at them."""
-    stamps = [_stamp(path, None) for path in (view.path, view.mask) if path is not None]
-    return digest([(stamp.size, stamp.content) for stamp in stamps])
+    """A digest of what the file of a photograph holds, as far as a fingerprint looks at it."""
+    stamp = _stamp(view.path, None)
+    return digest([stamp.size, stamp.content])
 
 
 def digest(value: Any) -> str:

@@ -24,11 +24,13 @@ class Made:
         maps: How many there are.
         cpu_seconds: CPU time that making them has taken so far.
         without: Names of the photographs of which none could be made.
+        unread: Names of those of them that the system could not read then, and that may be whole.
     """
 
     maps: int = 0
     cpu_seconds: float = 0.0
     without: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
 
 def folder_of(key: str) -> Path:

@@ -52,7 +52,7 @@ def with_maps(
     if not run.wants_priors or (begun and before is None):
         yield run
     elif files := prior_files(run.data, scene):
-        tell_of_others(run, files)
+        tell_of_others(run, files, caches.maps is not None)
         yield run
     elif before is not None and is_finished(run):
         yield with_priors(run, before)
@@ -127,22 +127,24 @@ def made_maps(
         yield folder
 
 
-def tell_of_others(run: Run, files: Mapping[str, DepthFile]) -> None:
+def tell_of_others(run: Run, files: Mapping[str, DepthFile], others: bool) -> None:
     """Say so where surfkit made the maps of the data set otherwise than the recipe would, as its settings are unused.
 
     Args:
         run: The run.
         files: Its maps.
+        others: Whether others may be made.
     """
     folder, own = run.data.path / FOLDER, run.recipe.depth
     if own is None or not all(file.path.is_relative_to(folder) for file in files.values()):
         return
     made = read_record(run.data.path).get("estimator")
-    if made in (None, dump(own)):
+    use, wanted = made.get("use") if isinstance(made, dict) else None, name_of(own)
+    if made == dump(own) or not isinstance(use, str):  # another program may write anything there
         return
-    use, wanted = made["use"], name_of(own)
     how = f"with {use}, not with {wanted}" if use != wanted else f"with other settings of {wanted} than the recipe has"
-    emit(Warned(f"{folder} has depth maps, made {how}: the run uses these; move the folder away to have others made"))
+    remedy = "; move the folder away to have others made" if others else ""
+    emit(Warned(f"{folder} has depth maps, made {how}: the run uses these{remedy}"))
 
 
 def with_priors(run: Run, folder: Path) -> Run:

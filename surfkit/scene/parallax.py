@@ -18,6 +18,11 @@ def degrees_between(points: np.ndarray, one: np.ndarray, other: np.ndarray) -> n
     return np.degrees(np.arccos((a * b).sum(1).clip(-1, 1)))
 
 
+def least_apart(distance: float, angle: float) -> float:
+    """How far apart two places are at least whose rays to a point at a distance from one are worth something."""
+    return distance * float(np.sin(np.radians(LEAST * angle)))
+
+
 def worth(between: np.ndarray, angle: float) -> np.ndarray:
     """Worth of angles, degrees, in [0, 1]: exp(-(a - angle)^2 / 2 s^2), and 0 below `LEAST`.
 

@@ -174,6 +174,14 @@ def test_maps_of_others_are_not_overwritten(farm, capsys):
     record.write_text(json.dumps({key: value for key, value in whole.items() if key != "photographs"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0, "of before contents were noted"
     assert json.loads(record.read_text()) == whole
+    record.write_text(json.dumps({key: value for key, value in whole.items() if key != "photographs"}))
+    photo = farm / "images" / "view_001.png"
+    picture = photo.read_bytes()
+    photo.write_bytes(picture[:400])
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    photo.write_bytes(picture)
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0, "what was damaged is not what maps were made from"
+    assert json.loads(record.read_text()) == whole
     record.write_text(json.dumps(whole | {"surfkit": "0.0.1"}))
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     assert "made by surfkit 0.0.1; --again" in capsys.readouterr().err
@@ -187,11 +195,33 @@ def test_maps_of_photographs_that_were_replaced_are_refused(farm, capsys):
     turned.save(photo)
     assert main(["prepare", "depth", str(farm), *SMALL]) == 2
     told = capsys.readouterr().err
-    assert "holds depth maps made before 'view_001.png' was replaced by other photographs of the same name" in told
+    assert "holds depth maps made before 'view_001.png' was changed, or replaced by other photographs of the" in told
     assert maps(farm) == first
     assert main(["prepare", "depth", str(farm), *SMALL, "--again"]) == 0
     assert maps(farm)["view_001.png.npy"] != first["view_001.png.npy"]
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+
+
+def test_masks_change_nothing(farm):
+    """Estimators do not look at them."""
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    first = maps(farm)
+    for path in (farm / "images").glob("*.png"):
+        (farm / "masks").mkdir(exist_ok=True)
+        with Image.open(path) as picture:
+            Image.new("L", picture.size, 255).save(farm / "masks" / path.name)
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and maps(farm) == first
+
+
+def test_a_record_without_maps_keeps_nobody_from_making_some(farm):
+    """What is left where `--again` was killed after it had deleted the maps."""
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0
+    first = maps(farm)
+    for path in (farm / "estimated_depths").glob("*.npy"):
+        path.unlink()
+    record = farm / "estimated_depths" / "depth.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"surfkit": "0.0.1"}))
+    assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and maps(farm) == first
 
 
 @pytest.mark.parametrize(

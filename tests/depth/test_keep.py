@@ -149,9 +149,19 @@ def test_a_photograph_that_cannot_be_read_for_a_while_is_tried_again(farm, tmp_p
         return view_photo(view)
 
     with mock.patch.object(prepare, "view_photo", away):
-        assert made(farm)[0] == first - 1
-    assert read_made(folder_of("some")).without == ()
-    assert made(farm)[0] == first and files(folder_of("some")).keys() == whole.keys()
+        with mock.patch.object(prepare, "emit") as told:
+            assert made(farm) == (first - 1, [])
+        (note,) = [call.args[0].text for call in told.mock_calls if isinstance(call.args[0], Warned)]
+        assert note.startswith("no depth map is made of a photograph: ")
+        assert read_made(folder_of("some")).without == read_made(folder_of("some")).unread == ("view_003.png",)
+        with mock.patch.object(prepare, "view_photo", mock.Mock(side_effect=away)) as looked:
+            assert made(farm) == (first - 1, []) and looked.call_count == 1, "at the photograph that is missing alone"
+    lesser = files(folder_of("some"))
+    with keep.mark_used(folder_of("some")):
+        assert made(farm) == (first - 1, []) and files(folder_of("some")) == lesser, "another run looks at them"
+    count, (told,) = made(farm)
+    assert count == first and "'view_003.png' could not be read before, and can be now" in told
+    assert files(folder_of("some")) == whole and made(farm) == (first, [])
     broken = farm.path / "images" / "view_003.png"
     broken.write_bytes(broken.read_bytes()[:400])
     shutil.rmtree(folder_of("some"))
@@ -165,6 +175,22 @@ def test_maps_of_a_gpu_are_others_than_those_of_a_cpu(farm):
         for device in ("cpu", "cuda:0", "cuda:1")
     ]
     assert named[0] != named[1] == named[2]
+
+
+def test_what_is_deleted_meanwhile_takes_no_room(tmp_path, monkeypatch):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    for name, size in (("a/one", 7), ("a/b/two", 5)):
+        (tmp_path / name).write_bytes(bytes(size))
+    assert keep.folder_bytes(tmp_path) == 12 and keep.folder_bytes(tmp_path / "gone") == 0
+    scan = os.scandir
+
+    def deleted(path):
+        if isinstance(path, str) and Path(path).name == "b":
+            shutil.rmtree(path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", deleted)
+    assert keep.folder_bytes(tmp_path) == 7
 
 
 def test_a_smaller_budget_holds_also_where_no_map_is_made(farm):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
+from surfkit.depth import neighbours as module
 from surfkit.depth.neighbours import neighbours
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.parallax import degrees_between, worth
@@ -44,6 +45,14 @@ def test_photographs_from_one_place_are_not_compared():
 def test_many_photographs_from_one_place_do_not_take_the_place_of_others():
     apart = HEIGHT * np.tan(np.radians(12))
     assert compared(np.array([[0, 0]] * 60 + [[apart, 0]]), points())[0] == [60]
+
+
+def test_angles_are_not_computed_where_places_tell_that_they_are_small(monkeypatch):
+    """Of a thousand photographs from one place, that would be a million pairs."""
+    apart, looked, real = HEIGHT * np.tan(np.radians(12)), [], module._worth
+    monkeypatch.setattr(module, "_worth", lambda *words: looked.append(1) or real(*words))
+    found = compared(np.array([[0, 0]] * 60 + [[apart, 0]]), points())
+    assert found[:60] == [[60]] * 60 and len(looked) == 60 + module.CANDIDATES
 
 
 def test_points_that_lie_nowhere_change_nothing():

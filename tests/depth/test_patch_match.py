@@ -11,8 +11,8 @@ from surfkit.core.check import BadInput
 from surfkit.depth import patch_match
 from surfkit.depth.base import DepthInput
 from surfkit.depth.native import Grey, Planes, Terms, improve, pattern, way
-from surfkit.depth.neighbours import neighbours
-from surfkit.depth.patch_match import PatchMatch, Work, in_turn
+from surfkit.depth.neighbours import in_turn, neighbours
+from surfkit.depth.patch_match import PatchMatch, Work
 from surfkit.depth.plane_map import Map, load_map, save_map
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.native import module

@@ -209,6 +209,8 @@ def test_blocks_are_counted_once_however_far_apart_they_are():
         cells = draw.integers(-spread, spread, (500, 3)).repeat(2, 0)
         assert np.array_equal(different(cells), np.unique(cells, axis=0))
     assert different(np.zeros((0, 3), np.int64)).shape == (0, 3)
+    wide = np.array([[-(2**62), 0, 0], [2**62, 0, 0], [-(2**62), 0, 0]])
+    assert np.array_equal(different(wide), wide[:2]), "the distance between the two is no int64"
 
 
 def test_progress_is_told():

@@ -267,9 +267,13 @@ def test_maps_of_the_data_set_that_were_made_otherwise_are_told(farm, recipe, tm
         told = f"has depth maps, made {how}: the run uses these; move the folder away to have others made"
         notes = record(tmp_path / f"run{at}")["notes"]
         assert notes == ([] if how is None else [f"{farm.path / 'estimated_depths'} {told}"])
-    (farm.path / "estimated_depths" / "depth.json").write_text('{"aligned": true}')  # of another program
-    run(recipe, farm, tmp_path / "foreign")
-    assert record(tmp_path / "foreign")["notes"] == []
+    run(replace(recipe, depth=PatchMatch()), farm, tmp_path / "none", caches=CacheSettings(maps=None))
+    (note,) = record(tmp_path / "none")["notes"]
+    assert note.endswith("the run uses these"), "others would not be made"
+    for at, other in enumerate(("", ', "estimator": "x"', ', "estimator": 7', ', "estimator": {"a": 1}')):  # foreign
+        (farm.path / "estimated_depths" / "depth.json").write_text(f'{{"aligned": true{other}}}')
+        run(recipe, farm, tmp_path / f"foreign{at}")
+        assert record(tmp_path / f"foreign{at}")["notes"] == []
 
 
 def test_a_model_without_tracks_trains_without_maps(tmp_path, recipe, own_cache):

@@ -351,13 +351,14 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
     report = json.loads((scene / "report.json").read_text())
     assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (5, [])
     assert report["depth_maps"]["estimator"]["longest"] == 48 and report["seconds"]["depth maps"] > 0
-    assert main(["prepare", "depth", str(other), "--estimator.longest", "48", "--device", "cpu"]) == 0
+    sweep = ("estimator:plane-sweep", "--estimator.longest", "48", "--device", "cpu")
+    assert main(["prepare", "depth", str(other), *sweep]) == 0
     assert maps_of(scene) == maps_of(other) and maps_of(scene).items() >= first.items()
 
     made = maps_of(scene)
     assert main([*words, *SMALL_MAPS]) == 0 and maps_of(scene) == made
     assert main([*words, "--lens", "RADIAL"]) == 0
-    assert "has depth maps of other cameras" in capsys.readouterr().err and maps_of(scene) == made
+    assert "has depth maps of other cameras or photographs" in capsys.readouterr().err and maps_of(scene) == made
     assert main([*words, "--lens", "RADIAL", *SMALL_MAPS]) == 0
     assert maps_of(scene).keys() == made.keys() and maps_of(scene) != made, "of the new cameras"
     capsys.readouterr()
@@ -370,7 +371,7 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
     [
         (("depth:plane-sweep", "--depth.window", "25", "--depth.longest", "32"), "window is 25, and the largest"),
         (("depth:depth-anything-v2", "--depth.weights", "nowhere"), "depth-anything-v2 needs|nowhere cannot be loaded"),
-        (("--device", "cpu"), "--device cpu is for depth maps, and none are made; add depth:plane-sweep"),
+        (("--device", "cpu"), "--device cpu is for depth maps, and none are made; add depth:patch-match"),
     ],
 )
 def test_depth_that_cannot_be_made_is_refused_before_the_work(folder, tmp_path, monkeypatch, capsys, words, said):
