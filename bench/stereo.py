@@ -222,7 +222,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         figures = measured(options, Path(folder))
     about = {"data": options.data.resolve().name, "rounds": options.rounds}
-    about |= {} if options.best is None else {"best": options.best}
+    about |= {} if options.best is None else {"best of patch-match": options.best}
     print(f"wrote {save(options.name, about | figures)}")
 
 
