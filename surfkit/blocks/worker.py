@@ -23,7 +23,7 @@ from surfkit.core.events import StageBegan, StepDone, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import hookimpl, plugins
-from surfkit.execute.base import terminable
+from surfkit.core.signals import terminable
 from surfkit.execute.remote import CRASHED, DRIVER, INTERRUPTED, POLL_S
 from surfkit.execute.state import STALE_S, find_remote_worker, find_worker
 from surfkit.partition.base import CoarseModel

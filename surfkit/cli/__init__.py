@@ -19,6 +19,7 @@ from surfkit.cli.streams import READER_LEFT, reopen_closed, replace_unknown_lett
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
+from surfkit.core.signals import terminable
 
 COMMANDS = {
     "train": "Train a model, and make its mesh, from photographs with known cameras.",
@@ -46,6 +47,8 @@ COMMANDS = {
     "new": "Write the files of a new plugin, with a working part and its tests: `new plugin`.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
+RESUMED = ("train", "tune", "prepare", "ablate")
+"""Commands that go on with what an interrupted one has done."""
 MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",
     "import": "smaller photographs (--longest, --scale) or mesh:none need less",
@@ -65,7 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
     2 is for arguments or data that the user can correct, 1 for a run that ran out of memory or disk or met NaN or Inf,
-    3 for one with blocks that failed, 130 for one that was interrupted, and 141 for output that nobody reads any more.
+    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C or SIGTERM, and 141 for output that
+    nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -77,7 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     reopen_closed()
     replace_unknown_letters()
     try:
-        status = _guarded(words)
+        with terminable():
+            status = _guarded(words)
         sys.stdout.flush()
         return status
     except OSError as error:
@@ -115,7 +120,7 @@ def _guarded(words: list[str]) -> int:
     try:
         return _dispatch(words)
     except KeyboardInterrupt:
-        print("surfkit: interrupted", file=sys.stderr)
+        print(f"surfkit: interrupted{'; the same command goes on' * (words[0] in RESUMED)}", file=sys.stderr)
         return 130
     except SystemExit as stop:  # --help, and rich when nobody reads its output any more
         if isinstance(stop.code, str):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,11 +17,13 @@ from surfkit.core.check import BadInput, few
 from surfkit.core.codec import dump
 from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
+from surfkit.core.registry import name_of
 from surfkit.core.version import own_version
 from surfkit.depth.base import DepthEstimator, DepthInput, Estimate
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import (
     FOLDER,
+    DepthFile,
     confidence_path,
     map_path,
     normal_path,
@@ -41,6 +43,10 @@ WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one 
 MADE_FROM, PHOTOGRAPHS = "made_from", "photographs"
 """In the record: from which cameras and sparse points, as a digest, which is also a file in the folder for work; and of
 each photograph the content of its file."""
+
+
+REMEDY = "; move the folder away to have others made"
+"""For maps of a data set that are not those that a run would make."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +254,33 @@ def made_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     if are_alike({**before, MADE_FROM: None}, {**now, MADE_FROM: None}):
         return "from other cameras or sparse points"
     return "of other photographs, or of other sizes"
+
+
+def others_warning(root: Path, maps: Iterable[DepthFile], own: DepthEstimator, longest: int) -> str | None:
+    """What to say where surfkit made the maps of a data set otherwise than an estimator would.
+
+    None where another program made them, or where only the photographs were larger, which gives maps that are as good.
+
+    Args:
+        root: The data set.
+        maps: Its maps, or others in their place.
+        own: The estimator.
+        longest: Longest side of the photographs, pixels.
+    """
+    folder = root / FOLDER
+    if not all(file.path.is_relative_to(folder) for file in maps):
+        return None
+    before = read_record(root)
+    made, side = before.get("estimator"), before.get("longest")
+    use, wanted = made.get("use") if isinstance(made, dict) else None, name_of(own)
+    if not isinstance(use, str):
+        return None
+    parts = [f"with {use}, not with {wanted}"] if use != wanted else []
+    parts += [f"with other settings of {wanted} than the recipe has"] if use == wanted and made != dump(own) else []
+    most = getattr(own, "longest", longest)  # estimators may make smaller maps of all photographs
+    if isinstance(side, int) and 0 < min(side, most) < min(longest, most):
+        parts.append(f"from photographs of {side} px, where the run has such of {longest} px")
+    return f"{folder} has depth maps, made {' and '.join(parts)}: the run uses these" if parts else None
 
 
 def fault_of(view: View) -> BadInput | None:

@@ -16,6 +16,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
+from surfkit.depth.prepare import REMEDY, others_warning
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
 from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
@@ -282,6 +283,9 @@ def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
     if missing := [shot.name for shot in train if shot.name not in maps]:
         text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
         found.append(Finding("warning", "depth-priors", text, tuple(missing)))
+    longest = max(max(data.size(shot.camera.width, shot.camera.height)) for shot in train)
+    if recipe.depth is not None and (text := others_warning(data.path, maps.values(), recipe.depth, longest)):
+        found.append(Finding("warning", "depth-priors", f"{text}{REMEDY}"))
     if normals and (text := normals_warning(data, list(maps.values()))):
         found.append(Finding("warning", "prior-normals", text))
     return found

@@ -6,16 +6,16 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from surfkit.core.check import BadInput
 from surfkit.core.registry import Component
+from surfkit.core.signals import terminable
 from surfkit.execute.remote import DRIVER, INTERRUPTED, POLL_S
 from surfkit.execute.state import Kind
 from surfkit.scene.memory import free_bytes, oom_kills
@@ -188,19 +188,6 @@ def _seen_gpus(count: int) -> list[str]:
 def sort_by_cost(jobs: Sequence[Job]) -> list[Job]:
     """The jobs in the order to start them: the longest first, so that none of these is the last to end."""
     return sorted(jobs, key=lambda job: (-job.cost, job.index))
-
-
-@contextmanager
-def terminable() -> Iterator[None]:
-    """Within, SIGTERM acts like Ctrl-C, so that workers save their states."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 @dataclass

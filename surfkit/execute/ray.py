@@ -12,7 +12,8 @@ from typing import Any
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost, terminable
+from surfkit.core.signals import terminable
+from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost
 from surfkit.execute.remote import CRASHED, POLL_S, run_remote_job
 from surfkit.execute.shared import mark_folder, remote_job
 from surfkit.execute.state import Kind

@@ -20,7 +20,8 @@ from typing import Any, Literal
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.optional import needed
-from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost, terminable
+from surfkit.core.signals import terminable
+from surfkit.execute.base import Executor, Job, JobResult, sort_by_cost
 from surfkit.execute.remote import CRASHED, POLL_S, RemoteJob
 from surfkit.execute.shared import mark_folder, remote_job
 from surfkit.execute.state import Kind, find_worker

@@ -20,7 +20,8 @@ from surfkit.blocks.schedule import LEAVE_S, Compute
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.codec import read_json, write_json, write_text
 from surfkit.core.lock import lock_holder
-from surfkit.execute.base import LOG, Executor, Job, JobResult, terminable
+from surfkit.core.signals import terminable
+from surfkit.execute.base import LOG, Executor, Job, JobResult
 from surfkit.execute.remote import DRIVER, INTERRUPTED, POLL_S
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data

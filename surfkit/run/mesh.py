@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, read_keys, write_json
+from surfkit.core.codec import dump, read_json, read_keys, write_json
 from surfkit.core.events import FileWritten, Progress, Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.evaluate.images.pictures import write_picture
@@ -171,8 +172,10 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
     least = delivery.clusters, delivery.least_triangles
     mesh, report = clean(raw, *least, inside, delivery.hole_edges, delivery.cluster_gap)
     del raw
-    delete_meshes(run)
+    before = delete_meshes(run)
     written = list(write_files(run, mesh, delivery, subject))
+    if gone := sorted(before - {path.name for path in written}):
+        emit(Warned(f"{', '.join(gone)} of the mesh before {'is' if len(gone) == 1 else 'are'} gone"))
     record = {
         "mesher": None if isinstance(mesher, Mesh) else mesher,
         "delivery": delivery,
@@ -213,11 +216,24 @@ def describe(report: Report, subject: MeshInput) -> dict[str, Any]:
     return dump(report) | {"longest_boundary": report.longest_boundary / subject.frame.scale}
 
 
-def delete_meshes(run: Run) -> None:
-    """Delete the files of an earlier mesh; its record first."""
+def delete_meshes(run: Run) -> set[str]:
+    """Delete the files of an earlier mesh, its record first, and what was measured of it; their names."""
     run.mesh_record.unlink(missing_ok=True)
-    for path in (*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*"), *run.mesh_pictures.rglob("*.png")):
+    forget_geometry(run)
+    found = {*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*")}
+    for path in (*found, *run.mesh_pictures.rglob("*.png")):
         path.unlink(missing_ok=True)
+    return {path.name for path in found}
+
+
+def forget_geometry(run: Run) -> None:
+    """Take out of the metrics what was measured of an earlier mesh."""
+    metrics: dict[str, Any] = {}
+    with suppress(BadInput):  # damaged: others say so
+        metrics = read_json(run.metrics, dict[str, Any]) if run.metrics.exists() else {}
+    if metrics.pop("geometry", None) is not None:
+        write_json(run.metrics, metrics)
+        emit(Warned("precision, recall and F1 were of the mesh before: `surfkit evaluate` with --gt measures this one"))
 
 
 def write_files(run: Run, mesh: Mesh, delivery: MeshOutput, subject: MeshInput) -> Iterator[Path]:

@@ -8,15 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import dump, read_json
+from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import mark_used
 from surfkit.core.registry import name_of
 from surfkit.depth.keep import key_of, maps
-from surfkit.depth.prepare import WITHOUT_DEPTH, Preparation
+from surfkit.depth.prepare import REMEDY, WITHOUT_DEPTH, Preparation, others_warning
 from surfkit.mesh.base import Mesher
 from surfkit.raster.select import Device, torch_device
-from surfkit.readers.depth_files import FOLDER, DepthFile, read_record
+from surfkit.readers.depth_files import FOLDER, DepthFile
 from surfkit.readers.depth_prior import prior_files
 from surfkit.readers.fingerprint import Fingerprint, fingerprint
 from surfkit.readers.made_maps import is_there, located
@@ -52,7 +52,7 @@ def with_maps(
     if not run.wants_priors or (begun and before is None):
         yield run
     elif files := prior_files(run.data, scene):
-        tell_of_others(run, files, caches.maps is not None)
+        tell_of_others(run, scene, files, caches.maps is not None)
         yield run
     elif before is not None and is_finished(run):
         yield with_priors(run, before)
@@ -120,31 +120,25 @@ def made_maps(
     key = key_of(run.recipe.depth, scene, prints, tracks, preparation.device)
     with maps(preparation, scene, tracks, key, caches.maps_bytes()) as (folder, made):
         count = f"{made.maps} of {len(scene.train)}" if made.without else made.maps
-        what, cost = f"depth maps of {count} photographs", f"{made.cpu_seconds:.0f} s of CPU time"
-        emit(Warned(f"{what} made with {name_of(run.recipe.depth)} in {cost}, in {folder}"))
+        how = f"made with {name_of(run.recipe.depth)} in {made.cpu_seconds:.0f} s of CPU time"
+        emit(Warned(f"depth maps of {count} photographs, {how}, are in {folder}"))
         if made.without:
             emit(Warned(f"the others give no depth: they are damaged, {WITHOUT_DEPTH}"))
         yield folder
 
 
-def tell_of_others(run: Run, files: Mapping[str, DepthFile], others: bool) -> None:
+def tell_of_others(run: Run, scene: Scene, files: Mapping[str, DepthFile], others: bool) -> None:
     """Say so where surfkit made the maps of the data set otherwise than the recipe would, as its settings are unused.
 
     Args:
         run: The run.
+        scene: Its data.
         files: Its maps.
         others: Whether others may be made.
     """
-    folder, own = run.data.path / FOLDER, run.recipe.depth
-    if own is None or not all(file.path.is_relative_to(folder) for file in files.values()):
-        return
-    made = read_record(run.data.path).get("estimator")
-    use, wanted = made.get("use") if isinstance(made, dict) else None, name_of(own)
-    if made == dump(own) or not isinstance(use, str):  # another program may write anything there
-        return
-    how = f"with {use}, not with {wanted}" if use != wanted else f"with other settings of {wanted} than the recipe has"
-    remedy = "; move the folder away to have others made" if others else ""
-    emit(Warned(f"{folder} has depth maps, made {how}: the run uses these{remedy}"))
+    longest, own = max(max(view.camera.width, view.camera.height) for view in scene.train), run.recipe.depth
+    if own is not None and (text := others_warning(run.data.path, files.values(), own, longest)):
+        emit(Warned(f"{text}{REMEDY if others else ''}"))
 
 
 def with_priors(run: Run, folder: Path) -> Run:

@@ -115,7 +115,7 @@ class Display:
             f"{done.points:,} points",
             f"loss {self.loss.value:.4f}",
         ]
-        parts += [f"PSNR {self.psnr.value:.2f} dB"] * (self.psnr.count > 0)
+        parts += [f"training PSNR {self.psnr.value:.2f} dB"] * (self.psnr.count > 0)
         parts += [f"{memory / 2**30:.1f} GiB" for memory in [peak_memory_bytes()] if memory]
         parts += [f"GPU {memory / 2**30:.1f} GiB" for memory in [peak_gpu_bytes()] if memory]
         return "  ".join(parts)

@@ -4,6 +4,7 @@ import importlib
 import io
 import os
 import re
+import signal
 import subprocess
 import sys
 import types
@@ -225,8 +226,17 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
     assert (main(["export"]), capsys.readouterr().err) == (2, "surfkit: data: no images\n")
     command(monkeypatch, interrupted)
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
+    monkeypatch.setattr("surfkit.cli.RESUMED", ("export",))
+    assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted; the same command goes on\n")
     command(monkeypatch, lambda: 3)
     assert main(["export"]) == 3
+
+
+def test_sigterm_is_an_interrupt(monkeypatch, capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    command(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_our_own_mistakes_keep_their_traceback(monkeypatch):

@@ -74,7 +74,17 @@ def test_another_mesh_of_the_same_run(finished, tmp_path, capsys):
     assert -2.5 < whole.vertices[:, 2].min() and whole.vertices[:, 2].max() < 3.5
     shown = capsys.readouterr().out
     assert f"{len(whole.faces):,}" in shown and "mesh-lod1.obj" in shown
+    assert (
+        main(["evaluate", str(out), "--gt", str(out / "mesh.ply"), "--tau", "0.5", "--draws", "1", "--crop", "none"])
+        == 0
+    )
+    assert "geometry" in json.loads((out / "metrics.json").read_text())
+    capsys.readouterr()
     assert main(["mesh", str(out), "--formats", "ply"]) == 0
+    said = capsys.readouterr().err
+    assert "mesh-lod1.ply, mesh.glb, mesh.glb.json, mesh.obj of the mesh before are gone" in said
+    assert "precision, recall and F1 were of the mesh before" in said
+    assert "geometry" not in json.loads((out / "metrics.json").read_text())
     assert not list(out.glob("mesh-lod*")) and not (out / "mesh.obj").exists(), "what was there before is gone"
 
 

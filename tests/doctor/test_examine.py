@@ -11,6 +11,7 @@ from PIL import Image
 
 from surfkit.appearance.exposure import Exposure
 from surfkit.cli.recipes import recipes
+from surfkit.core.codec import dump
 from surfkit.core.tree import evolve
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -362,6 +363,12 @@ def test_what_depends_on_the_recipe(farm):
     assert "there are no depth priors" in told(farm, "citygs2-coarse")["depth-priors"][0].text
     (farm / "estimated_depths").mkdir()
     np.save(farm / "estimated_depths" / "view_001.png.npy", np.ones((3, 4), np.float32))
+    own = json.dumps({"aligned": True, "estimator": dump(PlaneSweep()), "longest": 32})
+    (farm / "estimated_depths" / "depth.json").write_text(own)
+    _, other = told(farm, evolve(recipes()["citygs2-coarse"], "depth", PlaneSweep(longest=40)))["depth-priors"]
+    assert other.text.startswith(f"{farm / 'estimated_depths'} has depth maps, made with other settings of plane-sweep")
+    assert "and from photographs of 32 px, where the run has such of " in other.text
+    (farm / "estimated_depths" / "depth.json").unlink()
     (priors,) = told(farm, "citygs2-coarse")["depth-priors"]
     assert priors.text.startswith("13 of 14 photographs have no depth prior") and len(priors.names) == 13
     near = evolve(recipes()["2dgs"], "pretrain.near", 10.0)

@@ -101,7 +101,9 @@ def test_a_run_makes_its_maps_once_and_leaves_the_data_alone(farm, recipe, tmp_p
     assert not (folder / "estimated_depths/.work").exists()
     assert metrics["prepare_cpu_seconds"] == round(read_made(folder).cpu_seconds, 2) > 0
     (note,) = record(tmp_path / "a")["notes"]
-    assert note.startswith("depth maps of 7 photographs made with plane-sweep in ") and note.endswith(f", in {folder}")
+    assert note.startswith("depth maps of 7 photographs, made with plane-sweep in ") and note.endswith(
+        f", are in {folder}"
+    )
     assert record(tmp_path / "a")["data"]["priors"] == str(folder)
 
     again = run(recipe, farm, tmp_path / "b")
@@ -270,6 +272,13 @@ def test_maps_of_the_data_set_that_were_made_otherwise_are_told(farm, recipe, tm
     run(replace(recipe, depth=PatchMatch()), farm, tmp_path / "none", caches=CacheSettings(maps=None))
     (note,) = record(tmp_path / "none")["notes"]
     assert note.endswith("the run uses these"), "others would not be made"
+    path = farm.path / "estimated_depths" / "depth.json"
+    whole = json.loads(path.read_text())
+    for side, more in ((24, " and from photographs of 24 px, where the run has such of 48 px"), (96, "")):
+        path.write_text(json.dumps(whole | {"longest": side}))
+        run(replace(recipe, depth=replace(SWEEP, longest=64, window=7)), farm, tmp_path / f"small{side}")
+        (note,) = record(tmp_path / f"small{side}")["notes"]
+        assert f"made with other settings of plane-sweep than the recipe has{more}: the run uses these; move" in note
     for at, other in enumerate(("", ', "estimator": "x"', ', "estimator": 7', ', "estimator": {"a": 1}')):  # foreign
         (farm.path / "estimated_depths" / "depth.json").write_text(f'{{"aligned": true{other}}}')
         run(recipe, farm, tmp_path / f"foreign{at}")
@@ -441,7 +450,7 @@ def test_a_mesh_of_a_run_without_maps_has_them_made(farm, recipe, tmp_path, own_
     assert not seen and not (own_cache / "depth").exists()
     assert main([*words, "mesh:stereo"]) == 0 and len(seen) == 7 and contents(farm.path) == before
     told = capsys.readouterr().err
-    assert "depth maps  7/7" in told and "note: depth maps of 7 photographs made with plane-sweep in" in told
+    assert "depth maps  7/7" in told and "note: depth maps of 7 photographs, made with plane-sweep in" in told
     assert main([*words, *WEIGHED]) == 0 and len(seen) == 7, "the maps are in the cache"
     assert json.loads((tmp_path / "run/mesh.json").read_text())["mesher"]["trust"]["priors"] == "weigh"
 

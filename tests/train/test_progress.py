@@ -43,7 +43,7 @@ def test_without_a_terminal_lines_are_plain_and_the_last_step_is_shown():
     lines = out.getvalue().splitlines()
     assert len(lines) == 2 and "\x1b" not in out.getvalue()
     assert lines[0].startswith("pretrain  step 1/20") and "PSNR" not in lines[0]
-    for part in ("step 20/20", "it/s", "0:00 left", "12,345 points", "loss 0.5000", "PSNR 20.00 dB"):
+    for part in ("step 20/20", "it/s", "0:00 left", "12,345 points", "loss 0.5000", "  training PSNR 20.00 dB"):
         assert part in lines[1]
 
 
