@@ -200,10 +200,9 @@ def _masks(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
         )
         found.append(Finding("warning", "inverted-masks", text))
     elif empty:
-        text = f"{len(empty)} masks are all black, so that nothing of their photographs counts, {few(empty)}"
-        found.append(
-            Finding("warning", "empty-masks", f"{text}; delete these photographs from the model", tuple(empty))
-        )
+        count = "1 mask is" if len(empty) == 1 else f"{len(empty)} masks are"
+        text = f"{count} all black, so that nothing of the photograph counts, {few(empty)}; correct or delete it"
+        found.append(Finding("warning", "empty-masks", text, tuple(empty)))
     return found
 
 

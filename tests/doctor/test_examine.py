@@ -225,6 +225,12 @@ FAULTS = {
     "loose": (paint("images/more.png", np.zeros((9, 9), np.uint8)), "unused-pictures", "note", "1 of 17 pictures"),
     "exposure": (brightened, "exposure", "warning", "add pretrain.appearance:exposure"),
     "black-masks": (masks_of(0), "inverted-masks", "warning", "the masks keep 0% of the pixels"),
+    "black-mask": (
+        lambda f: [masks_of(255)(f), paint("masks/view_003.png", np.zeros((48, 64), np.uint8))(f)],
+        "empty-masks",
+        "warning",
+        "1 mask is all black, so that nothing of the photograph counts, 'view_003.png'; correct or delete it",
+    ),
     "mask-shape": (
         lambda f: [masks_of(255)(f), paint("masks/view_003.png", np.zeros((48, 20), np.uint8))(f)],
         "masks",
