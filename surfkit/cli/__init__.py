@@ -120,7 +120,8 @@ def _guarded(words: list[str]) -> int:
     try:
         return _dispatch(words)
     except KeyboardInterrupt:
-        print(f"surfkit: interrupted{'; the same command goes on' * (words[0] in RESUMED)}", file=sys.stderr)
+        goes_on = "; the same command goes on" if words and words[0] in RESUMED else ""
+        print(f"surfkit: interrupted{goes_on}", file=sys.stderr)
         return 130
     except SystemExit as stop:  # --help, and rich when nobody reads its output any more
         if isinstance(stop.code, str):

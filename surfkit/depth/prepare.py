@@ -131,7 +131,7 @@ class Preparation:
         paths = [map_path(root, view.name) for view in views]
         alike, names = are_alike(before, record), [] if again else replaced(before, record, views)
         again = again or (renew and bool(before) and (not alike or bool(names)))
-        if not again and not alike and any((root / FOLDER).rglob("*.npy")):
+        if not again and not alike and self.has_maps():
             raise BadInput(
                 f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
             )
@@ -155,6 +155,11 @@ class Preparation:
         record[PHOTOGRAPHS] = {name: known.get(name, it) for name, it in now if name in known or name not in damaged}
         self.open(record)
         return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
+
+    def has_maps(self) -> bool:
+        """Whether there are maps, of these photographs or of others."""
+        found = (self.place / FOLDER).rglob("*.npy")
+        return any(self.work not in path.parents for path in found)
 
     def is_outdated(self, given: DepthInput) -> bool:
         """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""
