@@ -102,7 +102,7 @@ CASES = {
     "grey": (grey, (0, HARDLY), (0, "no pixel of a depth map is trusted, so the run starts from the sparse points")),
     "the same": (same, (0, HARDLY), (0, HARDLY)),
     "mirrored": (mirrored, (0, HARDLY), (0, HARDLY)),
-    "two groups": (two_groups, (0, "7/7 view_"), (0, "depth maps of 7 photographs made")),
+    "two groups": (two_groups, (0, "7/7 view_"), (0, "depth maps of 7 photographs, made")),
     "nothing in common": (apart, NONE, (2, "depth maps of 0 of 7 photographs")),
     "one place": (one_place, NONE, (2, "or were taken from one place")),
     "maps of another size": (partial(maps, size=(36, 96)), AGAIN, (2, "96 x 36 px is not the shape of its photograph")),
