@@ -47,7 +47,7 @@ COMMANDS = {
     "new": "Write the files of a new plugin, with a working part and its tests: `new plugin`.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
-RESUMED = ("train", "tune", "prepare", "ablate")
+RESUMED = ("train", "tune", "prepare", "ablate", "maps", "texture", "render")
 """Commands that go on with what an interrupted one has done."""
 MEMORY_ADVICE = {
     "train": "smaller photographs (--longest, --scale) or fewer points need less",

@@ -58,7 +58,7 @@ class DepthEstimator(Component):
     `aligned` estimators give inverse depth in the units of the scene, others up to scale and offset. The ones that are
     `matched` compare photographs with one another, so they must not see those that are kept to measure with; those that
     are `oriented` give normals too. The `version` is raised when the same settings give other maps: what is kept of
-    earlier ones is not used again.
+    earlier ones is not used again. Maps do not depend on the masks of photographs: they are kept when masks change.
     """
 
     aligned: ClassVar[bool] = False

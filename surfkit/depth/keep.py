@@ -39,7 +39,7 @@ def key_of(
     Args:
         estimator: How they are made.
         scene: With the training views.
-        prints: Of its photographs, cameras and masks.
+        prints: Of its photographs and cameras.
         tracks: Its observations.
         device: Where they are made: maps of a GPU are as good as those of a CPU, and have other bits.
     """
@@ -48,8 +48,7 @@ def key_of(
     parts += [digest(tracks.xyz), digest(tracks.error_px)]
     for view in scene.train:
         known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
-        mask = known.beside["mask"].content if "mask" in known.beside else ""
-        parts += [view.name, known.camera, str(known.size), known.content, mask, str(view.white)]
+        parts += [view.name, known.camera, str(known.size), known.content, str(view.white)]
         parts.append("" if seen is None else digest(seen))
     return digest("\0".join(parts))
 
@@ -175,7 +174,8 @@ def forget_incomplete(folder: Path, scene: Scene) -> None:
     if not found or is_used(folder):
         return
     emit(Warned(f"{few(found)} could not be read before, and can be now: all depth maps are made anew"))
-    shutil.rmtree(folder / FOLDER, ignore_errors=True)
+    if (folder / FOLDER).exists():
+        shutil.rmtree(folder / FOLDER)
     write_made(folder, Made())
 
 

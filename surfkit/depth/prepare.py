@@ -43,8 +43,6 @@ WITHOUT_DEPTH = "show too few of the same sparse points, or were taken from one 
 MADE_FROM, PHOTOGRAPHS = "made_from", "photographs"
 """In the record: from which cameras and sparse points, as a digest, which is also a file in the folder for work; and of
 each photograph the content of its file."""
-
-
 REMEDY = "; move the folder away to have others made"
 """For maps of a data set that are not those that a run would make."""
 
@@ -130,8 +128,9 @@ class Preparation:
         record, before = self.record(given), read_record(root)
         paths = [map_path(root, view.name) for view in views]
         alike, names = are_alike(before, record), [] if again else replaced(before, record, views)
-        again = again or (renew and bool(before) and (not alike or bool(names)))
-        if not again and not alike and self.has_maps():
+        if names or not alike:
+            again = again or (renew and bool(before)) or not self.is_begun()
+        if not again and not alike:
             raise BadInput(
                 f"{root / FOLDER} holds depth maps made {made_otherwise(before, record)}; --again replaces them"
             )
@@ -149,17 +148,15 @@ class Preparation:
                 path.unlink(missing_ok=True)
                 confidence_path(path).unlink(missing_ok=True)
                 normal_path(path).unlink(missing_ok=True)
-        if again or not are_alike(before, record):
             shutil.rmtree(self.work, ignore_errors=True)
         now = record[PHOTOGRAPHS].items()
         record[PHOTOGRAPHS] = {name: known.get(name, it) for name, it in now if name in known or name not in damaged}
         self.open(record)
         return given, [at for at, path in enumerate(paths) if views[at].name not in damaged and not path.exists()]
 
-    def has_maps(self) -> bool:
-        """Whether there are maps, of these photographs or of others."""
-        found = (self.place / FOLDER).rglob("*.npy")
-        return any(self.work not in path.parents for path in found)
+    def is_begun(self) -> bool:
+        """Whether there is something to lose: maps, of these photographs or of others, or work on some."""
+        return any((self.place / FOLDER).rglob("*.npy")) or any(self.work.rglob("*"))
 
     def is_outdated(self, given: DepthInput) -> bool:
         """Whether there are maps that surfkit made otherwise: with other settings, or from something else."""
@@ -179,8 +176,9 @@ class Preparation:
     def record(self, given: DepthInput) -> dict[str, Any]:
         """What depth.json says of the maps."""
         views = given.views
+        # Of maps in the cache, the name of the folder tells the content of photographs.
         content = {} if self.root else {PHOTOGRAPHS: {view.name: content_of(view) for view in views}}
-        return content | {  # of maps in the cache, the name of the folder tells it
+        return content | {
             "estimator": dump(self.estimator),
             "surfkit": own_version(),
             "aligned": self.estimator.aligned,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -227,12 +227,17 @@ def delete_meshes(run: Run) -> set[str]:
 
 
 def forget_geometry(run: Run) -> None:
-    """Take out of the metrics what was measured of an earlier mesh."""
-    metrics: dict[str, Any] = {}
-    with suppress(BadInput):  # damaged: others say so
-        metrics = read_json(run.metrics, dict[str, Any]) if run.metrics.exists() else {}
-    if metrics.pop("geometry", None) is not None:
-        write_json(run.metrics, metrics)
+    """Take out of the metrics what was measured of an earlier mesh; the run repeats that of its compressed model."""
+    whole, found = replace(run, out=run.out.parent), False
+    places = [(run.metrics, "")] + [(whole.metrics, "compressed")] * (whole.compressed == run.out)
+    for path, part in places:
+        with suppress(BadInput):  # damaged: others say so
+            metrics = read_json(path, dict[str, Any]) if path.exists() else {}
+            measured = metrics.get(part) if part else metrics
+            if isinstance(measured, dict) and measured.pop("geometry", None) is not None:
+                write_json(path, metrics)
+                found = True
+    if found:
         emit(Warned("precision, recall and F1 were of the mesh before: `surfkit evaluate` with --gt measures this one"))
 
 

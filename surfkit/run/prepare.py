@@ -123,7 +123,7 @@ def made_maps(
         how = f"made with {name_of(run.recipe.depth)} in {made.cpu_seconds:.0f} s of CPU time"
         emit(Warned(f"depth maps of {count} photographs, {how}, are in {folder}"))
         if made.without:
-            emit(Warned(f"the others give no depth: they are damaged, {WITHOUT_DEPTH}"))
+            emit(Warned(f"the others give no depth: they cannot be read, {WITHOUT_DEPTH}"))
         yield folder
 
 

@@ -220,8 +220,13 @@ def test_a_record_without_maps_keeps_nobody_from_making_some(farm):
     for path in (farm / "estimated_depths").glob("*.npy"):
         path.unlink()
     record = farm / "estimated_depths" / "depth.json"
-    record.write_text(json.dumps(json.loads(record.read_text()) | {"surfkit": "0.0.1"}))
-    assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and maps(farm) == first
+    whole = json.loads(record.read_text())
+    for other in ({"surfkit": "0.0.1"}, {"photographs": whole["photographs"] | {"view_001.png": "0"}}):
+        for path in (farm / "estimated_depths").glob("*.npy"):
+            path.unlink()
+        record.write_text(json.dumps(whole | other))
+        assert main(["prepare", "depth", str(farm), *SMALL]) == 0 and maps(farm) == first
+        assert json.loads(record.read_text()) == whole, "what the maps are made from now"
 
 
 @pytest.mark.parametrize(

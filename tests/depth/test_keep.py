@@ -9,6 +9,7 @@ from unittest import mock
 import pytest
 import torch
 from needs import needs_native
+from PIL import Image
 
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.events import Warned
@@ -175,6 +176,21 @@ def test_maps_of_a_gpu_are_others_than_those_of_a_cpu(farm):
         for device in ("cpu", "cuda:0", "cuda:1")
     ]
     assert named[0] != named[1] == named[2]
+
+
+def test_masks_leave_the_name_of_maps(farm, tmp_path):
+    """Stereo does not look at them, and takes hours of a large survey."""
+    other = Data(Path(shutil.copytree(farm.path, tmp_path / "farm")))
+    (other.path / "masks").mkdir()
+    for path in (other.path / "images").iterdir():
+        Image.new("L", (48, 36), 255).save(other.path / "masks" / path.name)
+    scenes = read(farm), read(other)
+    assert all(view.mask for view in scenes[1].train) and not any(view.mask for view in scenes[0].train)
+    one, two = (
+        keep.key_of(FAST, scene, fingerprint(scene), observations(data, scene), torch.device("cpu"))
+        for data, scene in zip((farm, other), scenes, strict=True)
+    )
+    assert one == two
 
 
 def test_what_is_deleted_meanwhile_takes_no_room(tmp_path, monkeypatch):
