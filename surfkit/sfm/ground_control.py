@@ -5,7 +5,6 @@ The similarity to the map is that of the points, triangulated in the model; poin
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,19 +14,14 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.readers.georeference import Similarity, zone_of
+from surfkit.readers.georeference import Similarity
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
+from surfkit.sfm.systems import system_of
 
 FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
-GEOGRAPHIC = ("EPSG:4326", "WGS84", "+PROJ=LONGLAT", "+PROJ=LATLONG")
-"""How a list says that its coordinates are longitude, latitude and height."""
-WGS84 = re.compile(
-    r"\+(proj=(utm|longlat|latlong)|zone=\d+|south|(datum|ellps)=WGS84|towgs84=0(,0)*|units=m|no_defs|type=crs)"
-)
-"""Words of PROJ that leave UTM and degrees on WGS 84, in metres; with any other they are left to pyproj."""
 FAR_M = 1000.0
 """Receivers in cameras are not so wrong."""
 
@@ -164,22 +158,23 @@ def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], h
             f"the folder; {FEWEST_POINTS} are needed{also}"
         )
     xyz = np.array([point.xyz for point in points], np.float64)
-    plain = not crs.startswith("+") or all(map(WGS84.fullmatch, crs.split()))
-    zone = zone_of(crs) if plain else None
-    if plain and zone is None and crs.upper().replace(" ", "").startswith(GEOGRAPHIC):
-        positions = xyz[:, [1, 0, 2]]
+    try:
+        system = system_of(crs)
+    except BadInput as error:
+        raise BadInput(f"--gcp {path}: line 1: {error}") from error
+    if system.degrees:
         if wrong := [point.name for point, (x, y, _) in zip(points, xyz, strict=True) if abs(x) > 180 or abs(y) > 90]:
             raise BadInput(
                 f"--gcp {path}: {few(wrong)} is not in degrees, as line 1, {crs!r}, says; x is the longitude, y the "
                 "latitude, or line 1 names another system, such as EPSG:32633"
             )
+        positions = system.positions(xyz)
         chart = chart_of(positions, wanted)
         onto = to_chart(chart, positions)
         if not np.isfinite(onto).all():
             raise BadInput(f"--gcp {path}: some points are where {chart.crs} does not reach; x is the longitude")
         return Ground(points, chart, onto)
-    if zone is not None:
-        crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}"
+    crs = system.crs
     if wanted not in ("auto", crs):
         raise BadInput(f"--crs {wanted}: the list of --gcp is in {crs}, and the scene will be; leave --crs out")
     try:

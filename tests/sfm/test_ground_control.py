@@ -76,7 +76,7 @@ def test_rays_meet_in_the_point():
     assert triangulate(images, {"0.jpg": (10, 10), "elsewhere.jpg": (3, 3)}) is None
 
 
-@pytest.mark.parametrize("first", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
+@pytest.mark.parametrize("first", ["epsg:32633", "WGS84 UTM 33n", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
 def test_points_place_the_model_and_checkpoints_check_it(tmp_path, first):
     ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", SIZES)
     found = place_by_points(model(), ground, 3)
