@@ -17,6 +17,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.plausible import mirrored
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
 from surfkit.sfm.systems import system_of
 
@@ -24,6 +25,8 @@ FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
 FAR_M = 1000.0
 """Receivers in cameras are not so wrong."""
+HIGH_M = 300.0
+"""Nor are their altitudes, whether above the sea, the ellipsoid or by air pressure."""
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,12 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     left = (onto[seen] - given.points(np.stack([placed[at] for at in seen]))) * chart.metres
     if not sizes[1] > LINE * sizes[0]:
         return Refused("ground control points lie along a line")
+    if found := mirrored(xyz, onto[control], NEAR_M / chart.metres):
+        plain, other = (value * chart.metres for value in found)
+        return Refused(
+            f"ground control points fit mirrored only, to {other:.2f} m for {plain:.1f} m; x must be east and y north, "
+            "and heights count up"
+        )
     residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
     rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
     across = given.scale * sizes[1] * chart.metres
@@ -270,34 +279,39 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     )
 
 
-def doubts(control: Control, centres: Mapping[str, np.ndarray], up: np.ndarray, photos: Sequence[Photo]) -> list[str]:
+def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence[Photo]) -> list[str]:
     """What else is known of the photographs and contradicts the control points, a line for each.
 
     Args:
         control: Where the points put the model.
         centres: (3,) of each placed camera in the model, by the name of its photograph.
-        up: (3,) unit vector of the model, by how cameras are held.
         photos: With or without positions.
     """
-    crs, found = control.chart.crs, []
-    if (control.similarity.turn @ up)[2] < -0.5:
-        found.append(
-            "the ground control points turn the photographs upside down, as an exchange of x and y does: is x east and "
-            f"y north in the list, in {crs}?"
-        )
-    known = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
-    if known:
-        ours = control.similarity.points(np.stack([centres[photo.name] for photo in known]))
-        theirs = to_chart(control.chart, np.array([photo.exif.position for photo in known], np.float64))
-        away = np.linalg.norm((ours - theirs)[:, :2], axis=1) * control.chart.metres
-        away = float(np.median(np.where(np.isfinite(away), away, np.inf)))
-        if away > FAR_M:
-            far = f"{away / 1000:.0f} km" if np.isfinite(away) else "out of reach"
-            found.append(
-                f"the ground control points put the photographs {far} from their positions in EXIF: is {crs} the "
-                "system of the list, with x east and y north?"
-            )
-    return found
+    known = [
+        photo
+        for photo in photos
+        if photo.name in centres and photo.exif.position is not None and not photo.exif.unsigned
+    ]
+    if not known:
+        return []
+    ours = control.similarity.points(np.stack([centres[photo.name] for photo in known]))
+    theirs = to_chart(control.chart, np.array([photo.exif.position for photo in known], np.float64))
+    away = np.linalg.norm((ours - theirs)[:, :2], axis=1) * control.chart.metres
+    away = float(np.median(np.where(np.isfinite(away), away, np.inf)))
+    if away > FAR_M:
+        far = f"{away / 1000:.0f} km" if np.isfinite(away) else "out of reach"
+        return [
+            f"the ground control points put the photographs {far} from their positions in EXIF: is {control.chart.crs} "
+            "the system of the list, with x east and y north?"
+        ]
+    rise = (ours - theirs)[:, 2] * control.chart.metres
+    high = float(np.median(rise[np.isfinite(rise)])) if np.isfinite(rise).any() else 0.0
+    if abs(high) > HIGH_M:
+        return [
+            f"the ground control points put the photographs {abs(high):.0f} m {'above' if high > 0 else 'below'} their "
+            "altitudes in EXIF: do the heights of the list count up, in the unit of its system?"
+        ]
+    return []
 
 
 def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, float]]) -> np.ndarray | None:
