@@ -10,6 +10,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.readers.georeference import POLAR, zone_of
+from surfkit.readers.wkt import parse_wkt
 from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
@@ -83,7 +84,8 @@ def system_of(text: str) -> System:
             return System(WGS84_DEGREES, True)
         if number := next((int(word.removeprefix("+zone=")) for word in words if word.startswith("+zone=")), None):
             return _utm(text, number, "S" if "+south" in words else "N")
-    if found := CODE.fullmatch(text):
+    named = parse_wkt("well-known text", text).code if WKT.match(text) else None
+    if found := CODE.fullmatch(named or text):
         text = f"EPSG:{found[1]}"
         if text == WGS84_DEGREES or zone_of(text):
             return System(text, text == WGS84_DEGREES)
