@@ -14,7 +14,7 @@ from surfkit.core.optional import needed
 from surfkit.readers.georeference import BESIDE, POLAR, Similarity, zone_of
 from surfkit.scene.earth import Site, utm
 from surfkit.sfm.photographs import Photo
-from surfkit.sfm.plausible import mirrored
+from surfkit.sfm.plausible import Hand
 from surfkit.sfm.similarity import FEWEST, Fit, fit_robustly
 
 GRAIN_M = 100.0
@@ -61,6 +61,7 @@ class Placement:
         names: Photographs with a position that is used.
         onto: (P, 3) their positions less the offset.
         fit: How well they agree.
+        handed: Whether they are told from their mirror image: they are not all in a plane.
         plan: Whether the positions had no altitudes: heights are then above the middle of the ground, and those in
             `onto` are of the cameras.
     """
@@ -70,6 +71,7 @@ class Placement:
     names: tuple[str, ...]
     onto: np.ndarray
     fit: Fit
+    handed: bool = False
     plan: bool = False
 
 
@@ -194,10 +196,11 @@ def _fitted(
         return Refused(
             f"residuals of {rms:.1f} m are too large for positions that spread by {along:.1f} and {across:.1f} m"
         )
-    if axes == 3 and (found := mirrored(xyz[fit.inside], onto[fit.inside], NEAR_M / chart.metres)):
-        plain, other = (value * chart.metres for value in found)
-        return Refused(f"positions fit mirrored only, to {other:.2f} m for {plain:.1f} m")
-    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit)
+    hand = Hand.of(xyz[fit.inside], onto[fit.inside], NEAR_M / chart.metres)
+    if hand.wrong:
+        mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
+        return Refused(f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m")
+    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, hand.right)
 
 
 def _in_plan(

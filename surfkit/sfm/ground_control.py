@@ -17,7 +17,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
-from surfkit.sfm.plausible import mirrored
+from surfkit.sfm.plausible import Hand
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
 from surfkit.sfm.systems import system_of
 
@@ -71,6 +71,7 @@ class Control:
         checkpoints: Names of those held back.
         wrong: Names of those that contradict the others.
         unseen: Names of those that too few placed photographs show.
+        handed: Whether they are told from their mirror image: they are not all in a plane.
     """
 
     chart: Chart
@@ -80,6 +81,7 @@ class Control:
     checkpoints: tuple[str, ...]
     wrong: tuple[str, ...]
     unseen: tuple[str, ...]
+    handed: bool
 
     def facts(self) -> dict[str, Any]:
         """For the report."""
@@ -254,11 +256,12 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     left = (onto[seen] - given.points(np.stack([placed[at] for at in seen]))) * chart.metres
     if not sizes[1] > LINE * sizes[0]:
         return Refused("ground control points lie along a line")
-    if found := mirrored(xyz, onto[control], NEAR_M / chart.metres):
-        plain, other = (value * chart.metres for value in found)
+    hand = Hand.of(xyz[inside], onto[control][inside], NEAR_M / chart.metres)
+    if hand.wrong:
+        mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
         return Refused(
-            f"ground control points fit mirrored only, to {other:.2f} m for {plain:.1f} m; x must be east and y north, "
-            "and heights count up"
+            f"ground control points fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m; x must be east and y "
+            "north, and heights count up"
         )
     residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
     rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
@@ -276,6 +279,7 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
         tuple(points[at].name for at in sorted(back)),
         tuple(points[at].name for at, good in zip(control, inside, strict=True) if not good),
         unseen,
+        hand.right,
     )
 
 

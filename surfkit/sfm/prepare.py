@@ -176,7 +176,7 @@ class Preparation:
         where = place_by_points(model, ground, self.settings.checkpoints)
         if isinstance(where, Refused):
             return where
-        if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres):
+        if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):
             return Refused(f"by the ground control points {why}; x must be east and y north, and heights count up")
         for doubt in doubts(where, centres_of(model), list(photos.values())):
             emit(Warned(f"sparse/{number}: {doubt}"))

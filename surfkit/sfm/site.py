@@ -117,6 +117,8 @@ def locate(model: Any, reading: Reading, seed: int) -> Placement | Refused:
     turn = turn_upright(up)
     level = Level(turn, float(np.median(points_of(model) @ turn[2])))
     found = place(centres_of(model), reading.photos, reading.chart, seed, level)
-    if isinstance(found, Placement) and (why := upside_down(model, found.similarity, up, reading.chart.metres)):
+    if isinstance(found, Refused):
+        return found
+    if why := upside_down(model, found.similarity, up, found.chart.metres, found.handed):
         return Refused(f"by their positions {why}; are latitude and longitude, or their signs, exchanged?")
     return found

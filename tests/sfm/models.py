@@ -22,6 +22,11 @@ def reconstruction(poses, points, turn, scale, move, camera=None):
 
 
 def down(centres):
-    """Poses (4, 4) world_to_camera that look straight down from (V, 3) centres, with y to the south."""
-    turn = np.diag([1.0, -1.0, -1.0])
-    return [np.vstack([np.column_stack([turn, -turn @ centre]), [0, 0, 0, 1]]) for centre in centres]
+    """Poses (4, 4) world_to_camera that look straight down from (V, 3) centres, every other one turned by a quarter."""
+    north = np.diag([1.0, -1.0, -1.0])
+    turns = [north, np.array([[0.0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]) @ north]
+    poses = []
+    for at, centre in enumerate(centres):
+        turn = turns[at % 2]
+        poses.append(np.vstack([np.column_stack([turn, -turn @ centre]), [0, 0, 0, 1]]))
+    return poses

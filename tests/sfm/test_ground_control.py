@@ -154,7 +154,7 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
     def told():
         found = place_by_points(model(), read_ground(path, "auto", SIZES), 0)
         assert max(found.rms(found.control).values()) < 0.01, "the residuals are no help"
-        why = upside_down(model(), found.similarity, TURN @ (0, 0, 1), 1.0)
+        why = upside_down(model(), found.similarity, TURN @ (0, 0, 1), 1.0, found.handed)
         return [*([] if why is None else [why]), *doubts(found, centres, photos)]
 
     assert told() == []
