@@ -17,16 +17,12 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.georeference import Similarity
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
-from surfkit.sfm.plausible import Hand
+from surfkit.sfm.plausible import FAR_M, HIGH_M, LOW_M, Hand
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
 from surfkit.sfm.systems import system_of
 
 FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
-FAR_M = 1000.0
-"""Receivers in cameras are not so wrong."""
-HIGH_M = 300.0
-"""Nor are their altitudes, whether above the sea, the ellipsoid or by air pressure."""
 
 
 @dataclass(frozen=True)
@@ -291,31 +287,34 @@ def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence
         centres: (3,) of each placed camera in the model, by the name of its photograph.
         photos: With or without positions.
     """
-    known = [
-        photo
-        for photo in photos
-        if photo.name in centres and photo.exif.position is not None and not photo.exif.unsigned
-    ]
+    found, metres = [], control.chart.metres
+    low = float(np.median(control.similarity.points(np.stack(list(centres.values())))[:, 2])) * metres
+    if low < LOW_M:
+        found.append(
+            f"the ground control points put the photographs {-low:.0f} m below zero, where little land is: do the "
+            "heights of the list count up?"
+        )
+    exif = {photo.name: photo.exif for photo in photos if photo.exif.position is not None and not photo.exif.unsigned}
+    known = [name for name in centres if name in exif]
     if not known:
-        return []
-    ours = control.similarity.points(np.stack([centres[photo.name] for photo in known]))
-    theirs = to_chart(control.chart, np.array([photo.exif.position for photo in known], np.float64))
-    away = np.linalg.norm((ours - theirs)[:, :2], axis=1) * control.chart.metres
-    away = float(np.median(np.where(np.isfinite(away), away, np.inf)))
-    if away > FAR_M:
-        far = f"{away / 1000:.0f} km" if np.isfinite(away) else "out of reach"
-        return [
+        return found
+    ours = control.similarity.points(np.stack([centres[name] for name in known]))
+    away = (ours - to_chart(control.chart, np.array([exif[name].position for name in known], np.float64))) * metres
+    across = np.linalg.norm(away[:, :2], axis=1)
+    across = float(np.median(np.where(np.isfinite(across), across, np.inf)))
+    rise = float(np.median(away[np.isfinite(away[:, 2]), 2])) if np.isfinite(away[:, 2]).any() else 0.0
+    if across > FAR_M:
+        far = f"{across / 1000:.0f} km" if np.isfinite(across) else "out of reach"
+        found.append(
             f"the ground control points put the photographs {far} from their positions in EXIF: is {control.chart.crs} "
             "the system of the list, with x east and y north?"
-        ]
-    rise = (ours - theirs)[:, 2] * control.chart.metres
-    high = float(np.median(rise[np.isfinite(rise)])) if np.isfinite(rise).any() else 0.0
-    if abs(high) > HIGH_M:
-        return [
-            f"the ground control points put the photographs {abs(high):.0f} m {'above' if high > 0 else 'below'} their "
+        )
+    elif abs(rise) > HIGH_M:
+        found.append(
+            f"the ground control points put the photographs {abs(rise):.0f} m {'above' if rise > 0 else 'below'} their "
             "altitudes in EXIF: do the heights of the list count up, in the unit of its system?"
-        ]
-    return []
+        )
+    return found
 
 
 def triangulate(images: Mapping[str, Any], marks: Mapping[str, tuple[float, float]]) -> np.ndarray | None:

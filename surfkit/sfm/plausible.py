@@ -11,6 +11,10 @@ from surfkit.readers.georeference import Similarity
 from surfkit.sfm.level import points_of, poses_of
 from surfkit.sfm.similarity import umeyama
 
+FAR_M, HIGH_M = 1000.0, 300.0
+"""Receivers in cameras are not so wrong, across and in altitude, whatever they count it from."""
+LOW_M = -100.0
+"""Little land is lower."""
 UPRIGHT = 0.5
 """Cosine between up on the map and up by how cameras are held; between this and its negative neither is sure."""
 LOOKS_UP = 0.3

@@ -18,6 +18,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.scene.earth import geocentric
 from surfkit.sfm.exif import Exif, Position
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.plausible import FAR_M, LOW_M
 from surfkit.sfm.position_list import Listed, read_list
 from surfkit.sfm.settings import Settings
 
@@ -29,8 +30,6 @@ NEAR_DEGREES = 1.0
 """Photographs of one survey are nearer to one another."""
 LOWEST_M = -500.0
 """No land is lower."""
-FAR_M = 1000.0
-"""Receivers in cameras are not so wrong."""
 APART_M = 100.0
 """EXIF and XMP of a photograph that differ by more contradict each other."""
 
@@ -238,6 +237,8 @@ def _heights(photos: Sequence[Photo]) -> list[Photo]:
     if low := [name for name, height in heights.items() if height < LOWEST_M]:
         emit(Warned(f"{len(low)} positions are below any land, and are taken as above their zero: {few(low)}"))
         heights |= {name: -heights[name] for name in low}
+    if heights and (middle := float(np.median(list(heights.values())))) < LOW_M:
+        emit(Warned(f"the positions are {-middle:.0f} m below their zero, where little land is: do they count down?"))
     if unsure := [photo.name for photo in given if photo.exif.no_reference and photo.name in heights]:
         emit(
             Warned(

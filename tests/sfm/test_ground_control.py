@@ -168,7 +168,8 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
     assert "96 km from" in far
     low = [lines[0]] + [" ".join([x, y, str(float(z) - 500), *rest]) for x, y, z, *rest in map(str.split, lines[1:])]
     path.write_text("\n".join(low))
-    (below,) = told()
+    sea, below = told()
+    assert re.search("[34].. m below zero", sea)
     assert re.search("5.. m below their altitudes in EXIF: do the heights of the list count up", below)
     path.write_text("\n".join([lines[0]] + ["5" + line for line in exchanged[1:]]))  # where no zone reaches
     with pytest.raises(BadInput, match="x is east and y north"):

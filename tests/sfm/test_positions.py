@@ -91,6 +91,8 @@ def test_altitudes(settled):
     assert at == [none, none] and "the altitudes of all 2 positions are 0, and count as missing" in said
     _, at, said = settled(photo(position=(*SOUTH[:2], -1600.0)))
     assert at == [(*SOUTH[:2], 1600.0)] and "below any land" in said
+    _, at, said = settled(photo(position=(*SOUTH[:2], -140.0)))
+    assert at == [(*SOUTH[:2], -140.0)] and "the positions are 140 m below their zero" in said
     _, at, said = settled(photo(position=SOUTH, no_reference=True))
     assert at == [SOUTH] and "(GPSAltitudeRef); it is taken as above: 'a.jpg'" in said
     _, at, said = settled(photo(position=none, above_start=40.0), photo("b.jpg", none, above_start=41.0))
