@@ -114,7 +114,8 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
                 "or name one with --positions-crs"
             )
         if text not in systems:
-            systems[text] = _system(f"EPSG:{text}" if text.isdigit() else text, said, row.at)
+            where = f"{said}: line {row.at}" if row.cells.get("crs") else said if crs is None else "--positions-crs"
+            systems[text] = _system(f"EPSG:{text}" if text.isdigit() else text, where)
         numbers = [_number(row.cells.get(axis), said, row, axis == "z") for axis in "xyz"]
         name = row.cells["name"]
         if name in found and found[name][2] != numbers:
@@ -127,11 +128,11 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
     return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
 
 
-def _system(text: str, said: str, at: int) -> System:
+def _system(text: str, where: str) -> System:
     try:
         return system_of(text)
     except BadInput as error:
-        raise BadInput(f"{said}: line {at}: {error}") from error
+        raise BadInput(f"{where}: {error}") from error
 
 
 def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]:
@@ -152,10 +153,10 @@ def _rows(lines: Sequence[str], said: str) -> tuple[str | None, list[Row], bool]
         if comment:
             continue
         cells = _split(text) if header is not None else _joined(_split(text))
-        if not rows and system is None and header is None and not any(mark in text for mark in MARKS):
-            if not (len(cells) > 2 and _is_number(cells[1])):
-                system = text  # by a name that pyproj may know
-                continue
+        first = not rows and system is None and header is None
+        if first and not any(mark in text for mark in MARKS) and not (len(cells) > 2 and _is_number(cells[1])):
+            system = text  # by a name that pyproj may know
+            continue
         row = Row(at, dict(zip(header or _plain(cells), (cell.strip() for cell in cells), strict=False)))
         if header is not None and not (row.cells.get("x") or row.cells.get("y")):
             continue  # a photograph without a position, as Metashape lists them

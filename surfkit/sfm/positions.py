@@ -86,19 +86,23 @@ def _by_list(photos: Sequence[Photo], root: Path, settings: Settings) -> tuple[l
         if not found.positions:
             raise BadInput(f"{said}: it names none of the {len(photos)} photographs, such as {photos[0].name!r}")
     else:
-        path = next((path for path in (root / GEO, root.resolve().parent / GEO) if path.is_file()), None)
+        path = next((path for path in (root / GEO, root.absolute().parent / GEO) if path.is_file()), None)
         if path is None:
             return list(photos), None
         said = str(path)
-        found = _named(read_list(path, said), photos, said)
+        try:
+            found = _named(read_list(path, said), photos, said)
+        except BadInput as error:
+            raise BadInput(
+                f"{error}; {GEO} is read as OpenDroneMap's list of positions: mend it, or rename it"
+            ) from error
         if not found.positions:
             emit(Warned(f"{said} names none of the photographs and is not used"))
             return list(photos), None
     own = sum(photo.name in found.positions and photo.exif.position is not None for photo in photos)
     others = [photo.name for photo in photos if photo.name not in found.positions]
-    kept = sum(photo.exif.position is not None or photo.exif.xmp_position is not None for photo in photos)
-    rest = f"; {len(others)} are not in it: {few(others)}" if others else ""
-    rest += ", which keep the position in EXIF, if they have one" if others and kept > own else ""
+    rest = f"; {len(others)} are not in it, and keep the position in EXIF if they have one" if others else ""
+    rest += f": {few(others)}" if others else ""
     instead = f", instead of those in EXIF of {own}" if own else ""
     emit(Warned(f"{said} gives the positions of {len(found.positions)} photographs in {found.named}{instead}{rest}"))
     listed = [_listed(photo, found) for photo in photos]

@@ -102,7 +102,9 @@ def test_several_systems(listed):
         ("EPSG:4326\na.jpg 1 nan 3", None, "line 2 is 'a.jpg 1 nan 3', not"),
         ("EPSG:4326\na.jpg,1,,3", None, "line 2 is"),
         ("foto,ost,nord\na.jpg,1,2", "EPSG:4326", "line 1 is 'foto ost nord', not name, x"),
-        ("WGS84 UTM 56Q\na.jpg 1 2 3", None, "line 2: 'WGS84 UTM 56Q' has the letter 'Q'"),
+        ("WGS84 UTM 56Q\na.jpg 1 2 3", None, "list: 'WGS84 UTM 56Q' has the letter 'Q'"),
+        ("name,x,y,crs\na.jpg,1,2,WGS84 UTM 1\n", None, "list: line 2: 'WGS84 UTM 1' has no letter"),
+        ("a.jpg 1 2 3", "WGS84 UTM 1", "--positions-crs: 'WGS84 UTM 1' has no letter"),
         ("no system\na.jpg 1 2 3", None, "'no system' is no coordinate reference system"),
     ],
 )  # fmt: skip

@@ -112,7 +112,10 @@ def test_a_list_comes_first_then_geo_txt_then_exif(settled, tmp_path):
     assert found.photos[0].exif.accuracy_m == (0.02, 0.02, 0.05)
     assert "geo.txt: 1 of its photographs are not in the folder: 'gone.jpg'" in said
     assert "geo.txt gives the positions of 1 photographs in EPSG:32756, instead of those in EXIF of 1" in said
-    assert "2 are not in it: 'sub/b.jpg', 'c.jpg', which keep the position in EXIF" in said and "km from" not in said
+    assert (
+        "2 are not in it, and keep the position in EXIF if they have one: 'sub/b.jpg', 'c.jpg'" in said
+        and "km from" not in said
+    )
     path = tmp_path / "table.csv"
     path.write_text("label,longitude,latitude,altitude\nB,151.2,-33.9,7\n")
     found, at, said = settled(*photos, settings=Settings(positions=path))
@@ -126,6 +129,9 @@ def test_geo_txt_in_the_folder_above_and_one_of_other_photographs(settled, tmp_p
     (tmp_path / "geo.txt").write_text("EPSG:4326\nother.jpg 1 2 3\n")
     _, at, said = settled(photo(position=SOUTH))
     assert at == [SOUTH] and "geo.txt names none of the photographs and is not used" in said
+    (tmp_path / "geo.txt").write_text("EPSG:4326\nmy notes on the geometry\n")
+    with pytest.raises(BadInput, match="line 2 is .*; geo.txt is read as OpenDroneMap's list of positions: mend it"):
+        settled(photo(position=SOUTH))
 
 
 def test_a_list_far_from_exif_is_told(settled):
