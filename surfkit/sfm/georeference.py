@@ -200,8 +200,8 @@ def _fitted(
     if hand.wrong:
         mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
         return Refused(
-            f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m: latitude and longitude are exchanged, "
-            "a sign is wrong, or heights count down"
+            f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m: latitude and longitude are exchanged "
+            "or have a wrong sign, or heights count down"
         )
     return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, hand.right)
 

@@ -11,7 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
 from surfkit.readers.georeference import POLAR, zone_of
 from surfkit.readers.wkt import parse_wkt
-from surfkit.scene.earth import from_utm
+from surfkit.scene.earth import from_utm, utm
 
 WGS84_DEGREES = "EPSG:4326"
 CODE = re.compile(r"(?:.*\()?(?:urn:ogc:def:crs:)?EPSG\s*:{0,2}\s*(\d+(?:\+\d+)?)\)?", re.IGNORECASE | re.DOTALL)
@@ -42,7 +42,8 @@ class System:
     def positions(self, xyz: np.ndarray) -> np.ndarray:
         """(P, 3) latitudes and longitudes, degrees on WGS 84, and heights, metres, of (P, 3) coordinates.
 
-        Heights are those of the list, counted from what it counts them from; those that are not known are not finite.
+        Heights are those of the list, counted from what it counts them from; those that are not known are not finite,
+        nor are latitude and longitude where the system does not reach.
 
         Raises:
             BadInput: pyproj is needed and not installed, or cannot tell.
@@ -50,7 +51,11 @@ class System:
         if self.crs == WGS84_DEGREES:
             return xyz[:, [1, 0, 2]]
         if self.crs.startswith("EPSG:") and (zone := zone_of(self.crs)):
-            return np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
+            found = np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
+            back = np.array([utm(*row, *zone) for row in found[:, :2].tolist()]).reshape(-1, 2)
+            beyond = (np.abs(found[:, 0]) > POLAR) | ~(np.abs(back - xyz[:, :2]) < 1).all(1)
+            found[beyond, :2] = np.nan  # the series are of no use there
+            return found
         with needed("pyproj", f"the coordinate reference system {self.crs}"):
             from pyproj import CRS, Transformer
         given = CRS(self.crs)

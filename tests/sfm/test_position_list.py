@@ -97,6 +97,7 @@ def test_several_systems(listed):
         ("EPSG:4326\na.jpg,1,2,3", "EPSG:4326", "names its system itself, 'EPSG:4326'; leave --positions-crs out"),
         ("name,x,y,crs\na.jpg,1,2,EPSG:4326", "EPSG:4326", "names its system itself"),
         ("EPSG:4326\na.jpg {e} {n} 1", None, "'a.jpg' is not in degrees, as EPSG:4326 says"),
+        ("WGS84 UTM 56S\na.jpg {n} {e} 1", None, "'a.jpg' is where EPSG:32756 does not reach; x is east and y north"),
         ("EPSG:4326\na.jpg 1 2 3\na.jpg 1 2 4", None, "lines 2 and 3 give two positions for 'a.jpg'"),
         ("EPSG:4326\na.jpg 1", None, "line 2 is 'a.jpg 1', not name, x"),
         ("EPSG:4326\na.jpg 1 nan 3", None, "line 2 is 'a.jpg 1 nan 3', not"),
