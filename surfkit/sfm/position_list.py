@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from surfkit.core.check import BadInput, few
+from surfkit.core.events import Warned, emit
 from surfkit.sfm.exif import MOST_ERROR_M, Position
 from surfkit.sfm.systems import WGS84_DEGREES, System, names_a_system, system_of
 
@@ -124,7 +125,7 @@ def read_list(path: Path, said: str, crs: str | None = None) -> Listed:
     if not found:
         raise BadInput(f"{said}: no positions; each line is {WANTED}")
     positions = _positions(found, said)
-    accuracies = {name: sigma for name, (row, *_) in found.items() if (sigma := _accuracy(row, said)) is not None}
+    accuracies = {name: sigma for name in positions if (sigma := _accuracy(found[name][0], said)) is not None}
     return Listed(positions, accuracies, list(dict.fromkeys(systems.values())))
 
 
@@ -239,10 +240,14 @@ def _positions(found: Mapping[str, tuple[Row, System, list[float | None]]], said
                 f"{said}: {few(wrong)} is not in degrees, as {system.crs} says; x is the longitude and y the latitude"
             )
         rows = system.positions(xyz)
-        if lost := [name for name, row in zip(names, rows, strict=True) if not np.isfinite(row[:2]).all()]:
-            raise BadInput(f"{said}: {few(lost)} is where {system.crs} does not reach; x is east and y north")
-        for name, (latitude, longitude, height) in zip(names, rows.tolist(), strict=True):
-            positions[name] = (latitude, longitude, height if np.isfinite(height) else None)
+        good = np.isfinite(rows[:, :2]).all(1) & rows[:, :2].any(1)
+        if not good.any():
+            raise BadInput(f"{said}: all positions are where {system.crs} does not reach; x is east and y north")
+        if lost := [name for name, reached in zip(names, good, strict=True) if not reached]:
+            emit(Warned(f"{said}: {len(lost)} positions are no place in {system.crs}, and are left out: {few(lost)}"))
+        for name, (latitude, longitude, height), reached in zip(names, rows.tolist(), good, strict=True):
+            if reached:
+                positions[name] = (latitude, longitude, height if np.isfinite(height) else None)
     return positions
 
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.optional import needed
-from surfkit.readers.georeference import POLAR, zone_of
+from surfkit.readers.georeference import BESIDE, POLAR, zone_of
 from surfkit.readers.wkt import parse_wkt
-from surfkit.scene.earth import from_utm, utm
+from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
 CODE = re.compile(r"(?:.*\()?(?:urn:ogc:def:crs:)?EPSG\s*:{0,2}\s*(\d+(?:\+\d+)?)\)?", re.IGNORECASE | re.DOTALL)
@@ -52,9 +52,8 @@ class System:
             return xyz[:, [1, 0, 2]]
         if self.crs.startswith("EPSG:") and (zone := zone_of(self.crs)):
             found = np.column_stack([*from_utm(xyz[:, 0], xyz[:, 1], *zone), xyz[:, 2]])
-            back = np.array([utm(*row, *zone) for row in found[:, :2].tolist()]).reshape(-1, 2)
-            beyond = (np.abs(found[:, 0]) > POLAR) | ~(np.abs(back - xyz[:, :2]) < 1).all(1)
-            found[beyond, :2] = np.nan  # the series are of no use there
+            away = np.abs(found[:, 1] - (6 * zone[0] - 183))
+            found[~((np.abs(found[:, 0]) <= POLAR) & (away < BESIDE)), :2] = np.nan
             return found
         with needed("pyproj", f"the coordinate reference system {self.crs}"):
             from pyproj import CRS, Transformer

@@ -5,6 +5,7 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
+from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import utm
 from surfkit.sfm.position_list import read_list
 
@@ -82,6 +83,13 @@ def test_heights_that_are_missing_blanks_in_names_and_accuracies(listed):
     assert found.accuracies == {"a": (0.1, 0.2, 0.3)}
 
 
+@pytest.mark.parametrize("text", ["EPSG:4326\na.jpg 151.2 -33.9\nb.jpg 0 0", "WGS84 UTM 56S\na.jpg {e} {n}\nb.jpg 0 0"])
+def test_places_of_a_receiver_without_a_fix_are_left_out(listed, text):
+    with collect_notes() as notes:
+        assert list(listed(text).positions) == ["a.jpg"]
+    assert "1 positions are no place in EPSG" in notes.texts[0] and "'b.jpg'" in notes.texts[0]
+
+
 def test_several_systems(listed):
     found = listed("name,x,y,z,crs\na,{e},{n},1,EPSG:32756\nb,151.2,-33.9,1,EPSG:4326")
     np.testing.assert_allclose(found.positions["a"], found.positions["b"], atol=1e-8)
@@ -97,7 +105,7 @@ def test_several_systems(listed):
         ("EPSG:4326\na.jpg,1,2,3", "EPSG:4326", "names its system itself, 'EPSG:4326'; leave --positions-crs out"),
         ("name,x,y,crs\na.jpg,1,2,EPSG:4326", "EPSG:4326", "names its system itself"),
         ("EPSG:4326\na.jpg {e} {n} 1", None, "'a.jpg' is not in degrees, as EPSG:4326 says"),
-        ("WGS84 UTM 56S\na.jpg {n} {e} 1", None, "'a.jpg' is where EPSG:32756 does not reach; x is east and y north"),
+        ("WGS84 UTM 56S\na.jpg {n} {e} 1", None, "all positions are where EPSG:32756 does not reach; x is east"),
         ("EPSG:4326\na.jpg 1 2 3\na.jpg 1 2 4", None, "lines 2 and 3 give two positions for 'a.jpg'"),
         ("EPSG:4326\na.jpg 1", None, "line 2 is 'a.jpg 1', not name, x"),
         ("EPSG:4326\na.jpg 1 nan 3", None, "line 2 is 'a.jpg 1 nan 3', not"),

@@ -107,7 +107,7 @@ GEO = "WGS84 UTM 56S\nA.JPG 333000 6247000 99 0 0 0 0.02 0.05\n"
 def test_a_list_comes_first_then_geo_txt_then_exif(settled, tmp_path):
     far = (-33.904, 151.194, 5.0)
     photos = [photo("a.jpg", far, accuracy_m=(3, 3, 6), unsigned=()), photo("sub/b.jpg", SOUTH), photo("c.jpg")]
-    found, at, said = settled(*photos, files={"geo.txt": GEO + "gone.jpg 1 2 3\n"})
+    found, at, said = settled(*photos, files={"geo.txt": GEO + "gone.jpg 333000 6247100 3\n"})
     assert at[0][2] == 99 and at[1:] == [SOUTH, None] and found.crs == "EPSG:32756"
     assert found.photos[0].exif.accuracy_m == (0.02, 0.02, 0.05)
     assert "geo.txt: 1 of its photographs are not in the folder: 'gone.jpg'" in said
