@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.cli.length import with_usual_steps
 from surfkit.cli.recipes import chosen_recipe, settled
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
@@ -86,7 +87,10 @@ class Doctor:
     def run(self) -> int:
         """Check, and print the findings."""
         data = self.reading.of(self.data)
-        recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
+        if self.steps is None:
+            recipe = with_usual_steps(self.recipe, data, self.device)
+        else:
+            recipe = with_steps(self.recipe, self.steps)
         with progress_bars() as report:
             examined = examine(data, recipe, self.quick, report)
             diagnosis = examined.diagnosis

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,6 +57,18 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
         print(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
+
+
+def what_next(run: Run) -> str:
+    """The commands that one would give after training, on one line."""
+    out = shlex.quote(str(run.out))
+    mesh = (
+        f"`surfkit maps {out}` draws maps of its mesh"
+        if run.mesh_record.exists()
+        else f"`surfkit mesh {out} mesh:tsdf` makes its mesh"
+    )
+    smaller = f"; `surfkit compress {out}` makes the model smaller" if run.cloud.exists() else ""
+    return f"next: `surfkit view {out}` shows it in a browser; {mesh}{smaller}"
 
 
 def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:

@@ -6,10 +6,41 @@ import io
 import os
 import select
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
 
 READER_LEFT = 141
 """What a shell reports for a program that SIGPIPE ends, and so what a command returns whose output nobody reads."""
 STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
+
+
+class Record(io.StringIO):
+    """What was printed, in the colours and the letters of a screen."""
+
+    def __init__(self, screen: TextIO) -> None:
+        super().__init__()
+        self.screen = screen
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """Of the screen; where there is none, boxes are drawn in ASCII."""
+        return self.screen.encoding
+
+    def isatty(self) -> bool:
+        """Whether the screen is a terminal."""
+        return self.screen.isatty()
+
+
+@contextmanager
+def recorded() -> Iterator[Record]:
+    """Within, what would go to stdout is recorded, and does not appear."""
+    screen = sys.stdout
+    sys.stdout = record = Record(screen)
+    try:
+        yield record
+    finally:
+        sys.stdout = screen
 
 
 def reopen_closed() -> None:

@@ -41,9 +41,8 @@ def command(monkeypatch, run):
 
 def test_help_lists_every_command(capsys):
     assert main(["--help"]) == main([]) == 0
-    out = capsys.readouterr().out
-    for name, text in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(text)}$", out, re.M)
+    out = " ".join(capsys.readouterr().out.split())  # texts are wrapped
+    assert all(f" {name} {text}" in out for name, text in COMMANDS.items())
 
 
 def test_version(capsys):
@@ -135,7 +134,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ([*OK, "--pretrain.losses.l1.weight", "x"], "--pretrain.losses.l1.weight: expected a number, got 'x'"),
         (
             [*OK, "--pretrain.losses.depth.until", "x"],
-            "--pretrain.losses.depth.until: expected None or a whole number, got 'x'",
+            "--pretrain.losses.depth.until: expected none or a whole number, got 'x'",
         ),
         ([*OK, "--pretrain.steps"], "--pretrain.steps: a value must follow"),
         (["evaluate", "RUN", "--seen"], "--seen: a value must follow"),
@@ -406,3 +405,54 @@ def test_help_loads_neither_torch_nor_tyro():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_names_no_none_of_python_and_none_is_a_value(world, capsys):
+    assert main(["train", "recipe:discs", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "None" not in out and re.search(r"--pretrain\.losses\.depth\.until INT\b", out)
+    for word in ("none", "None"):
+        words = ["train", "recipe:balls", "--data", "d", "pretrain.losses.depth:depth"]
+        assert main([*words, "--pretrain.losses.depth.until", word]) == 0
+        assert "until=None" in capsys.readouterr().out
+
+
+def test_no_part_of_surfkit_shows_none_of_python(capsys):
+    for command in ("train", "evaluate", "mesh", "maps"):
+        assert main([command, *["recipe:citygs2"] * (command == "train"), "--help"]) == 0
+        assert "None" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_prose_of_help_is_wrapped(capsys, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main(["mesh", "--help"]) == 0
+    about = capsys.readouterr().out.split("\n\n")[1:-1]
+    lines = "\n".join(part for part in about if "─" not in part).splitlines()
+    assert len(lines) > 2 and max(map(len, lines)) <= width
+    assert main(["--help"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines()[5:])) <= width
+
+
+def test_help_of_a_command_by_either_order(world, capsys):
+    assert main(["help", "train"]) == main(["train", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert out[: len(out) // 2] == out[len(out) // 2 :] != ""
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["discs"], "no recipe chosen: unexpected 'discs'; did you mean recipe:discs?"),
+        (["dics", "--data", "d"], "no recipe chosen: unexpected 'dics'; did you mean recipe:discs?"),
+        (
+            ["a/scene"],
+            "unexpected 'a/scene'; did you mean --data a/scene? And no recipe chosen: add one",
+        ),
+        ([*OK[1:], "relocate"], "unexpected 'relocate'; did you mean pretrain.grow:relocate?"),
+        ([*OK[1:], "a/scene"], "unexpected 'a/scene'; did you mean --data a/scene?"),
+    ],
+)
+def test_words_without_their_slot_or_flag(world, capsys, words, line):
+    assert main(["train", *words]) == 2
+    assert capsys.readouterr().err.startswith(f"surfkit: {line}")

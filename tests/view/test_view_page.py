@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from browser import LONG_S, Browser
+from browser import LONG_S, Browser, wait_until
 from models import ORIGIN, data_set, like_3dgs
 from needs import needs, needs_native
 
@@ -35,6 +35,7 @@ from surfkit.scene.scene import Frame
 from surfkit.view.film import FilmTool
 from surfkit.view.las import read_las
 from surfkit.view.page import show
+from surfkit.view.plain import as_text
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, served
 from surfkit.view.shelf import Shelf
@@ -115,7 +116,7 @@ def test_a_click_on_a_camera_shows_its_photograph(browser, page):
     camera = subject.views[1].camera
     ahead = camera.world_to_camera[2, :3].numpy()
     browser.click((camera.centre.numpy() - 0.1 * ahead) * WORLD, ahead)
-    browser.wait_for(lambda b: any(subject.views[1].name in text and "pixels" in text for text in b.texts()))
+    browser.wait_for(lambda b: any(as_text(subject.views[1].name) in text and "pixels" in text for text in b.texts()))
     browser.wait_for(lambda b: "/chosen" in b.names())
     browser.set("show", "error")
     browser.wait_for(lambda b: any("|render - photograph|" in text and "PSNR" in text for text in b.texts()))
@@ -226,6 +227,31 @@ def test_two_browsers_at_once(page, browser):
     browser.wait_for(lambda b: "/points" in b.names())
     assert "/measure/0" not in browser.names() and "/points" not in other.names()
     other.close()
+
+
+@needs_native
+def test_the_last_browser_that_leaves_takes_what_was_chosen_for_it(page, monkeypatch):
+    forgotten = []
+    monkeypatch.setattr(Shelf, "forget_choices", lambda shelf: forgotten.append(shelf))
+    first, second = (Browser(page[0].url) for _ in range(2))
+    for each in (first, second):
+        each.wait_for(Browser.is_whole)
+    forgotten.clear()  # when the one of the test before left
+    first.close()
+    wait_until(lambda: len(page[0].viser.get_clients()) == 1)
+    assert not forgotten
+    second.close()
+    wait_until(lambda: forgotten)
+
+
+def test_choices_that_are_forgotten_are_made_again(tmp_path):
+    write_mesh(tmp_path / "a.ply", TRIANGLE, SURVEY)
+    with opened_subject(tmp_path / "a.ply", "cpu") as subject:
+        shelf = Shelf(subject)
+        kept = shelf.mesh(1)
+        assert shelf.mesh(1) is kept
+        shelf.forget_choices()
+        assert shelf._mesh.cache_info().currsize == 0 and len(shelf.mesh(1).faces) == 1
 
 
 @needs_native
