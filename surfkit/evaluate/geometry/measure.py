@@ -99,6 +99,7 @@ def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
         "chamfer_dtu": {**chamfer(first.distances, far), "far": far},
         "points": {"reconstruction": len(first.reconstruction), "truth": len(first.truth)},
         "crop": crop and {"from": settings.crop, "low": crop.low, "high": crop.high, "area": crop.area},
+        "outside": outcome.outside,
         "truth_voxel": outcome.voxel,
         "seen_points": outcome.seen,
         "curve": {"tau": taus.tolist(), "precision": precision, "recall": recall},
