@@ -6,19 +6,19 @@ import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.heights import MAX_CELLS, mesh_of_cells
-from surfkit.evaluate.geometry.scores import spacing, tree
+from surfkit.evaluate.geometry.scores import surface_gap, tree
 from surfkit.evaluate.geometry.surface import Surface
 
-CELL = 1.5
-"""Side of a square, in mean distances of the points to their nearest neighbours in plan: few squares are empty."""
+CELL = 2.0
+"""Side of a square, in those of one that a single point would have: four points lie in each, and few are empty."""
 
 
 def highest(cloud: Surface) -> Surface:
-    """A mesh of the highest points of a cloud, z up: one vertex in each square of 1.5 mean distances of neighbours."""
+    """A mesh of the highest points of a cloud, z up: one vertex in each square of four points."""
     points = np.concatenate(list(cloud.blocks()))
     plan = points[:, :2] - points[:, :2].min(0)
     few = plan[:: max(1, len(plan) // 100_000)]
-    cell = CELL * spacing(tree(plan), few)
+    cell = CELL * surface_gap(tree(plan), few)
     if not cell > 0:
         raise BadInput(f"{cloud.path}: its points lie on top of one another, so there is no surface in it")
     at = np.floor(plan / cell).astype(np.int64)
