@@ -47,7 +47,8 @@ class Evaluate:
     """Run folder that `surfkit train` made, or a mesh or point cloud to compare with --gt."""
 
     gt: Path | None = None
-    """Ground truth: a point cloud or a mesh. PLY of any size; OBJ, STL, GLB and OFF are read by trimesh."""
+    """Ground truth: a point cloud or a mesh. PLY, LAS and LAZ of any size; E57; OBJ, STL, GLB and OFF; or a raster of
+    heights (GeoTIFF)."""
 
     views: Path | None = None
     """When a file is measured: run folder or data set whose training views define the crop volume."""

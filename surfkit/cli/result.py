@@ -261,6 +261,9 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     where = "all" if crop is None else f"area {crop['area']:.4g}, heights {crop['low']:.4g} to {crop['high']:.4g}"
     rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
     rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
+    if outside := found.get("outside"):  # not in metrics of older versions
+        shares = ", ".join(f"{share:.1%} {name}" for name, share in outside.items())
+        rows.append(("outside of it", f"{shares}: not measured"))
     for label, name in (("chamfer", "chamfer"), ("chamfer, as DTU", "chamfer_dtu")):
         values = [found[name][part] for part in ("accuracy", "completeness", "overall")]
         texts = ["-" if value is None else f"{value:.3g}" for value in values]

@@ -143,6 +143,7 @@ def names_of_row(report: Mapping[str, Any], at: int) -> list[str]:
     row = rows[at]
     numbers = {other["label"]: str(other["number"]) for other in rows}
     states = ["failed" if e["rows"][at]["failed"] else f"{len(e['rows'][at]['runs'])}/{seeds}" for e in entries]
+    states = ["blank" if e["rows"][at].get("not_as_named") else s for e, s in zip(entries, states, strict=True)]
     label = f"({row['label']})" if row["given_up"] else row["label"]
     return [str(row["number"]), label, numbers.get(row["built_on"], ""), ", ".join(states)]
 
@@ -157,6 +158,16 @@ def failures(report: Mapping[str, Any]) -> list[str]:
         for row in entry["rows"]
         if row["failed"]
     ]
+
+
+def blanks(report: Mapping[str, Any]) -> list[str]:
+    """A line for each reason why rows that were run have no figures, with these rows."""
+    found: dict[str, list[str]] = {}
+    for entry in data_sets(report):
+        for row in entry["rows"]:
+            if row.get("not_as_named") and row["label"] not in found.setdefault(row["not_as_named"], []):
+                found[row["not_as_named"]].append(row["label"])
+    return [f"not run as named, and blank: {', '.join(labels)}: {reason}" for reason, labels in found.items()]
 
 
 def note_lines(report: Mapping[str, Any]) -> list[str]:
@@ -191,7 +202,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     for row, data in zip(rows, entries[0]["rows"], strict=True):
         body += [["", f"*{data['group']}*", *[""] * (len(head) - 2)]] * bool(data["group"]) + [row]
     table = ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in body]
-    told = [f"- {text}" for text in (*failures(report), *note_lines(report), *sharing_lines(report))]
+    told = [f"- {text}" for text in (*failures(report), *blanks(report), *note_lines(report), *sharing_lines(report))]
     page = [f"# table:{report['table']}", caption(report), "\n".join(table), LEGEND, "\n".join(told)]
     return "\n\n".join(part for part in page if part) + "\n"
 

@@ -20,6 +20,7 @@ from needs import needs, needs_native
 
 from surfkit.cli import main
 from surfkit.core.check import BadInput
+from surfkit.evaluate.geometry.las import read_las
 from surfkit.export.files import format_for, format_of
 from surfkit.export.ply import write_splats
 from surfkit.export.table import SplatTable
@@ -33,7 +34,6 @@ from surfkit.run.notes import collect_notes
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
 from surfkit.view.film import FilmTool
-from surfkit.view.las import read_las
 from surfkit.view.page import show
 from surfkit.view.plain import as_text
 from surfkit.view.screen import WORLD
@@ -333,8 +333,8 @@ def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
     assert "/points" in names and (subject.frame.crs, subject.frame.metres) == ("EPSG:32632", 1.0)
     assert np.allclose(subject.frame.to_input(subject.points.xyz), many, atol=1e-3)
     assert subject.points.rgb[:, 0].tolist() == list(range(250)) and (subject.points.rgb[:, 1:] == [255, 0]).all()
-    monkeypatch.setattr("surfkit.view.las.MOST", 100)
-    monkeypatch.setattr("surfkit.view.las.AT_ONCE", 64)
+    monkeypatch.setattr("surfkit.view.subject.MOST_POINTS", 100)
+    monkeypatch.setattr("surfkit.evaluate.geometry.las.AT_ONCE", 64)
     places = cloud(tmp_path / "b.las", 6)
     with opened_subject(tmp_path / "b.las", "cpu") as subject:
         assert np.allclose(subject.frame.to_input(subject.points.xyz), places[::3], atol=1e-3)
@@ -343,7 +343,7 @@ def test_points_of_other_programs_are_shown(tmp_path, monkeypatch, capsys):
     cloud(tmp_path / "c.las", 6, wkt="somewhere")
     with collect_notes() as notes, opened_subject(tmp_path / "c.las", "cpu") as subject:
         assert subject.frame.crs is None
-        assert any("c.las: coordinates are shown without their reference system" in each for each in notes.texts)
+        assert any("c.las: coordinates are used without their reference system" in each for each in notes.texts)
     (tmp_path / "short.laz").write_bytes((tmp_path / "a.laz").read_bytes()[:1200])
     (tmp_path / "other.las").write_text("hello")
     capsys.readouterr()
