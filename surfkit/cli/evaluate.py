@@ -27,6 +27,7 @@ from surfkit.run.lod import load_levels, measure_levels
 from surfkit.run.measure import evaluate, note_compressed
 from surfkit.run.method import refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
+from surfkit.run.resume import read_unchanged
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -181,10 +182,12 @@ class Evaluate:
         if run is not None and self.views is not None:
             raise BadInput(f"--views {self.views}: a run has views of its own; leave it out, or name a file")
         if run is not None:
-            return read(run.data)
+            return read_unchanged(run)
         if self.views is None:
             return None
-        return read(opened(self.views).data if (self.views / "run.json").exists() else Data(self.views))
+        if (self.views / "run.json").exists():
+            return read_unchanged(opened(self.views))
+        return read(Data(self.views))
 
 
 def refuse_no_mesh(run: Run) -> None:
