@@ -85,7 +85,7 @@ class Doctor:
 
     def run(self) -> int:
         """Check, and print the findings."""
-        data = self.reading.of(self.data)
+        data = self.reading.of(self.data, self.recipe.test_every)
         recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
         with progress_bars() as report:
             examined = examine(data, recipe, self.quick, report)

@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.cli.result import show, show_geometry, show_levels
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
@@ -28,6 +29,7 @@ from surfkit.run.measure import evaluate, note_compressed
 from surfkit.run.method import refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
 from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import NONE_HELD_OUT
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -113,6 +115,8 @@ class Evaluate:
     def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
         run, scene = ctx.run, ctx.scene
         refuse_not_drawn(run)
+        if not scene.held_out:
+            emit(Warned(f"{run.out}: {NONE_HELD_OUT}"))
         zones.refuse_too_many(scene)
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         tree = load_levels(run, splats_of(run, made)) if self.lod else None

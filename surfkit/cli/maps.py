@@ -18,6 +18,7 @@ from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
 from surfkit.run.notes import collect_notes
 from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import note_held_out
 from surfkit.scene.scene import Frame
 from surfkit.texture.make import Subject
 from surfkit.train.bars import bars
@@ -61,6 +62,7 @@ class MapsOf:
         out = self.out or run.out / "maps"
         with collect_notes(), bars():
             scene, surface = read_unchanged(run), mesh_of(run.mesh)
+            note_held_out(run, scene)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)

@@ -26,6 +26,7 @@ from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
 from surfkit.run.method import refuse_mesher
 from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps_to_mesh
+from surfkit.run.warn import note_held_out
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -85,6 +86,7 @@ class MeshOf:
         self.mesh.ready()
         with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
             run, scene = ctx.run, ctx.scene
+            note_held_out(run, scene)
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             mesher = None if made.mesh is not None else self.mesh

@@ -85,7 +85,7 @@ class Depth:
         Raises:
             BadInput: There are maps that are not to be replaced, or nothing can be estimated.
         """
-        data = self.reading.of(self.data)
+        data = self.reading.of(self.data, test_every=0)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
         if notice := self.estimator.notice():

@@ -116,7 +116,7 @@ class Photos:
         """Make the depth maps that are not there; what the report says of them, and the time of all stages."""
         stages, command = Stages(self.scene / WORK), Depth(self.scene, estimator, device=self.device)
         done = stages.run("depth maps", key_of(estimator), lambda: command.make(renew=True))
-        preparation = DepthMaps(Data(self.scene), estimator, torch_device(self.device))
+        preparation = DepthMaps(Data(self.scene, test_every=0), estimator, torch_device(self.device))
         scene = read(preparation.data)
         count, lacking = len(preparation.views(scene)), preparation.lacking(scene)
         covered = [step.coverage for step in done if step.coverage is not None]
@@ -186,7 +186,7 @@ def maps_before(scene: Path) -> dict[str, Any] | None:
 
 def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
     """Say that the depth maps of a scene were made from other cameras or photographs than it has now, if so."""
-    data = Data(scene)
+    data = Data(scene, test_every=0)
     try:
         preparation = DepthMaps(data, load(DepthEstimator, maps.get("estimator")), torch.device("cpu"))
         outdated = preparation.is_outdated(preparation.material(read(data)))

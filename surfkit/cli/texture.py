@@ -16,6 +16,7 @@ from surfkit.mesh.simplify import require_simplification
 from surfkit.pipeline import opened
 from surfkit.run.notes import collect_notes
 from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import note_held_out
 from surfkit.scene.memory import cache_bytes
 from surfkit.texture.make import RECORD, Subject, TextureSettings, make_texture
 from surfkit.train.bars import bars
@@ -60,6 +61,7 @@ class TextureOf:
         out = self.out or run.out / "texture"
         with collect_notes(), bars(), full_disk_in_one_line(out):
             scene = read_unchanged(run)
+            note_held_out(run, scene)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)

@@ -39,7 +39,7 @@ def refuse_other_run(run: Run) -> None:
     now = dump(run.recipe)
     other = [name for name in ("mesh", "lod", "compress") if isinstance(there, dict) and there.get(name) != now[name]]
     if isinstance(there, dict):
-        there |= {name: now[name] for name in ("mesh", "lod", "compress")}  # training is the same
+        there |= {name: now[name] for name in ("mesh", "lod", "compress", "test_every")}  # training is the same
         before = there.get("refine")
         prefix = isinstance(before, list) and first_difference(before, now["refine"][: len(before)]) is None
         if prefix and there.get("pretrain") == now["pretrain"]:
