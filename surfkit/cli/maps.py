@@ -62,12 +62,12 @@ class MapsOf:
         out = self.out or run.out / "maps"
         with collect_notes(), bars():
             scene, surface = read_unchanged(run), mesh_of(run.mesh)
-            note_held_out(run, scene)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(frame)
             record = make_maps(Subject(surface, frame, scene.train), self.settings, out, other)
+            note_held_out(run, scene)
         show(out, record)
 
     def _other(self, frame: Frame) -> Surface:

@@ -86,7 +86,6 @@ class MeshOf:
         self.mesh.ready()
         with collect_notes(), bars(), loaded(self.run_folder, self.device, self.compressed) as (ctx, made):
             run, scene = ctx.run, ctx.scene
-            note_held_out(run, scene)
             if self.metres_per_unit is not None:
                 scene = replace(scene, frame=replace(scene.frame, metres=self.metres_per_unit))
             mesher = None if made.mesh is not None else self.mesh
@@ -94,6 +93,7 @@ class MeshOf:
             with locked(run.out), full_disk_in_one_line(run.out), maps as run, record_events(run.out):
                 what = mesh_input(run, made, scene, ctx.rasterizer, budget, mesher)
                 record = make_mesh(run, mesher or made.mesh, self.delivery, what, made.last_steps)
+            note_held_out(run, scene)
         show(run, record)
 
 

@@ -61,11 +61,11 @@ class TextureOf:
         out = self.out or run.out / "texture"
         with collect_notes(), bars(), full_disk_in_one_line(out):
             scene = read_unchanged(run)
-            note_held_out(run, scene)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             record = make_texture(Subject(mesh_of(run.mesh), frame, scene.train), self.settings, out, budget)
+            note_held_out(run, scene)
         show(out, record)
 
 

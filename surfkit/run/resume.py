@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import platform
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -138,7 +138,8 @@ def compared_data(run: Run, scene: Scene, skipped: set[str]) -> tuple[Fingerprin
         skipped: Names of photographs that the run has found damaged; they do not count.
     """
     before = read_json(run.inputs, Fingerprint) if run.inputs.exists() else None
-    now = _fingerprint_now(run, scene, before, run.files)
+    own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
+    now = fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None, run.files)
     if before is None:
         return now, None
     if (path := changed_file(before, now)) is not None:
@@ -187,7 +188,8 @@ def _read_compared(run: Run) -> tuple[Scene, str | None]:
         return scene, None
     before = read_json(run.inputs, Fingerprint)
     record = read_record(run.out)
-    now = _fingerprint_now(run, scene, before)
+    is_own = run.needs_priors and run.data.priors is None  # it was trained on maps of the data set, not on made ones
+    now = fingerprint(scene, before, prior_files(run.data, scene) if is_own else None)
     what = _difference(run, scene, before, now, record.get("skipped", ()))
     if what is None:
         return scene, None
@@ -197,11 +199,6 @@ def _read_compared(run: Run) -> tuple[Scene, str | None]:
         f"{run.out}: the data in {run.data.path} have changed since the run was trained: {what}"
         + (reads if trained_by not in (None, own_version()) else "")
     )
-
-
-def _fingerprint_now(run: Run, scene: Scene, before: Fingerprint | None, files: Sequence[Path] = ()) -> Fingerprint:
-    own = replace(run.data, priors=None)  # of maps that were made for the run, the name of their folder tells
-    return fingerprint(scene, before, prior_files(own, scene) if run.needs_priors else None, files)
 
 
 def _difference(run: Run, scene: Scene, before: Fingerprint, now: Fingerprint, skipped: Collection[str]) -> str | None:
