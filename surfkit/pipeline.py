@@ -28,7 +28,15 @@ from surfkit.readers.read import observations, read
 from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, discard_results, read_data, refuse_file, refuse_no_run
+from surfkit.run.folder import (
+    Run,
+    discard_results,
+    read_data,
+    refuse_file,
+    refuse_foreign,
+    refuse_links,
+    refuse_no_run,
+)
 from surfkit.run.journal import record_events
 from surfkit.run.lod import has_levels, make_wanted_levels
 from surfkit.run.measure import evaluate, measure_compressed
@@ -205,6 +213,7 @@ class Stages:
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
     refuse_file(run.out)
+    refuse_foreign(run.out)
     refuse_unused(run.recipe)
     refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
@@ -314,6 +323,7 @@ def opened(out: Path) -> Run:
         BadInput: The folder holds no run.
     """
     refuse_no_run(out)
+    refuse_links(out)
     return Run(out, read_json(out / "recipe.json", Recipe), read_data(out))
 
 

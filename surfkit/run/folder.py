@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import FileWritten, emit
 from surfkit.primitives.base import Primitive
@@ -22,6 +23,10 @@ SHARED = "shared.json"
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
 """In a run folder."""
 FOLDERS = ("pretrain", "partition", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
+
+
+MESHES = ("mesh.ply", "mesh.obj", "mesh.glb")
+"""Files of meshes in a run folder; others begin with `mesh-lod`."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +247,31 @@ def refuse_file(out: Path) -> None:
     for path in [*(out / name for name in FOLDERS), *out.glob("refine[0-9]")]:
         if path.is_file():
             raise BadInput(f"{path}: a file, where the run keeps a folder; delete it")
+
+    refuse_links(out)
+
+
+def refuse_foreign(out: Path) -> None:
+    """BadInput if a folder that holds no run has files of the names that a run would give to its own."""
+    if (out / "run.json").exists():  # the first that a run writes
+        return
+    names = (*FILES, "cameras.json", "mesh.json", *MESHES)
+    if foreign := [name for name in names if (out / name).exists()]:
+        raise BadInput(
+            f"--out {out}: no run folder (no run.json in it), but it has {few(foreign)}, which would be replaced; name "
+            "another folder"
+        )
+
+
+def refuse_links(out: Path) -> None:
+    """BadInput if a folder or journal in a run folder is a link to elsewhere: the run would write and delete there."""
+    for place, folders, files in os.walk(out):
+        for path in (Path(place, name) for name in (*folders, *{journal.NAME}.intersection(files))):
+            if path.is_symlink() and not path.resolve().is_relative_to(out.resolve()):
+                raise BadInput(
+                    f"{path}: a link out of the run folder, to {path.resolve()}, where nothing is written or deleted; "
+                    "put a folder or file in its place, or keep the whole run folder elsewhere"
+                )
 
 
 def refuse_no_run(out: Path) -> None:

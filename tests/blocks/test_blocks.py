@@ -188,9 +188,9 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
     shutil.copytree(undisturbed, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "blocks" / "001")
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
-    (tmp_path / "run" / "blocks" / ".merge.json.7.part").write_bytes(b"of a process that is gone")
+    (tmp_path / "run" / "blocks" / ".surfkit-merge.json.7.part").write_bytes(b"of a process that is gone")
     run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
-    assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".*.part"))
+    assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".surfkit-*"))
 
 
 def test_blocks_of_a_finished_run_can_be_deleted(undisturbed, data, recipe, tmp_path, capsys):

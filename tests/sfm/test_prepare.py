@@ -175,7 +175,7 @@ def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkey
         with monkeypatch.context() as patch:
             patch.setattr(module, name, stop)
             assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 130
-        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/lock").exists()
+        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/.surfkit-lock").exists()
     seen = watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert "_keep" not in seen
