@@ -15,7 +15,13 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from surfkit.cli.streams import READER_LEFT, reopen_closed, replace_unknown_letters, silence_lost_streams
+from surfkit.cli.streams import (
+    READER_LEFT,
+    outlive_terminal,
+    reopen_closed,
+    replace_unknown_letters,
+    silence_lost_streams,
+)
 from surfkit.core.check import BadInput, Fault
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
@@ -68,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
     2 is for arguments or data that the user can correct, 1 for a run that ran out of memory or disk or met NaN or Inf,
-    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C or SIGTERM, and 141 for output that
-    nobody reads any more.
+    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C, SIGTERM or a terminal that is closed
+    (SIGHUP), and 141 for output that nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -80,6 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # wait 2^4 cycles
     reopen_closed()
     replace_unknown_letters()
+    outlive_terminal()
     try:
         with terminable():
             status = _guarded(words)
