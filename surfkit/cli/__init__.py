@@ -22,7 +22,7 @@ from surfkit.cli.streams import (
     replace_unknown_letters,
     silence_lost_streams,
 )
-from surfkit.core.check import BadInput, Fault
+from surfkit.core.check import BadInput, Fault, printable
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
 from surfkit.core.signals import terminable
@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         where = f"standard {lost[0]}" if lost else os.fsdecode(error.filename or "what was being written")
         with suppress(OSError):
-            print(f"surfkit: {where}: {error.strerror}; what is finished is kept", file=sys.stderr)
+            print(printable(f"surfkit: {where}: {error.strerror}; what is finished is kept"), file=sys.stderr)
         return 1
 
 
@@ -141,7 +141,7 @@ def _guarded(words: list[str]) -> int:
         if (found := _error_line(error, words)) is None:
             raise
         text, status = found
-        print(f"surfkit: {text}", file=sys.stderr)
+        print(printable(f"surfkit: {text}"), file=sys.stderr)
         return status
 
 

@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from surfkit.cli.prepare_depth import OVERVIEW, Depth
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import Warned, emit
@@ -80,7 +80,7 @@ class Photos:
         """Prepare, and print the results and what to do next."""
         self.prepare()
         uses = ", which uses the depth maps if its losses or its mesh look at some" if self.depth is not None else ""
-        print(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
+        tell(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
 
     def prepare(self) -> None:
         """Prepare, and print the results."""
@@ -229,9 +229,9 @@ def show(report: dict[str, Any], scene: Path) -> None:
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
     for name, why in list(lost.items())[:SHOWN]:
-        print(f"no camera for {name!r}: {why}")
+        tell(f"no camera for {name!r}: {why}")
     if len(lost) > SHOWN:
-        print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
-    print(f"data set in {scene}; look at {scene / PICTURE}")
+        tell(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
+    tell(f"data set in {scene}; look at {scene / PICTURE}")
     if report.get("depth_maps"):
-        print(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")
+        tell(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")

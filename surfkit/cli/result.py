@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.run.folder import Run
@@ -55,7 +55,7 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
-        print(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
+        tell(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
 
 
 def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:

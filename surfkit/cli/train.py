@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -212,7 +211,7 @@ class Train:
             raise BadInput(
                 "no --data given, and the bundled example is only part of a source checkout; name a data set"
             )
-        print(f"no --data given: using the bundled example {EXAMPLE}", file=sys.stderr)
+        say(f"no --data given: using the bundled example {EXAMPLE}")
         return EXAMPLE
 
 

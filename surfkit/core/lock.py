@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import from_json, read_json
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import MARK
 
@@ -171,9 +171,11 @@ def _opened(path: Path) -> int:
 
 def _is_ours(content: bytes) -> bool:
     """Whether a file holds what `_lock` writes, or nothing: a process died before it had written."""
+    if not content:
+        return True
     try:
-        said = json.loads(content or b'{"pid": 0, "host": ""}')
-    except (ValueError, RecursionError):
+        said = from_json(content.decode())
+    except ValueError:  # BadInput, bytes that are no UTF-8
         return False
     return isinstance(said, dict) and said.keys() == {"pid", "host"}
 
