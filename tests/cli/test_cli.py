@@ -258,6 +258,16 @@ def test_under_nohup_a_closed_terminal_is_ignored(monkeypatch):
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.parametrize("module", ["surfkit", "surfkit.cli"])
+def test_it_runs_as_a_module(module, tmp_path):
+    """Where the command is not on the PATH; its exit status is that of the process."""
+    run = [sys.executable, "-m", module]
+    done = subprocess.run([*run, "--version"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("surfkit ")
+    done = subprocess.run([*run, "trian"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("surfkit: no command 'trian'; did you mean 'train'?")
+
+
 OUTLIVES = """
 import sys
 from pathlib import Path

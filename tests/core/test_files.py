@@ -36,7 +36,7 @@ def test_two_threads_write_the_same_file(tmp_path):
     def write(text):
         with replacing(tmp_path / "a.txt") as file:
             file.write(text)
-            both.wait(60)
+            both.wait()
 
     with ThreadPoolExecutor(2) as threads:
         list(threads.map(write, [b"one", b"two"]))
