@@ -22,9 +22,10 @@ def terminable() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    others = [number for number in asking() if number != signal.SIGINT]
-    handlers = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: _hung_up}
-    before = {number: signal.signal(number, handlers[number]) for number in others}
+    handlers = {signal.SIGTERM: signal.default_int_handler}
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        handlers[signal.SIGHUP] = _hung_up
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
