@@ -22,10 +22,9 @@ def terminable() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handlers = {signal.SIGTERM: signal.default_int_handler}
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, signal.default_int_handler)}
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        handlers[signal.SIGHUP] = _hung_up
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, _hung_up)
     try:
         yield
     finally:
