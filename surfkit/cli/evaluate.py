@@ -115,9 +115,9 @@ class Evaluate:
     def _photographs(self, ctx: RunContext, made: Reconstruction, zones: Zones) -> None:
         run, scene = ctx.run, ctx.scene
         refuse_not_drawn(run)
+        zones.refuse_too_many(scene)
         if not scene.held_out:
             emit(Warned(f"{run.out}: {NONE_HELD_OUT}"))
-        zones.refuse_too_many(scene)
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         tree = load_levels(run, splats_of(run, made)) if self.lod else None
         metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)

@@ -193,12 +193,12 @@ def _read_compared(run: Run) -> tuple[Scene, str | None]:
     what = _difference(run, scene, before, now, record.get("skipped", ()))
     if what is None:
         return scene, None
-    trained_by = (record.get("versions") or {}).get("surfkit")
-    reads = f" (or surfkit {own_version()} reads them otherwise than {trained_by}, which trained the run)"
-    return scene, (
-        f"{run.out}: the data in {run.data.path} have changed since the run was trained: {what}"
-        + (reads if trained_by not in (None, own_version()) else "")
-    )
+    text = f"{run.out}: the data in {run.data.path} have changed since the run was trained: {what}"
+    versions = record.get("versions")
+    trained_by = versions.get("surfkit") if isinstance(versions, dict) else None
+    if trained_by not in (None, own_version()):
+        text += f" (or surfkit {own_version()} reads them otherwise than {trained_by}, which trained the run)"
+    return scene, text
 
 
 def _difference(run: Run, scene: Scene, before: Fingerprint, now: Fingerprint, skipped: Collection[str]) -> str | None:

@@ -54,21 +54,35 @@ def test_a_folder_of_another_program_is_refused(source, tmp_path, capsys, name):
     assert [path.name for path in (tmp_path / "theirs").iterdir()] == [name]
 
 
-@pytest.mark.parametrize("linked", ["pretrain", "pictures", "mesh_pictures", "events.jsonl", "pictures/inner"])
+@pytest.mark.parametrize(
+    "linked", ["pretrain", "pictures", "mesh_pictures", "events.jsonl", "pictures/inner", "log.txt", "method/state"]
+)
 @pytest.mark.parametrize("command", ["train", "evaluate", "mesh"])
 def test_links_are_not_followed_out_of_it(source, out, tmp_path, capsys, linked, command):
     mine, link = tmp_path / "mine", out / linked
-    is_folder = not linked.endswith("jsonl")
     if link.exists():
         shutil.move(link, mine)
+    elif linked in ("log.txt", "method/state"):
+        link.parent.mkdir(exist_ok=True)
+        mine.write_text("mine")
     else:
         mine.mkdir()
-    link.symlink_to(mine, target_is_directory=is_folder)
+    link.symlink_to(mine)
     before = {path: path.read_bytes() for path in [mine, *mine.rglob("*")] if path.is_file()}
     words = {"train": [*WORDS, "--data", str(source / "data"), "--out", str(out)]}.get(command, [str(out)])
     assert main([command, *words]) == 2
     assert f"{link}: a link out of the run folder, to {mine}, where" in capsys.readouterr().err
     assert before == {path: path.read_bytes() for path in [mine, *mine.rglob("*")] if path.is_file()}
+
+
+def test_a_linked_file_is_replaced_and_what_it_leads_to_stays(out, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (out / "metrics.json").unlink()
+    (out / "metrics.json").symlink_to(tmp_path / "nowhere.json")
+    (out / "notes.txt").symlink_to(tmp_path / "mine.txt")
+    assert main(["evaluate", str(out), "--lpips-weights", "none"]) == 0
+    assert not (out / "metrics.json").is_symlink() and not (tmp_path / "nowhere.json").exists()
+    assert (out / "notes.txt").read_text() == "mine"
 
 
 def test_a_link_inside_and_a_linked_run_folder_are_fine(out, tmp_path):
