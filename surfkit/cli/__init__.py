@@ -18,8 +18,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from surfkit.cli.help_cache import HELP, keep, kept_help, show_kept
-from surfkit.cli.streams import READER_LEFT, recorded, reopen_closed, replace_unknown_letters, silence_lost_streams
-from surfkit.core.check import BadInput, Fault
+from surfkit.cli.streams import (
+    READER_LEFT,
+    outlive_terminal,
+    recorded,
+    reopen_closed,
+    replace_unknown_letters,
+    silence_lost_streams,
+)
+from surfkit.core.check import BadInput, Fault, printable
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
 from surfkit.core.signals import terminable
@@ -71,8 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
     2 is for arguments or data that the user can correct, 1 for a run that ran out of memory or disk or met NaN or Inf,
-    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C or SIGTERM, and 141 for output that
-    nobody reads any more.
+    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C, SIGTERM or a terminal that is closed
+    (SIGHUP), and 141 for output that nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -83,6 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # wait 2^4 cycles
     reopen_closed()
     replace_unknown_letters()
+    outlive_terminal()
     try:
         with terminable():
             status = _guarded(words) if argv is not None else _helped(words)
@@ -96,7 +104,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         where = f"standard {lost[0]}" if lost else os.fsdecode(error.filename or "what was being written")
         with suppress(OSError):
-            print(f"surfkit: {where}: {error.strerror}; what is finished is kept", file=sys.stderr)
+            print(printable(f"surfkit: {where}: {error.strerror}; what is finished is kept"), file=sys.stderr)
         return 1
 
 
@@ -160,7 +168,7 @@ def _guarded(words: list[str]) -> int:
         if (found := _error_line(error, words)) is None:
             raise
         text, status = found
-        print(f"surfkit: {text}", file=sys.stderr)
+        print(printable(f"surfkit: {text}"), file=sys.stderr)
         return status
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from surfkit.cli.recipes import ARGV
+from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
@@ -75,9 +76,9 @@ class Export:
             path.parent.mkdir(parents=True, exist_ok=True)
             form.write(path, table, frame, tree)
         told = form.rounding(table)
-        print(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
+        tell(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
         if any(frame.shift) and not (isinstance(form, Tiles3D) and form.georeference and frame.crs):
-            print(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
+            tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
         return replace(self.format, strict_2dgs=True) if self.strict_2dgs else self.format

@@ -18,8 +18,9 @@ from surfkit.evaluate.geometry.surface import Surface, read_surface, system_of
 from surfkit.maps.grid import same_crs
 from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
-from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
+from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import note_held_out
 from surfkit.scene.scene import Frame
 from surfkit.texture.make import Subject
 from surfkit.train.bars import bars
@@ -63,12 +64,13 @@ class MapsOf:
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
         with collect_notes(), bars():
-            scene, surface = read(run.data), mesh_of(run.mesh)
+            scene, surface = read_unchanged(run), mesh_of(run.mesh)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(frame)
             record = make_maps(Subject(surface, frame, scene.train), self.settings, out, other)
+            note_held_out(run, scene)
         show(out, record)
 
     def _other(self, frame: Frame) -> Surface:
@@ -83,7 +85,7 @@ class MapsOf:
             return heights_of(self.against)
         run = opened(self.against)
         refuse_no_mesh(run)
-        theirs = read(run.data).frame
+        theirs = read_unchanged(run).frame
         if not same_crs(theirs.crs, frame.crs):
             raise BadInput(
                 f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "

@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from surfkit.cli.prepare_depth import OVERVIEW, Depth
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import Warned, emit
@@ -80,7 +80,7 @@ class Photos:
         """Prepare, and print the results and what to do next."""
         self.prepare()
         uses = ", which uses the depth maps if its losses or its mesh look at some" if self.depth is not None else ""
-        print(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
+        tell(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
 
     def prepare(self) -> None:
         """Prepare, and print the results."""
@@ -116,7 +116,7 @@ class Photos:
         """Make the depth maps that are not there; what the report says of them, and the time of all stages."""
         stages, command = Stages(self.scene / WORK), Depth(self.scene, estimator, device=self.device)
         done = stages.run("depth maps", key_of(estimator), lambda: command.make(renew=True))
-        preparation = DepthMaps(Data(self.scene), estimator, torch_device(self.device))
+        preparation = DepthMaps(Data(self.scene, test_every=0), estimator, torch_device(self.device))
         scene = read(preparation.data)
         count, lacking = len(preparation.views(scene)), preparation.lacking(scene)
         covered = [step.coverage for step in done if step.coverage is not None]
@@ -186,7 +186,7 @@ def maps_before(scene: Path) -> dict[str, Any] | None:
 
 def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
     """Say that the depth maps of a scene were made from other cameras or photographs than it has now, if so."""
-    data = Data(scene)
+    data = Data(scene, test_every=0)
     try:
         preparation = DepthMaps(data, load(DepthEstimator, maps.get("estimator")), torch.device("cpu"))
         outdated = preparation.is_outdated(preparation.material(read(data)))
@@ -230,9 +230,9 @@ def show(report: dict[str, Any], scene: Path) -> None:
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
     for name, why in list(lost.items())[:SHOWN]:
-        print(f"no camera for {name!r}: {why}")
+        tell(f"no camera for {name!r}: {why}")
     if len(lost) > SHOWN:
-        print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
-    print(f"data set in {scene}; look at {scene / PICTURE}")
+        tell(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
+    tell(f"data set in {scene}; look at {scene / PICTURE}")
     if report.get("depth_maps"):
-        print(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")
+        tell(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.run.folder import Run
@@ -56,7 +56,7 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
-        print(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
+        tell(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
 
 
 def what_next(run: Run) -> str:
@@ -117,7 +117,7 @@ def refuse_damaged(path: Path, complaint: str) -> Iterator[None]:
 def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """What metrics.json says of a run, without the geometry."""
     images = metrics["images"]
-    rows = [] if "not_measured" in images else [("views held out", str(len(images["per_image"])))]
+    rows = [] if "not_measured" in images else [("views held out", _held_out(len(images["per_image"])))]
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
         rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
@@ -141,6 +141,10 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
     return rows
+
+
+def _held_out(count: int) -> str:
+    return f"{count}, which training has not seen" if count else "none, so nothing to measure with"
 
 
 def before_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:

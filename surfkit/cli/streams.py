@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import select
@@ -64,6 +65,35 @@ def replace_unknown_letters() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
+
+
+def outlive_terminal() -> None:
+    """Let output to a terminal go nowhere once that is closed: an error of writing must not end what is to be saved.
+
+    SIGHUP, which asks to stop, comes a moment later, or never to a process that a shell has disowned.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, io.TextIOWrapper) or not stream.isatty():
+            continue
+        if not isinstance(getattr(stream.buffer, "raw", None), _Terminal):
+            file = io.BufferedWriter(_Terminal(stream.fileno(), "wb", closefd=False))
+            settings = {"encoding": stream.encoding, "errors": stream.errors, "line_buffering": True}
+            setattr(sys, name, io.TextIOWrapper(file, **settings))
+
+
+class _Terminal(io.FileIO):
+    """Writes to a terminal, and to nobody when it is gone."""
+
+    def write(self, content: bytes) -> int | None:
+        """As FileIO does."""
+        try:
+            return super().write(content)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            _give_to_null(self.fileno())
+            return super().write(content)
 
 
 def silence_lost_streams() -> list[str]:

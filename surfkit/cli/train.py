@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from surfkit.readers.data import Reading
 from surfkit.readers.read import bare_photographs
 from surfkit.recipe import Recipe, unused
 from surfkit.report.tensorboard import tensorboard
-from surfkit.run.folder import Run
+from surfkit.run.folder import Run, read_data
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals
 from surfkit.train.material import CacheSettings
 from surfkit.view.server import LOCAL, Address, refuse_wrong_port
@@ -179,8 +178,9 @@ class Train:
                 say("--view: the page ends with the run")
 
     def _train(self, following: Callable[[Path], AbstractContextManager[None]] = nullcontext) -> None:
-        data = self.reading.of(self._with_cameras(self._data()))
-        out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.folder}"
+        path = self._with_cameras(self._data())
+        out = self.out or Path("runs") / f"{path.resolve().name}-{self.folder}"
+        data = self.reading.of(path, self._test_every(out))
         if self.steps is None:
             recipe = with_usual_steps(self.recipe, data, self.device, out)
         else:
@@ -193,6 +193,11 @@ class Train:
             metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
         print(f"\n{what_next(Run(out, recipe, data))}")
+
+    def _test_every(self, out: Path) -> int:
+        """Which photographs are held out where nobody says: those that the run in a folder has begun without, or as the
+        recipe has it. Older versions held out every 8th with all recipes."""
+        return read_data(out).test_every if (out / "run.json").exists() else self.recipe.test_every
 
     def _with_cameras(self, data: Path) -> Path:
         """The data set; with --prepare, that of a folder of photographs, made now or taken up where it was left."""
@@ -212,7 +217,7 @@ class Train:
             raise BadInput(
                 "no --data given, and the bundled example is only part of a source checkout; name a data set"
             )
-        print(f"no --data given: using the bundled example {EXAMPLE}", file=sys.stderr)
+        say(f"no --data given: using the bundled example {EXAMPLE}")
         return EXAMPLE
 
 

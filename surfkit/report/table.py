@@ -12,6 +12,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from surfkit.core.check import printable
 from surfkit.report.columns import COLUMNS, shown_columns
 from surfkit.report.notes import row_numbers
 from surfkit.report.sharing import sharing_lines
@@ -223,18 +224,20 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
     below = published_cells(rows, names if len(entries) == 1 else beside)
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for head in ("", "row", "on", "seeds", *_heads(entries, names), *(f"{COLUMNS[n].head}\npaper" for n in beside)):
-        table.add_column(head, justify="left" if head == "row" else "right", no_wrap=head != "row")
+        table.add_column(
+            Text(printable(head, lines=True)), justify="left" if head == "row" else "right", no_wrap=head != "row"
+        )
     for at, row in enumerate(rows):
         failed = any(entry["rows"][at]["failed"] for entry in entries)
         style = "red" if failed else "bold" if row["label"] == running else "dim" if row["given_up"] else ""
         if row["group"]:
-            table.add_row("", Text(row["group"], "italic"))
+            table.add_row("", Text(printable(row["group"]), "italic"))
         number, label, on, seeds = names_of_row(report, at)
         label = f"> {label}" if row["label"] == running else label
         stacked = below[at] if len(entries) == 1 else [Cell()] * len(names)
         cells = [_stacked(cell, *pair, style) for group in own for cell, *pair in zip(group[at], stacked, strict=True)]
         extra = [Text(_two_lines(cell), "dim") for cell in (below[at] if beside else ())]
-        table.add_row(number, Text(label, style), on, seeds, *cells, *extra)
+        table.add_row(number, Text(printable(label), style), on, seeds, *cells, *extra)
     return table
 
 

@@ -48,7 +48,7 @@ SOURCES = (".py", ".cu", ".cpp", ".h", ".so")
 """Endings of files with code of a plugin."""
 PLAN, TUNE = ("partition", "assign", "min_views", "partition_pretrain"), ("tune", "context")
 """Fields of the recipe that belong to the plan of the blocks, and to tuning them."""
-OTHERS = ("about", "depth", "refine", "mesh", "lod", "compress")
+OTHERS = ("about", "test_every", "depth", "refine", "mesh", "lod", "compress")
 """Fields with parts of their own, and those that count only where depth maps are looked at, or never."""
 
 

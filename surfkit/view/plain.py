@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+from surfkit.core.check import printable
+
 MARKS = re.compile(r"([\\`*_\[\]<>#|~&])")
 """What Markdown and HTML begin with within a line; CommonMark takes each for itself behind a backslash."""
 LIST = re.compile(r"(?=[-+=\d])")
@@ -16,17 +18,12 @@ JOINER = "\u2060"
 
 def as_text(text: object) -> str:
     """Markdown that shows a text as it is: no mark in it makes a tag, a link, a picture or bold letters."""
-    shown = LINKS.sub(rf"\1{JOINER}", printable(text))
+    shown = LINKS.sub(rf"\1{JOINER}", printable(str(text)))
     return MARKS.sub(r"\\\1", JOINER + shown if LIST.match(shown) else shown)
 
 
 def as_code(text: object) -> str:
     """Markdown that shows a text as code, to be copied: it ends where the text does, whatever marks this has."""
-    shown = printable(text)
+    shown = printable(str(text))
     fence = "`" * (1 + max((len(run) for run in re.findall("`+", shown)), default=0))
     return f"{fence} {shown} {fence}" if "`" in shown else f"`{shown}`"
-
-
-def printable(text: object) -> str:
-    """On one line; what cannot be printed is shown by its number."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(text))

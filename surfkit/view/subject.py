@@ -34,6 +34,7 @@ from surfkit.render.path import up_of
 from surfkit.run.context import RunContext
 from surfkit.run.lod import load_levels
 from surfkit.run.method import with_drawing
+from surfkit.run.resume import read_noting_changes
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.texture.deliver import NAME
 from surfkit.texture.make import RECORD
@@ -109,7 +110,7 @@ def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
         BadInput: It is neither, damaged, or there is nothing in it to look at.
     """
     if path.is_dir() and not (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
-        with loaded(path, device) as (ctx, made):
+        with loaded(path, device, read_data=read_noting_changes) as (ctx, made):
             yield of_run(ctx, made)
         return
     if not path.exists():

@@ -231,11 +231,65 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
     assert main(["export"]) == 3
 
 
-def test_sigterm_is_an_interrupt(monkeypatch, capsys):
-    before = signal.getsignal(signal.SIGTERM)
-    command(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGTERM))
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_sigterm_and_a_closed_terminal_are_an_interrupt(monkeypatch, capsys, number):
+    before, after = signal.getsignal(number), []
+
+    def asked():
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            if number == signal.SIGHUP:  # comes again, while what is begun is put away
+                os.kill(os.getpid(), number)
+            after.append("put away")
+
+    command(monkeypatch, asked)
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(number) == before and after == ["put away"]
+
+
+def test_under_nohup_a_closed_terminal_is_ignored(monkeypatch):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        command(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGHUP))
+        assert main(["export"]) == 0 and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("module", ["surfkit", "surfkit.cli"])
+def test_it_runs_as_a_module(module, tmp_path):
+    """Where the command is not on the PATH; its exit status is that of the process."""
+    run = [sys.executable, "-m", module]
+    done = subprocess.run([*run, "--version"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("surfkit ")
+    done = subprocess.run([*run, "trian"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("surfkit: no command 'trian'; did you mean 'train'?")
+
+
+OUTLIVES = """
+import sys
+from pathlib import Path
+from surfkit.cli.streams import outlive_terminal
+outlive_terminal()
+outlive_terminal()
+print("on the terminal", flush=True)
+sys.stdin.readline()
+for stream in (sys.stdout, sys.stderr) * 2:
+    print("to nobody", file=stream, flush=True)
+Path(sys.argv[1]).write_text("saved")
+"""
+
+
+def test_output_to_a_terminal_that_was_closed_ends_nothing(tmp_path):
+    ours, theirs = os.openpty()
+    words = [sys.executable, "-c", OUTLIVES, str(tmp_path / "state")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        assert os.read(ours, 100) == b"on the terminal\r\n"
+        os.close(ours)
+        process.communicate(b"now\n")
+    assert process.returncode == 0 and (tmp_path / "state").read_text() == "saved"
 
 
 def test_our_own_mistakes_keep_their_traceback(monkeypatch):

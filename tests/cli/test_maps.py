@@ -142,7 +142,7 @@ def test_no_run_and_no_mesh(tmp_path, run, capsys):
 
 def test_without_the_package_of_textures_nothing_is_read(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    monkeypatch.setattr("surfkit.cli.maps.read", lambda data: pytest.fail("the data set is read"))
+    monkeypatch.setattr("surfkit.cli.maps.read_unchanged", lambda run: pytest.fail("the data set is read"))
     assert main(["maps", str(run), "--colors", "photographs"]) == 2
     assert "needs the package fast_simplification" in capsys.readouterr().err
 

@@ -286,6 +286,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
         return {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
 
     monkeypatch.setattr(truth, "opened", Opened)
+    monkeypatch.setattr(truth, "read_unchanged", lambda run: read(run.data))
     monkeypatch.setattr(truth, "measure_geometry", measure)
     gt = tmp_path / "gt.ply"
     vertices = "".join(f"{x} {y} 0\n" for x in range(20) for y in range(20))

@@ -175,7 +175,7 @@ def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkey
         with monkeypatch.context() as patch:
             patch.setattr(module, name, stop)
             assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 130
-        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/lock").exists()
+        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/.surfkit-lock").exists()
     seen = watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert "_keep" not in seen
@@ -391,10 +391,10 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
     capsys.readouterr()
     assert main([*words, *SMALL_MAPS]) == 0 and seen == []
     said = capsys.readouterr()
-    assert "1 of 5 photographs have depth maps already" in said.err
-    assert "of 5 of 5 photographs" in said.out and f"surfkit train recipe:surface --data {scene}" in said.out
+    assert "1 of 6 photographs have depth maps already" in said.err
+    assert "of 6 of 6 photographs" in said.out and f"surfkit train recipe:surface --data {scene}" in said.out
     report = json.loads((scene / "report.json").read_text())
-    assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (5, [])
+    assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (6, [])
     assert report["depth_maps"]["estimator"]["longest"] == 48 and report["seconds"]["depth maps"] > 0
     sweep = ("estimator:plane-sweep", "--estimator.longest", "48", "--device", "cpu")
     assert main(["prepare", "depth", str(other), *sweep]) == 0
