@@ -210,6 +210,11 @@ def show(report: dict[str, Any], scene: Path) -> None:
     first = models[0]
     rows.append(("points", f"{first['points']:,}, each in {first['track_length']:.1f} photographs on average"))
     rows.append(("reprojection error", f"{first['reprojection_error_px']:.2f} px"))
+    lenses, heights = first["weighed"]["focal_lengths_px"], first["weighed"]["heights_times"]
+    lens, more = lenses[0], f" (first of {len(lenses)} lenses)" if len(lenses) > 1 else ""
+    exif = "none in EXIF" if lens["exif"] is None else f"{lens['exif']:.0f} px in EXIF"
+    said = f"{exif}, {lens['photographs_alone']:.0f} by the photographs alone, {lens['final']:.0f} in the end{more}"
+    rows.append(("focal length", f"{said}; heights are {heights:.2f} times those by the photographs alone"))
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))

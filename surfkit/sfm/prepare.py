@@ -19,6 +19,7 @@ from surfkit.sfm.adjust import adjust_once
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
 from surfkit.sfm.engine import load_engine
+from surfkit.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
 from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
 from surfkit.sfm.ground_control import Control, Ground, doubts, place_by_points, read_ground
 from surfkit.sfm.level import turn_upright, up_direction
@@ -73,9 +74,9 @@ class Preparation:
             raise BadInput(self._no_model(photos, reasons(photos, found.counts, matches, [])))
         placed = stages.run("georeference", "", lambda: self._place(models, photos, site))
         by_name = {photo.name: photo for photo in photos}
-        done = [(model, None if where is None else _placed(where)) for model, where in placed]
+        done = [(model, None if where is None else _placed(where)) for model, where, _ in placed]
         stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
-        names = [set(centres_of(model)) for model, _ in placed]
+        names = [set(centres_of(model)) for model, _, _ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
     def _look(self) -> list[Photo]:
@@ -126,14 +127,15 @@ class Preparation:
 
     def _place(
         self, models: Sequence[Path], photos: Sequence[Photo], site: Chart | Ground | None
-    ) -> list[tuple[Any, Placement | Control | None]]:
-        """The models, each on the map or level."""
+    ) -> list[tuple[Any, Placement | Control | None, Weighed]]:
+        """The models, each on the map or level, and what became of their focal lengths and heights."""
         return [self._place_one(number, read_model(path), site, photos) for number, path in enumerate(models)]
 
     def _place_one(
-        self, number: int, model: Any, site: Chart | Ground | None, photos: Sequence[Photo]
-    ) -> tuple[Any, Placement | Control | None]:
+        self, number: int, alone: Any, site: Chart | Ground | None, photos: Sequence[Photo]
+    ) -> tuple[Any, Placement | Control | None, Weighed]:
         by_name = {photo.name: photo for photo in photos}
+        model = self._with_exif(number, alone, by_name)
         where: Placement | Control | Refused
         if isinstance(site, Ground):
             where = place_by_points(model, site, self.settings.checkpoints)
@@ -143,31 +145,59 @@ class Preparation:
             where = Refused("no photograph has a position in EXIF" if self.settings.gps else "--no-gps")
         if isinstance(where, Refused):
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
-            return _levelled(model, by_name), None
+            return _levelled(model, by_name), None, self._weighed(number, alone, model, by_name)
         if isinstance(where, Control):
             for doubt in doubts(where, centres_of(model), _up(model, by_name), photos):
                 emit(Warned(f"sparse/{number}: {doubt}"))
         model.transform(_sim3d(where.similarity))
         _name_wrong(where)
         if isinstance(where, Control):
-            return model, where
+            return model, where, self._weighed(number, alone, model, by_name)
+        inside, cameras = where.fit.inside, where.onto - where.fit.residuals
+        heights = where.onto[inside], where.sigma[inside, 2], height_above_ground(model)
+        stretch = height_stretch(cameras[inside], *heights)
         adjusted = adjust_once(model, where, by_name, self.settings, self.work / "adjusted" / str(number))
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
-        return adjusted or model, where
+        final = adjusted or model
+        return final, where, self._weighed(number, alone, final, by_name, stretch)
+
+    def _with_exif(self, number: int, alone: Any, photos: dict[str, Photo]) -> Any:
+        """A copy of the model, adjusted to the focal lengths of EXIF if there are some."""
+        copy = load_engine().Reconstruction(alone)
+        if not exif_focals(alone, photos):
+            return copy
+        found = adjust_once(copy, None, photos, self.settings, self.work / "weighed" / str(number))
+        if found is None:
+            emit(Warned(f"sparse/{number}: the focal lengths of EXIF do not fit the photographs and are left out"))
+        return found or copy
+
+    def _weighed(
+        self,
+        number: int,
+        alone: Any,
+        final: Any,
+        photos: dict[str, Photo],
+        stretch: tuple[float, float] | None = None,
+    ) -> Weighed:
+        """What became of focal lengths and heights; what is doubtful of it is said."""
+        found = weighed(alone, final, photos, stretch)
+        for doubt in found.doubts():
+            emit(Warned(f"sparse/{number}: {doubt}"))
+        return found
 
     def _report(
         self,
         stages: Stages,
         photos: Sequence[Photo],
-        placed: Sequence[tuple[Any, Placement | Control | None]],
+        placed: Sequence[tuple[Any, Placement | Control | None, Weighed]],
         why: dict[str, str],
     ) -> dict[str, Any]:
         report = {
             "photographs": len(photos),
             "registered": placed[0][0].num_reg_images(),
             "not_registered": why,
-            "models": [model_facts(model, where) for model, where in placed],
+            "models": [model_facts(model, where) | {"weighed": moved.facts()} for model, where, moved in placed],
             "seconds": stages.seconds(),
             "settings": self.settings,
         }
