@@ -45,9 +45,9 @@ class Photos:
     `surfkit train` reads.
 
     SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
-    positions in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one
-    with other settings or photographs does again only what depends on them. `depth:patch-match` or another estimator
-    makes depth maps too, as `surfkit prepare depth SCENE` does.
+    positions in EXIF, XMP or geo.txt it lies on the map, else it is level. An interrupted command continues when it is
+    given again; one with other settings or photographs does again only what depends on them. `depth:patch-match` or
+    another estimator makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
@@ -218,7 +218,8 @@ def show(report: dict[str, Any], scene: Path) -> None:
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))
-        rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north, {up:.2f} up of {place['positions']}"))
+        above = f", {up:.2f} up" if up is not None else ""
+        rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north{above} of {place['positions']}"))
     if ground := first.get("ground_control"):
         rows.append(("on the map", f"{ground['crs']}, offset {' '.join(f'{value:.0f}' for value in ground['offset'])}"))
         for what in ("control", "checkpoints"):

@@ -33,10 +33,17 @@ class Placed:
             raise BadInput("crs must name a system, offset and metres_per_unit must be finite numbers")
 
 
-def read_placed(folder: Path) -> Placed | None:
-    """Where the cameras in a folder lie; None if no file says so."""
-    path = folder / FILE
-    return read_json(path, Placed) if path.is_file() else None
+def read_placed(*folders: Path) -> Placed | None:
+    """Where the cameras lie by the file in one of some folders; None if no file says so.
+
+    Raises:
+        BadInput: A file is damaged, or two of them differ.
+    """
+    paths = [path for path in dict.fromkeys(folder / FILE for folder in folders) if path.is_file()]
+    found = [read_json(path, Placed) for path in paths]
+    if other := next((path for path, placed in zip(paths, found, strict=True) if placed != found[0]), None):
+        raise BadInput(f"{paths[0]} and {other} differ; delete the one that is wrong")
+    return found[0] if found else None
 
 
 def on_the_map(capture: Capture, placed: Placed) -> Capture:

@@ -29,6 +29,8 @@ DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MOST_THREADS = 8
 """Photographs that are read at once."""
+EDITION = 1
+"""Changes when more is found in a photograph: it is looked at again then."""
 DARK, FLAT = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
 
@@ -48,6 +50,7 @@ class Photo:
         contrast: Standard deviation of grey levels.
         sharpness: Standard deviation of the Laplacian over the contrast, of the draft.
         problem: Why it cannot be used; None if it can.
+        edition: `EDITION` of the code that looked at it.
     """
 
     name: str
@@ -60,6 +63,7 @@ class Photo:
     contrast: float = 0.0
     sharpness: float = 0.0
     problem: str | None = None
+    edition: int = 0
 
     @property
     def usable(self) -> bool:
@@ -156,13 +160,13 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     if not _is_text(name):
         return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
-    if before is not None and before.stamp == stamp:
+    if before is not None and before.stamp == stamp and before.edition == EDITION:
         copy = (before.problem or "").startswith("a copy of")
         return replace(before, problem=None) if copy else before
     try:
-        return _look(path, Photo(name, stamp))
+        return _look(path, Photo(name, stamp, edition=EDITION))
     except BadInput as error:
-        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "))
+        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "), edition=EDITION)
 
 
 def _is_text(name: str) -> bool:

@@ -39,10 +39,19 @@ class Settings:
     less robust."""
 
     gps: bool = True
-    """Place the scene on Earth by the positions in EXIF. Without it, or without such positions, it is only levelled."""
+    """Place the scene on Earth by the positions of the photographs. Without it, or without positions, it is only
+    levelled."""
+
+    positions: Path | None = None
+    """Positions of the photographs in a file, instead of those in EXIF: OpenDroneMap's geo.txt, or a table (CSV) of
+    name, x, y, z. A geo.txt beside the photographs, or in the folder above, is found without it."""
+
+    positions_crs: str | None = None
+    """Coordinate reference system of --positions, where the file names none."""
 
     crs: str = "auto"
-    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is the zone of UTM."""
+    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is that of --positions or
+    geo.txt if it is a map, else the zone of UTM."""
 
     gcp: Path | None = None
     """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""
@@ -60,5 +69,9 @@ class Settings:
             raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
         if self.crs != "auto" and not self.gps and self.gcp is None:
             raise BadInput(f"--crs {self.crs} needs positions, which --no-gps leaves out; leave out one of the two")
+        if self.positions is not None and not self.gps:
+            raise BadInput("--positions gives positions, which --no-gps leaves out; leave out one of the two")
+        if self.positions_crs is not None and self.positions is None:
+            raise BadInput("--positions-crs is that of --positions FILE, which is not given")
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

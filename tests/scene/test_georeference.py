@@ -14,11 +14,11 @@ from surfkit.export.table import SplatTable
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
 from surfkit.readers.opensfm import ODM
-from surfkit.readers.read import read, read_capture
+from surfkit.readers.read import observations, read, read_capture
 from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import utm
 from surfkit.scene.scene import Frame
-from surfkit.testing.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 from .folders import surveyed
 
@@ -177,3 +177,28 @@ def test_an_offset_that_is_none(tmp_path):
 def test_the_unit_that_a_user_gives():
     with pytest.raises(BadInput, match="--metres-per-unit 0: it must be more than 0"):
         Data(None, metres_per_unit=0)
+
+
+PLACED = {"crs": "EPSG:25832", "offset": [451_234.5, 5_873_456.25, 37.0]}
+
+
+@pytest.mark.parametrize("place", [".", "sparse", "sparse/0"])
+def test_a_colmap_model_is_on_the_map_by_a_file_beside_it_or_above(tmp_path, place):
+    write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
+    plain = read(Data(tmp_path))
+    local = observations(Data(tmp_path), plain).xyz
+    (tmp_path / place / "georeference.json").write_text(json.dumps(PLACED))
+    scene = read(Data(tmp_path))
+    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:25832", 1.0, tuple(PLACED["offset"]))
+    np.testing.assert_allclose(scene.frame.origin, plain.frame.origin + PLACED["offset"], atol=1e-6)
+    np.testing.assert_allclose(observations(Data(tmp_path), scene).xyz, local, atol=1e-6)
+
+
+def test_two_files_that_put_a_colmap_model_in_two_places_are_refused(tmp_path):
+    write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
+    for place in (".", "sparse/0"):
+        (tmp_path / place / "georeference.json").write_text(json.dumps(PLACED))
+    assert read(Data(tmp_path)).frame.crs == "EPSG:25832"
+    (tmp_path / "georeference.json").write_text(json.dumps(PLACED | {"crs": "EPSG:25833"}))
+    with pytest.raises(BadInput, match=r"sparse/0/georeference.json and .*/georeference.json differ"):
+        read(Data(tmp_path))

@@ -10,9 +10,10 @@ from surfkit.scene.earth import from_utm
 from surfkit.sfm.adjust import adjust
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.focal import Focal, height_stretch, weighed
-from surfkit.sfm.georeference import chart_of
+from surfkit.sfm.positions import Positions
 from surfkit.sfm.prepare import Preparation
 from surfkit.sfm.settings import Settings
+from surfkit.sfm.site import readings
 
 from .flight import ALTITUDE, FOCAL, fly, reconstructed
 
@@ -35,9 +36,9 @@ def placed(flight, focal_px, folder, sigma=(2.0, 2.0, 4.0), stated=None):
         replace(photo, exif=replace(photo.exif, position=tuple(place), accuracy_m=stated))
         for photo, place in zip(flight.photos(focal_px).values(), positions.tolist(), strict=True)
     ]
-    preparation = Preparation(folder, folder / "scene", Settings())
+    preparation, given = Preparation(folder, folder / "scene", Settings()), Positions(photos)
     with collect_notes():
-        [(model, _, found)] = preparation._place([folder / "model"], photos, chart_of(positions, "auto"))
+        [(model, _, found)] = preparation._place([folder / "model"], given, readings(given, "auto"))
     return alone, model, found
 
 
