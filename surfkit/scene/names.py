@@ -9,7 +9,9 @@ from typing import TypeVar
 from surfkit.core.events import Warned, emit
 
 T = TypeVar("T")
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"})
+HEIF = frozenset({".heic", ".heif"})
+"""Photographs of telephones, that Pillow reads with pillow-heif only."""
+PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"}) | HEIF
 SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
     lambda path: str(path).lower(),
     lambda path: str(path).removesuffix(path.suffix).lower(),

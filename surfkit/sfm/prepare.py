@@ -18,6 +18,7 @@ from surfkit.readers.placed import Placed
 from surfkit.sfm.adjust import adjust_once
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
+from surfkit.sfm.deliver_masks import deliver_masks
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
 from surfkit.sfm.georeference import Placement, Refused, centres_of
@@ -25,12 +26,13 @@ from surfkit.sfm.ground_control import Control, Ground, doubts, place_by_points,
 from surfkit.sfm.level import points_of, turn_upright, up_of
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import matched
-from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look
+from surfkit.sfm.photographs import PHOTOGRAPHS, Photo
 from surfkit.sfm.plausible import upside_down
 from surfkit.sfm.positions import Positions, settle
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import REPORT, WORK, Settings
 from surfkit.sfm.site import Reading, decide, locate, readings
+from surfkit.sfm.sources import Sources, look_at_all
 
 PICTURE = "cameras.png"
 
@@ -40,7 +42,7 @@ class Preparation:
     """A folder of photographs on its way to a data set.
 
     Attributes:
-        root: Folder of the photographs; nothing is written there.
+        root: Folder of the photographs, or a video; nothing is written there.
         scene: The data set.
         settings: How cameras are found.
         refuse: Raises BadInput if the usable photographs do not fit what comes after the cameras.
@@ -64,13 +66,13 @@ class Preparation:
         """
         load_engine()
         stages = Stages(self.work)
-        photos = stages.run("photographs", "", self._look)
+        sources, photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
         self.refuse(usable)
-        positions = settle(usable, self.root, self.settings) if self.settings.gps else Positions(usable)
+        positions = settle(usable, sources.root, self.settings) if self.settings.gps else Positions(usable)
         usable, site = positions.photos, self._site(positions)
-        found = compare(stages, usable, self.root, self.work, self.settings)
+        found = compare(stages, usable, sources, self.work, self.settings)
         key = key_of(found.key, self.settings.mapper, self.settings.seed)
         models = stages.run("cameras", key, lambda: self._map(found.database, len(found.rich)), self._load_models)
         matches = matched(found.database)
@@ -79,15 +81,20 @@ class Preparation:
         placed = stages.run("georeference", "", lambda: self._place(models, positions, site))
         by_name = {photo.name: photo for photo in usable}
         done = [(model, None if where is None else _placed(where)) for model, where, _ in placed]
-        stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
+        stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources))
         names = [set(centres_of(model)) for model, _, _ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
-    def _look(self) -> list[Photo]:
+    def _look(self) -> tuple[Sources, list[Photo]]:
         path = self.work / PHOTOGRAPHS
-        photos = look(self.root, known_photographs(path))
+        sources, photos = look_at_all(self.root, self.work, path, self.settings)
         write_json(path, photos)
-        return photos
+        return sources, photos
+
+    def _deliver(self, models: Sequence[tuple[Any, Placed | None]], photos: dict[str, Photo], sources: Sources) -> None:
+        """Write photographs, masks and models of the data set."""
+        deliver_masks([model for model, _ in models], photos, sources, self.scene, self.work)
+        deliver(models, photos, sources, self.scene, self.work)
 
     def _refuse_few(self, photos: Sequence[Photo], usable: Sequence[Photo]) -> None:
         if len(usable) >= SMALLEST:
