@@ -29,8 +29,8 @@ from surfkit.readers.depth_prior import trust_warning
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
+from surfkit.scene.names import VIDEOS, is_video
 from surfkit.scene.scene import View
-from surfkit.sfm.frames import VIDEOS, is_video
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.prepare import PICTURE, Preparation
 from surfkit.sfm.settings import REPORT, WORK, Settings

@@ -21,7 +21,6 @@ from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing_folder
 from surfkit.core.optional import needed
 
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
 RECORD = "frames.json"
 """What was taken of a video, beside the frames."""
 RECIPE = "1"
@@ -81,11 +80,6 @@ class Track:
 
     way: np.ndarray
     sharpness: np.ndarray
-
-
-def is_video(path: Path) -> bool:
-    """Whether a path is that of a video, by its ending."""
-    return path.suffix.lower() in VIDEOS and path.is_file()
 
 
 def require_opencv(video: Path) -> Any:

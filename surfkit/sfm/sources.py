@@ -14,9 +14,9 @@ from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot
 from surfkit.readers.masks import ENDS, check_mask, find_masks
 from surfkit.readers.masks import FOLDER as MASKS
-from surfkit.scene.names import PICTURES
+from surfkit.scene.names import PICTURES, is_video
 from surfkit.sfm.exif import Exif
-from surfkit.sfm.frames import Taken, is_video, take_frames
+from surfkit.sfm.frames import Taken, take_frames
 from surfkit.sfm.photographs import Photo, files_of, known_photographs, look, look_at
 from surfkit.sfm.settings import Settings
 

@@ -12,7 +12,7 @@ from PIL import Image
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
-from surfkit.readers.read import read
+from surfkit.readers.read import bare_photographs, read
 from surfkit.run.notes import collect_notes
 from surfkit.sfm import frames
 from surfkit.sfm.frames import Track, choose, take_frames
@@ -172,3 +172,12 @@ def test_without_opencv_one_line_names_the_extra(walk, tmp_path, monkeypatch, ca
     assert "pip install 'surfkit[video]'" in said
     with pytest.raises(BadInput, match="pip install"):
         take_frames(walk, tmp_path / "f", 0.04, 300)
+
+
+def test_training_on_a_video_says_what_to_do(walk, tmp_path, capsys):
+    words = ["train", "recipe:2dgs", "--out", str(tmp_path / "run"), "--data"]
+    assert main([*words, str(walk)]) == 2
+    assert f"walk.mp4: a video; `surfkit prepare photos {walk}` finds the cameras" in capsys.readouterr().err
+    assert main([*words, str(walk.parent)]) == 2
+    assert f"`surfkit prepare photos {walk.parent}` finds the cameras" in capsys.readouterr().err
+    assert bare_photographs(walk) == walk and bare_photographs(walk.parent) == walk.parent
