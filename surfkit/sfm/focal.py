@@ -28,6 +28,8 @@ MARKS = 64
 LEVEL = 0.02
 """Cameras whose heights, less a plane, spread by less than this share of their height above the ground say nothing of
 the focal length: bundle adjustment bends a model by up to a tenth of it."""
+SAMPLE = 100
+"""Cameras that tell how far away the ground is."""
 PARALLEL = 0.06
 """Root mean square of the sines between the axes of photographs, below which all look the same way."""
 
@@ -159,7 +161,7 @@ class Weighed:
             ],
             "heights_times": round(self.heights, 3),
             "gps_heights_times": None if self.stretch is None else [round(value, 3) for value in self.stretch],
-        }  # fmt: skip
+        }
 
     def doubts(self) -> list[str]:
         """What contradicts each other, or is known from one source only, a line for each."""
@@ -252,8 +254,10 @@ def height_stretch(
 
 
 def height_above_ground(model: Any) -> float:
-    """Median distance of the ground from the cameras."""
-    return float(np.median([_depth(model, model.image(number)) for number in model.reg_image_ids()]))
+    """Median distance of the ground from the cameras, by some of them that are spread over all."""
+    numbers = sorted(model.reg_image_ids())
+    some = numbers[:: -(-len(numbers) // SAMPLE)]
+    return float(np.median([_depth(model, model.image(number)) for number in some]))
 
 
 def _relative_height(model: Any) -> float:

@@ -7,6 +7,7 @@ they were chosen anew. So a camera that stands still gets nowhere, however long.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from surfkit.core.optional import needed
 
 RECORD = "frames.json"
 """What was taken of a video, beside the frames."""
+NAME = re.compile(r"\d{6,}\.jpg")
+"""Of a frame: its number in the video, from 0."""
 RECIPE = "1"
 """Changes when other frames would be taken of the same video."""
 QUALITY = 95
@@ -107,7 +110,7 @@ def take_frames(video: Path, folder: Path, step: float, most: int) -> Taken:
         before = read_json(folder / RECORD, Taken)
     except BadInput:
         before = None
-    if before is not None and before.key == key and all((folder / name).is_file() for name in before.names):
+    if before is not None and before.key == key and all(_is_there(folder, name) for name in before.names):
         _tell(video, before)
         return before
     cv2 = require_opencv(video)
@@ -188,11 +191,16 @@ def choose(track: Track, step: float, most: int) -> tuple[list[int], float]:
         step *= len(chosen) / most
 
 
+def _is_there(folder: Path, name: str) -> bool:
+    """Whether a frame lies in a folder, and not elsewhere."""
+    return NAME.fullmatch(name) is not None and (folder / name).is_file()
+
+
 def _tell(video: Path, taken: Taken) -> None:
     """Say how many frames were taken, and whether they overlap."""
-    said = f"{video}: {len(taken.names)} of {taken.frames} frames are taken, one each {taken.step:.0%} of the width"
+    said = f"{video}: {len(taken.names)} of {taken.frames} frames are taken, one each time that the picture moves by"
     wide = ", so that they hardly overlap; give more --frames" if taken.step > WIDE else ""
-    emit(Warned(f"{said} that the picture moves{wide}"))
+    emit(Warned(f"{said} {taken.step:.0%} of its width{wide}"))
 
 
 def _opened(cv2: Any, video: Path) -> Any:

@@ -183,9 +183,9 @@ class Preparation:
                 )
             )
             return model, where, None
-        inside, cameras = where.fit.inside, where.onto - where.fit.residuals
-        heights = where.onto[inside], where.sigma[inside, 2], height_above_ground(model)
-        stretch = height_stretch(cameras[inside], *heights)
+        inside, ground = where.fit.inside, height_above_ground(model)
+        cameras, onto = (where.onto - where.fit.residuals)[inside], where.onto[inside]
+        stretch = height_stretch(cameras, onto, where.sigma[inside, 2], ground)
         adjusted = adjust_once(model, where, photos, self.settings, self.work / "adjusted" / str(number))
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))

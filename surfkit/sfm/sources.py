@@ -81,13 +81,14 @@ def _taken(root: Path, folder: Path, settings: Settings) -> dict[str, Taken]:
     files = files_of(root, settings.masks)
     pictures = {path.with_suffix("").as_posix().lower() for path in files if path.suffix.lower() in PICTURES}
     videos = [path for path in files if is_video(path)]
-    if live := [path.name for path in videos if path.with_suffix("").as_posix().lower() in pictures]:
-        said = f"{len(live)} videos are called as a photograph beside them, as live photos are: {few(live)}"
+    if live := [path for path in videos if path.with_suffix("").as_posix().lower() in pictures]:
+        names = few([path.name for path in live])
+        said = f"{len(live)} videos are called as a photograph beside them, as live photos are: {names}"
         emit(Warned(f"{said}; no frames are taken of them"))
     found, wrong = {}, {}
     for path in videos:
         name = path.relative_to(root).as_posix()
-        if path.name in live:
+        if path in live:
             continue
         try:
             found[name] = take_frames(path, folder / name, settings.frame_step, settings.frames)

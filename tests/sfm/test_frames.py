@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -27,14 +28,19 @@ BLURRED = (3, 4, 9, 40, 41)
 QUICK = ("--features", "800")
 
 
-def film(path, angles=ANGLES, blurred=BLURRED, seed=0):
+@lru_cache(maxsize=None)
+def shown(angle):
+    """(H, W, 3) uint8 of the scene from an angle."""
+    return picture(looking((15 * np.cos(angle), 15 * np.sin(angle), 11)))
+
+
+def film(path, angles=ANGLES, blurred=BLURRED):
     """A video of cameras that look at the scene from these angles."""
     path.parent.mkdir(parents=True, exist_ok=True)
     code = "MJPG" if path.suffix == ".avi" else "mp4v"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), 25, (WIDTH, HEIGHT))
-    shown = {angle: picture(looking((15 * np.cos(angle), 15 * np.sin(angle), 11)), seed) for angle in angles}
     for at, angle in enumerate(angles):
-        pixels = np.ascontiguousarray(shown[angle][..., ::-1])
+        pixels = np.ascontiguousarray(shown(angle)[..., ::-1])
         writer.write(cv2.GaussianBlur(pixels, (0, 0), 4) if at in blurred else pixels)
     writer.release()
     return path
@@ -60,19 +66,21 @@ def test_sharp_frames_are_taken_evenly_and_of_a_rest_only_one(tmp_path, name):
     moved = np.abs(np.diff([ANGLES[at] for at in chosen]))
     assert moved.max() < 2.5 * np.median(moved), "evenly, though the camera rests for half of the time"
     assert notes.texts == [
-        f"{path}: {len(chosen)} of 50 frames are taken, one each 4% of the width that the picture moves"
+        f"{path}: {len(chosen)} of 50 frames are taken, one each time that the picture moves by 4% of its width"
     ]
     with Image.open(tmp_path / "frames" / taken.names[0]) as image:
-        shown = np.asarray(image, float)
-    truth = picture(looking((15 * np.cos(ANGLES[chosen[0]]), 15 * np.sin(ANGLES[chosen[0]]), 11)))
-    assert np.abs(shown - truth).mean() < 6, "the frame of that number"
+        pixels = np.asarray(image, float)
+    assert np.abs(pixels - shown(ANGLES[chosen[0]])).mean() < 6, "the frame of that number"
 
 
 def test_no_more_frames_are_taken_than_asked_for(walk, tmp_path):
     with collect_notes() as notes:
         taken = take_frames(walk, tmp_path / "f", 0.005, 5)
     assert 3 <= len(taken.names) <= 5 and numbers(taken)[-1] > 36 and taken.step > 0.005
-    assert f"of 50 frames are taken, one each {taken.step:.0%} of the width" in notes.texts[0]
+    assert (
+        f"of 50 frames are taken, one each time that the picture moves by {taken.step:.0%} of its width"
+        in notes.texts[0]
+    )
 
 
 def test_frames_that_are_there_are_not_taken_again(walk, tmp_path, monkeypatch):
@@ -84,6 +92,14 @@ def test_frames_that_are_there_are_not_taken_again(walk, tmp_path, monkeypatch):
     assert take_frames(walk, tmp_path / "f", 0.04, 300) == first and seen == [1]
     assert len(take_frames(walk, tmp_path / "f", 0.1, 300).names) < len(first.names) and seen == [1, 1]
     assert len(list((tmp_path / "f").glob("*.jpg"))) < len(first.names), "those of other settings are gone"
+
+
+def test_a_record_that_names_files_elsewhere_counts_for_nothing(walk, tmp_path):
+    first = take_frames(walk, tmp_path / "f", 0.1, 300)
+    save(tmp_path / "000000.jpg", shown(0.0))
+    record = json.loads((tmp_path / "f/frames.json").read_text())
+    (tmp_path / "f/frames.json").write_text(json.dumps(record | {"names": ["../000000.jpg"]}))
+    assert take_frames(walk, tmp_path / "f", 0.1, 300) == first
 
 
 def test_the_sharpest_near_each_step_is_chosen():
