@@ -150,10 +150,9 @@ class Preparation:
         placed = []
         for number, (before, model) in enumerate(zip(alone, loaded, strict=True)):
             final, where, stretch = self._place_one(number, model, chosen, photos)
-            moved = weighed(before, final, photos, stretch)
-            for doubt in moved.doubts():
-                emit(Warned(f"sparse/{number}: {doubt}"))
-            placed.append((final, where, moved))
+            placed.append((final, where, weighed(before, final, photos, stretch)))
+        for doubt in placed[0][2].doubts():  # of the others, which have the same lenses mostly, the report says it
+            emit(Warned(f"sparse/0: {doubt}"))
         return placed
 
     def _place_one(

@@ -107,9 +107,12 @@ def _with_masks(sources: Sources, photos: Sequence[Photo], folder: Path) -> tupl
     shots = [Shot(photo.name, np.eye(4), None, sources.path(photo.name)) for photo in photos]
     masks = find_masks(sources.root, folder.absolute(), shots)
     masks = {name: path for name, path in masks.items() if path.is_relative_to(folder.absolute())}
+    if not masks:
+        named = "NAME.jpg.png or NAME.png, as the photograph NAME.jpg"
+        raise BadInput(f"--masks {folder}: no picture in it has the name of a photograph; call masks {named}")
     idle = [path.name for path in sorted(folder.absolute().rglob("*")) if path.suffix.lower() in ENDS]
     idle = [name for name in idle if name not in {path.name for path in masks.values()}]
-    if masks and idle:
+    if idle:
         emit(Warned(f"--masks {folder}: {len(idle)} masks have the name of no photograph: {few(idle)}"))
     found = []
     for photo in photos:

@@ -3,7 +3,7 @@
 import json
 import struct
 import sys
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ BLURRED = (3, 4, 9, 40, 41)
 QUICK = ("--features", "800")
 
 
-@lru_cache(maxsize=None)
+@cache
 def shown(angle):
     """(H, W, 3) uint8 of the scene from an angle."""
     return picture(looking((15 * np.cos(angle), 15 * np.sin(angle), 11)))

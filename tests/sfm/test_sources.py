@@ -106,6 +106,9 @@ def test_masks_that_do_not_fit_are_told(folder):
     Image.new("L", (WIDTH, HEIGHT // 2), 255).save(folder / "m/flight/1.png")
     with pytest.raises(BadInput, match=r"1.png: 240 x 90 px is not the shape of its photograph"):
         sources_of(folder, masks=folder / "m")
+    (folder / "empty").mkdir()
+    with pytest.raises(BadInput, match="empty: no picture in it has the name of a photograph; call masks NAME.jpg.png"):
+        sources_of(folder, masks=folder / "empty")
     with pytest.raises(BadInput, match="no such folder of masks"):
         sources_of(folder, masks=folder / "nowhere")
 
