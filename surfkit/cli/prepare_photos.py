@@ -29,6 +29,7 @@ from surfkit.readers.depth_prior import trust_warning
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
+from surfkit.scene.names import VIDEOS, is_video
 from surfkit.scene.scene import View
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.prepare import PICTURE, Preparation
@@ -41,7 +42,7 @@ SHOWN = 10
 
 @dataclass(frozen=True)
 class Photos:
-    """Find the cameras of a folder of photographs by structure from motion, and write a data set that
+    """Find the cameras of a folder of photographs, or of a video, by structure from motion, and write a data set that
     `surfkit train` reads.
 
     SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
@@ -51,10 +52,10 @@ class Photos:
     """
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-    """Folder of photographs, in folders inside it or not; nothing is written there."""
+    """Folder of photographs and videos, in folders inside it or not, or one video; nothing is written there."""
 
     out: Path | None = None
-    """SCENE, the folder of the data set; by default FOLDER-scene beside the folder of photographs."""
+    """SCENE, the folder of the data set; by default FOLDER-scene beside the folder of photographs, or VIDEO-scene."""
 
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
     """How cameras are found."""
@@ -74,7 +75,8 @@ class Photos:
     @property
     def scene(self) -> Path:
         """The folder of the data set."""
-        return self.out or self.photos.resolve().with_name(f"{self.photos.resolve().name}-scene")
+        name = self.photos.stem if is_video(self.photos) else self.photos.resolve().name
+        return self.out or self.photos.resolve().with_name(f"{name}-scene")
 
     def run(self) -> None:
         """Prepare, and print the results and what to do next."""
@@ -85,8 +87,9 @@ class Photos:
     def prepare(self) -> None:
         """Prepare, and print the results."""
         root, scene = self.photos, self.scene
-        if not root.is_dir():
-            raise BadInput(f"{root}: {'a file' if root.exists() else 'no such folder'}; name a folder of photographs")
+        if not root.is_dir() and not is_video(root):
+            what = "a file, and no video that is known by its ending" if root.exists() else "no such folder"
+            raise BadInput(f"{root}: {what}; name a folder of photographs, or a video ({', '.join(sorted(VIDEOS))})")
         refuse_overlap(root, scene)
         refuse_foreign(scene)
         if self.depth is not None:
@@ -210,6 +213,11 @@ def show(report: dict[str, Any], scene: Path) -> None:
     first = models[0]
     rows.append(("points", f"{first['points']:,}, each in {first['track_length']:.1f} photographs on average"))
     rows.append(("reprojection error", f"{first['reprojection_error_px']:.2f} px"))
+    lenses, heights = first["weighed"]["focal_lengths_px"], first["weighed"]["heights_times"]
+    lens, more = lenses[0], f" (first of {len(lenses)} lenses)" if len(lenses) > 1 else ""
+    exif = "none in EXIF" if lens["exif"] is None else f"{lens['exif']:.0f} px in EXIF"
+    said = f"{exif}, {lens['photographs_alone']:.0f} by the photographs alone, {lens['final']:.0f} in the end{more}"
+    rows.append(("focal length", f"{said}; heights are {heights:.2f} times those by the photographs alone"))
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))

@@ -24,7 +24,7 @@ from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
 from surfkit.scene.groups import groups_warning, untied_warning
-from surfkit.scene.names import PICTURES
+from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
 from surfkit.scene.scene import Cloud, Frame, Scene, View
@@ -129,6 +129,8 @@ def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
 def reader_of(data: Data) -> Reader:
     """The reader for a data set: the one that `layout` names, or the one that recognises the folder."""
     root = data.path
+    if is_video(root):
+        raise BadInput(f"{root}: a video; {_finds_cameras(root)}")
     if not root.is_dir():
         raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
     if not any(root.iterdir()):
@@ -143,18 +145,27 @@ def reader_of(data: Data) -> Reader:
     if not first and (photos := bare_photographs(root)):
         raise BadInput(
             f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
-            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, "
-            "as `surfkit train --prepare` does first"
+            f"{_finds_cameras(photos)}"
         )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
 
 
+def _finds_cameras(photos: Path) -> str:
+    return (
+        f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, as `surfkit "
+        "train --prepare` does first"
+    )
+
+
 def bare_photographs(root: Path) -> Path | None:
-    """The folder of photographs, where no reader recognises `root` and it has some: its images/, or itself."""
+    """What cameras can be found of, where no reader recognises `root`: a folder that has photographs or videos, its
+    images/ or itself, or a video."""
+    if is_video(root):
+        return root
     if not root.is_dir() or _fitting(root):
         return None
     for folder in (root / "images", root):
-        if folder.is_dir() and any(path.suffix.lower() in PICTURES for path in folder.rglob("*")):
+        if folder.is_dir() and any(path.suffix.lower() in PICTURES | VIDEOS for path in folder.rglob("*")):
             return folder
     return None
 

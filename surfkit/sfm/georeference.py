@@ -23,6 +23,10 @@ MOST_TURN = 0.05
 """Standard error of the turn and the scale, as a share: beyond it positions do not determine them."""
 LINE = 0.05
 """Positions lie along a line where they spread across it by less than this share of the spread along it."""
+LEAST_SIGMA_M = 0.01
+"""No position is trusted more."""
+ASSUMED_M = 3.0
+"""Standard deviation of each coordinate of a position that states none, beside others that do."""
 NEAR_M = 0.1
 """A residual below it is not held against a position, nor half of it against a control point."""
 METRIC = 0.01
@@ -61,6 +65,8 @@ class Placement:
         names: Photographs with a position that is used.
         onto: (P, 3) their positions less the offset.
         fit: How well they agree.
+        sigma: (P, 3) standard deviations of the positions, units of the map: what they state, else that of the
+            residuals of those that state none.
         handed: Whether they are told from their mirror image: they are not all in a plane.
         plan: Whether the positions had no altitudes: heights are then above the middle of the ground, and those in
             `onto` are of the cameras.
@@ -71,6 +77,7 @@ class Placement:
     names: tuple[str, ...]
     onto: np.ndarray
     fit: Fit
+    sigma: np.ndarray
     handed: bool = False
     plan: bool = False
 
@@ -178,21 +185,21 @@ def _fitted(
     known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: Chart, seed: int, axes: int = 3
 ) -> Placement | Refused:
     """The similarity of (P, 3) camera centres to (P, 3) places on the map, of which the first `axes` axes count."""
-    stated = [photo.exif.accuracy_m for photo in known]
-    sigma = None
-    if None not in stated:
-        sigma = np.linalg.norm(np.array(stated, np.float64)[:, :axes], axis=1) / np.sqrt(axes)
-    fit = fit_robustly(xyz, onto, sigma, seed, NEAR_M / chart.metres)
+    stated = np.array([photo.exif.accuracy_m or (np.nan,) * 3 for photo in known], np.float64)
+    stated = np.maximum(stated, LEAST_SIGMA_M) / chart.metres
+    silent = np.isnan(stated[:, 0])
+    assumed = np.where(silent, ASSUMED_M / chart.metres, np.linalg.norm(stated[:, :axes], axis=1) / np.sqrt(axes))
+    fit = fit_robustly(xyz, onto, None if silent.all() else assumed, seed, NEAR_M / chart.metres)
     if fit is None:
         return Refused(f"of {len(known)} positions fewer than {FEWEST} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
     along, across = fit.similarity.scale * spread[:2] / np.sqrt(fit.inside.sum()) * chart.metres
-    rms = float(np.linalg.norm(fit.sigma)) * chart.metres
     if along < NEAR_M:
         return Refused(f"{int(fit.inside.sum())} of {len(known)} positions are one place")
     if across < LINE * along:
         return Refused(f"positions lie along a line: they spread by {along:.1f} m along it and {across:.2f} m across")
-    if rms / np.sqrt(axes) > MOST_TURN * across * np.sqrt(fit.inside.sum()):
+    if not fit.turn_error(xyz) * np.sqrt(3 / axes) <= MOST_TURN:
+        rms = float(np.linalg.norm(fit.sigma)) * chart.metres
         return Refused(
             f"residuals of {rms:.1f} m are too large for positions that spread by {along:.1f} and {across:.1f} m"
         )
@@ -203,7 +210,9 @@ def _fitted(
             f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m: latitude and longitude are exchanged "
             "or have a wrong sign, or heights count down"
         )
-    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, hand.right)
+    own = np.maximum(fit.deviation(silent), LEAST_SIGMA_M / chart.metres)
+    sigma = np.where(silent[:, None], own, stated)
+    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right)
 
 
 def _in_plan(

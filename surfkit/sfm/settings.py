@@ -59,11 +59,22 @@ class Settings:
     checkpoints: int = 0
     """How many of them are held back, to report how far they are off."""
 
+    frames: int = 300
+    """Frames that are taken of a video at most: sharp ones, one for each step that the picture moves."""
+
+    frame_step: float = 0.06
+    """That step, as a share of the width of the picture. It becomes larger where there would be too many frames."""
+
+    masks: Path | None = None
+    """Folder of masks: pictures called as the photographs, such as NAME.jpg.png or NAME.png. Where they are black,
+    features are not taken, and training looks away."""
+
     seed: int = 0
     """Of all that is drawn at random."""
 
     def __post_init__(self) -> None:
-        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000)}
+        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "frames": (3, 10_000), "neighbours": (1, 1000)}
+        require_within({"frame_step": (0.005, 0.5)}, self)
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
         if self.checkpoints and self.gcp is None:
             raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")

@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.cloud import sample_evenly, write_cloud
 from surfkit.maps.contours import contour_lines, even_interval
+from surfkit.maps.difference import write_difference
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Window, map_crs, same_crs
 from surfkit.maps.hillshade import hillshade
@@ -153,6 +154,21 @@ def test_a_surface_does_not_differ_from_itself(tmp_path):
     here = heightfield(rising(0.3), UTM, (UTM[0] + 5, UTM[1] + 5))
     found = make_maps(Subject(here, FRAME), MapSettings((), 0.5), tmp_path, here)["difference"]
     assert [found[name] for name in ("fill", "cut", "median", "median_absolute", "percentile_90")] == [0] * 5
+
+
+@pytest.mark.parametrize("heights", [[-4.0, 1.0, 2.0, 9.0], [-4.0, 1.0, 9.0], [3.0, -5.0], [2.0]])
+def test_the_median_of_an_even_number_of_differences_is_a_mean(tmp_path, heights):
+    grid = grid_of(1.0, *UTM, UTM[0] + len(heights), UTM[1] + 1)
+    crs, _ = map_crs(FRAME)
+    with workshop(tmp_path, ()) as folder:
+        sheet = Sheet(grid, crs, folder, tmp_path)
+        for name, row in (("here.tif", heights), ("there.tif", np.zeros(len(heights)))):
+            with sheet.raster(name, "heights") as file:
+                file.write(np.array([row]), Window(0, 0, len(heights), 1), {})
+        found = write_difference(sheet, (tmp_path / "here.tif", tmp_path / "there.tif"), "difference.tif", 64)
+    assert found.median == pytest.approx(np.median(heights), abs=1e-4)
+    assert found.median_absolute == pytest.approx(np.median(np.abs(heights)), abs=1e-4)
+    assert found.percentile_90 == pytest.approx(np.percentile(np.abs(heights), 90), abs=1e-4)
 
 
 def test_surfaces_apart_cannot_be_subtracted(tmp_path):

@@ -1,17 +1,20 @@
 """Where a data set lies on Earth, against PROJ, and that nothing of it is lost in files of float32."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.export.ply import read_splats, read_vertices, write_splats
 from surfkit.export.table import SplatTable
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
-from surfkit.readers.read import observations, read
+from surfkit.readers.opensfm import ODM
+from surfkit.readers.read import observations, read, read_capture
 from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import utm
 from surfkit.scene.scene import Frame
@@ -54,6 +57,35 @@ def test_a_topocentric_reconstruction_comes_where_proj_puts_it(tmp_path):
     moved = place.moved.points(local)
     np.testing.assert_allclose(moved[:, :2], wanted[:, :2], atol=2e-3)
     np.testing.assert_allclose(moved[:, 2], wanted[:, 2], atol=2e-2, err_msg="heights are scaled too, by 0.05 %")
+
+
+@pytest.mark.parametrize(("away", "said"), [(500.0, None), (1_000.0, 0.08), (2_500.0, 0.49), (5_000.0, 1.96)])
+def test_how_far_the_earth_bends_below_a_reconstruction_is_told(tmp_path, away, said):
+    """A camera that far from the reference is d^2 / 2 R lower on the round Earth than the similarity puts it."""
+    model = {
+        "cameras": {"c": {"projection_type": "perspective", "width": 40, "height": 30, "focal": 1}},
+        "shots": {
+            f"{at}.png": {"camera": "c", "rotation": [np.pi, 0, 0], "translation": translation}
+            for at, translation in enumerate([[0.0, 0.0, 100.0], [-away, 0.0, 100.0], [0.0, 50.0, 100.0]])
+        },
+    }
+    project(tmp_path)
+    (tmp_path / "opensfm/reconstruction.json").write_text(json.dumps([model]))
+    (tmp_path / "images").mkdir()
+    for name in model["shots"]:
+        Image.new("RGB", (40, 30), (90, 90, 90)).save(tmp_path / "images" / name)
+    with collect_notes() as notes:
+        capture = read_capture(Data(tmp_path), ODM())
+    found = [text for text in notes.texts if "the Earth is round" in text]
+    east = -capture.shots[1].pose[:3, :3].T @ capture.shots[1].pose[:3, 3] - capture.shift
+    assert abs(east[0] - 468 - away) < 0.01 * away, "the case is one"
+    if said is None:
+        assert found == []
+    else:
+        off = float(
+            re.search(r"'EPSG:32632' is flat: at the outermost camera, coordinates are ([.\d]+) m off", found[0])[1]
+        )
+        assert off == pytest.approx(said, abs=0.06), "the map is scaled too, heights with it"
 
 
 def test_moving_changes_no_pixel(tmp_path):

@@ -106,6 +106,8 @@ def test_the_report_says_what_became_of_each(prepared):
     place = report["models"][0]["georeference"]
     assert list(place["left_out"]) == [WRONG] and place["left_out"][WRONG] == pytest.approx(500, abs=1)
     assert max(place["rms_m"].values()) < 0.2
+    [lens] = report["models"][0]["weighed"]["focal_lengths_px"]
+    assert lens["exif"] is None and lens["photographs"] == 6 and lens["final"] == pytest.approx(260, rel=0.03)
     assert set(report["seconds"]) == {
         "photographs", "features", "pairs", "matches", "cameras", "georeference", "undistortion"
     }  # fmt: skip
