@@ -194,8 +194,18 @@ def _refuse_weights(path: str, stage: Stage) -> None:
                 )
 
 
+def _refuse_no_loss(path: str, stage: Stage) -> None:
+    """BadInput for a stage in which no loss counts at its beginning, middle or end: nothing would be learnt."""
+    if not any(stage.weights_at(index) for index in (1, (stage.steps + 1) // 2, stage.steps)):
+        left = f"{', '.join(stage.losses)} have a weight of 0" if stage.losses else "none is left"
+        raise BadInput(
+            f"{path}.losses: {left}, so nothing would be learnt from the photographs; add {path}.losses.l1:l1"
+        )
+
+
 def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
     _refuse_weights(path, stage)
+    _refuse_no_loss(path, stage)
     columns = primitive.columns()
     lacking = [name for name in stage.rates if name not in columns]
     if unknown := [name for name in lacking if name not in RATES]:
