@@ -20,13 +20,13 @@ from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import Difference, draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Grid, map_crs, shown, unit_of
+from surfkit.maps.grid import Grid, map_crs, shown
 from surfkit.maps.hillshade import draw_hillshade
 from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
 from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
-from surfkit.scene.lengths import Length
+from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.texture.keep import Kept, identity, seen
@@ -132,7 +132,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         refuse_apart(surface, grid)
     if other is not None:
         refuse_apart(other, grid)
-    done, unit = drawable(surface, settings), unit_of(frame, crs)
+    done, unit = drawable(surface, settings), unit_of(frame)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
