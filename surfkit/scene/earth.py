@@ -263,7 +263,8 @@ def _without_grid(crs: str, given: Any, origin: np.ndarray) -> str:
     """That heights above a geoid are taken as above the ellipsoid, and what is missing."""
     longitude, latitude = (float(at[0]) for at in degrees_of(crs, origin[None]))
     grids, _ = missing(given, HEIGHTS, longitude, latitude)
+    why = f"{not_installed(grids)}, or" if grids else "PROJ knows no geoid for them;"
     return (
-        f"{crs}: its heights, above sea level, are taken as above the ellipsoid, up to 100 m off: "
-        f"{not_installed(grids) or 'PROJ knows no geoid for them'}; or give the geoid with --geoid FILE or METRES"
+        f"{crs}: its heights, above sea level, are taken as above the ellipsoid, up to 100 m off: {why} give the geoid "
+        "with --geoid FILE or METRES"
     )
