@@ -65,7 +65,15 @@ class Export:
     strict_2dgs: bool = False
     """Leave out the third scale of surfels, as programs written for 2DGS alone expect; ply only."""
 
+    geoid: str | None = None
+    """The geoid, where heights are above sea level: a grid of it (GTX, GeoTIFF), or the metres by which it lies above
+    the ellipsoid; tiles3d only."""
+
     def __post_init__(self) -> None:
+        if self.geoid is not None and not isinstance(self.format, Tiles3D):
+            raise BadInput(
+                f"--geoid: files of the format {name_of(self.format)} keep heights as they are; leave it out"
+            )
         if self.strict_2dgs and not isinstance(self.format, PLY):
             raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
 
@@ -81,6 +89,8 @@ class Export:
             tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
+        if self.geoid is not None:
+            return replace(self.format, geoid=self.geoid)
         return replace(self.format, strict_2dgs=True) if self.strict_2dgs else self.format
 
     def _path(self) -> Path:

@@ -71,7 +71,7 @@ class TextureOf:
 
 def show(out: Path, record: dict[str, Any]) -> None:
     """Print what the textured mesh is, and the paths of what was written."""
-    unit = "m" if record["metres_per_unit"] == 1 else "units"
+    unit = record["unit"]
     pages = ", ".join(f"{width} x {height}" for width, height in record["pages"][:4])
     rows = [
         ("texel", f"{record['texel']:g} {unit}"),

@@ -12,6 +12,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.readers.georeference import POLAR, Similarity, zone_of
 from surfkit.readers.wkt import Node, parse_wkt
+from surfkit.scene.crs import exact
 from surfkit.scene.earth import AXIS, FLATTENING, to_ecef, utm
 
 GEOGRAPHIC, PROJECTED = ("GEOGCS", "GEOGCRS", "BASEGEOGCRS", "GEODCRS", "BASEGEODCRS"), ("PROJCS", "PROJCRS")
@@ -186,7 +187,10 @@ def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tup
         given = CRS(code or text)
         given = given.sub_crs_list[0] if given.is_compound else given
         target = (CRS(onto) if onto else given).to_2d()
-        known = Transformer.from_crs(given.geodetic_crs.to_2d(), target, always_xy=True)
+        degrees = given.geodetic_crs.to_2d()
+        if (known := exact(degrees, target)) is None:
+            emit(Warned(f"{where}: the shift from its datum to {onto} is not known; places may be some 100 m off"))
+            known = Transformer.from_crs(degrees, target, always_xy=True)
         unit = float(target.axis_info[0].unit_conversion_factor)
     except (CRSError, ProjError, AttributeError, IndexError) as error:
         said = " ".join(str(error).split())[:200]

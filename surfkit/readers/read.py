@@ -23,6 +23,7 @@ from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
 from surfkit.scene.camera import Camera
+from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
@@ -123,7 +124,20 @@ def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
                 f"the offset {text}, which their headers and run.json name"
             )
         )
-    return replace(frame, metres=given or capture.metres, crs=capture.crs, shift=shift)
+    return replace(frame, metres=_metres(given or capture.metres, capture.crs, frame), crs=capture.crs, shift=shift)
+
+
+def _metres(stated: float | None, crs: str | None, frame: Frame) -> float | None:
+    """Metres per unit as they were stated, or as the coordinate reference system has them; a line tells of both where
+    they contradict each other."""
+    axes = known_axes(crs) if crs else None
+    if axes is None:
+        return stated
+    try:
+        refuse_other_unit(crs, stated, frame.origin)
+    except BadInput as error:
+        emit(Warned(str(error)))
+    return axes.metres if stated is None else stated
 
 
 def reader_of(data: Data) -> Reader:

@@ -10,8 +10,8 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.core.optional import needed
 from surfkit.readers.georeference import BESIDE, POLAR, Similarity, zone_of
+from surfkit.scene.crs import DEGREES, axes_of, exact, parsed
 from surfkit.scene.earth import Site, utm
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.plausible import Hand
@@ -125,7 +125,7 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
 def chart_about(crs: str, placed: np.ndarray) -> Chart:
     """The map about (3,) a place on it, its offset near it; BadInput for one that is not of east, north and up."""
     unit = Site.at(crs, placed).unit
-    metres = 1.0 if abs(unit - 1) < METRIC else _unit_of_heights(crs)
+    metres = 1.0 if abs(unit - 1) < METRIC else axes_of(crs).metres
     east, north = (float(np.round(value / GRAIN_M) * GRAIN_M) for value in placed[:2])
     return Chart(crs, (east, north, 0.0), metres)
 
@@ -238,23 +238,14 @@ def centres_of(model: Any) -> dict[str, np.ndarray]:
 
 
 def _by_pyproj(crs: str, positions: np.ndarray) -> np.ndarray:
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import ProjError
     try:
-        known = Transformer.from_crs("EPSG:4326", CRS(crs).to_2d(), always_xy=True)
-        flat = np.stack(known.transform(positions[:, 1], positions[:, 0]), axis=1)
-    except ProjError as error:
-        said = " ".join(str(error).split())[:200]
-        raise BadInput(f"--crs {crs}: pyproj does not know it: {said}; name one such as EPSG:2180") from error
-    return flat
-
-
-def _unit_of_heights(crs: str) -> float:
-    """Metres, without the scale that the map has at a place: that of its heights is 1."""
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS
-    return float(CRS(crs).to_3d().axis_info[-1].unit_conversion_factor)
+        flat = parsed(crs).to_2d()
+    except BadInput as error:
+        raise BadInput(f"--crs {crs}: {error}; name one such as EPSG:2180") from error
+    known = exact(DEGREES, flat)
+    if known is None:
+        raise BadInput(f"--crs {crs}: the shift from WGS 84 to its datum is not known; name another, such as EPSG:2180")
+    return np.stack(known.transform(positions[:, 1], positions[:, 0]), axis=1)
 
 
 def _unbroken(longitudes: np.ndarray) -> np.ndarray:

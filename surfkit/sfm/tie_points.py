@@ -85,7 +85,7 @@ class TiePoints:
                 f"{self.data.path}: not one point could be triangulated: the photographs share no features that fit "
                 "their cameras; are these the cameras of these photographs?"
             )
-        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres or 1.0)
+        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres)
         if placed is None:  # no file to keep an offset in
             model.transform(load_engine().Sim3d(1.0, load_engine().Rotation3d(), offset))
         by_name = {photo.name: photo for photo in photos}

@@ -202,12 +202,49 @@ def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said)
 
 @pytest.mark.parametrize(
     "crs, metres, unit",
-    [("EPSG:32633", 1.0, "m"), ("EPSG:2263+6360", 0.3048006096012192, "US ft"), ("EPSG:2222", 0.3048, "ft")],
+    [
+        ("EPSG:32633", 1.0, "m"),
+        ("EPSG:2263+6360", 0.3048006096012192, "US ft"),
+        ("EPSG:2263", 0.3048006096012192, "US ft"),
+        ("EPSG:2222", 0.3048, "ft"),
+        ("EPSG:2180", 1.0, "m"),
+    ],
 )
 def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
     here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
     frame = Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)
     assert make_maps(Subject(here, frame), MapSettings((), 0.5), tmp_path)["unit"] == unit
+
+
+@pytest.mark.parametrize(
+    "crs, metres, said",
+    [
+        ("EPSG:2263+5703", 0.3048006096012192, "in units of US survey foot, heights in metre"),
+        ("EPSG:2263", 1.0, "EPSG:2263 is in units of US survey foot"),
+        ("EPSG:32633", 0.3048, "EPSG:32633 is in units of metre"),
+        ("EPSG:5513", 1.0, "its axes point south and west"),
+        ("EPSG:2048", 1.0, "its axes point west and south"),
+        ("EPSG:3857", 1.0, r"lengths on the map are 1\.\d+ times those on the ground here, areas [12]\.\d+ times"),
+    ],
+)
+def test_a_system_that_would_make_volumes_wrong_is_refused(tmp_path, crs, metres, said):
+    here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
+    with pytest.raises(BadInput, match=said):
+        make_maps(Subject(here, Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)), MapSettings((), 0.5), tmp_path / "m")
+    assert not (tmp_path / "m").exists()
+
+
+def test_lengths_that_a_map_stretches_a_little_are_told_of(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("surfkit.maps.grid.emit", told.append)
+    place = (2_000_000.0, 2_000_000.0)  # 64 degrees north
+    for crs, at in (("EPSG:3035", (4_321_000.0, 3_210_000.0)), ("EPSG:3995", place)):
+        map_crs(Frame(np.array([*at, 0.0]), 0.01, 1.0, crs))
+    longer = float(told[0].text.split("are ")[1].split(" times")[0])
+    pyproj = needs("pyproj")
+    lon, lat = pyproj.Transformer.from_crs("EPSG:3995", "EPSG:4326", always_xy=True).transform(*place)
+    scale = pyproj.Proj("EPSG:3995").get_factors(lon, lat).areal_scale ** 0.5
+    assert len(told) == 1 and longer == pytest.approx(scale, abs=2e-3)
 
 
 def test_a_coordinate_reference_system_is_the_same_however_it_is_spelt():
