@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.readers.georeference import BESIDE, POLAR, zone_of
 from surfkit.readers.wkt import parse_wkt
+from surfkit.scene.crs import exact
 from surfkit.scene.earth import from_utm
 
 WGS84_DEGREES = "EPSG:4326"
@@ -58,7 +60,13 @@ class System:
         with needed("pyproj", f"the coordinate reference system {self.crs}"):
             from pyproj import CRS, Transformer
         given = CRS(self.crs)
-        flat = Transformer.from_crs(given.to_2d(), WGS84_DEGREES, always_xy=True).transform(xyz[:, 0], xyz[:, 1])
+        known = exact(given.to_2d(), WGS84_DEGREES)
+        if known is None:
+            emit(
+                Warned(f"{self.crs}: the shift of its datum to WGS 84 is not known here; places may be some 100 m off")
+            )
+            known = Transformer.from_crs(given.to_2d(), WGS84_DEGREES, always_xy=True)
+        flat = known.transform(xyz[:, 0], xyz[:, 1])
         metres = float(given.axis_info[2].unit_conversion_factor) if len(given.axis_info) > 2 else 1.0
         return np.column_stack([flat[1], flat[0], xyz[:, 2] * metres])
 
