@@ -19,6 +19,7 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
+from surfkit.export.axes import AxesOrAuto
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
 from surfkit.run.compress import Target, compress_run, fitted, writing
@@ -57,6 +58,10 @@ class Compress:
     out: Path | None = None
     """For a FILE: file to write, ending in .surfkit; beside it by default."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in a FILE, as SPZ names them: rdf for right, down, forward, those of a PLY file. auto: those
+    that the file names, or that its format has."""
+
     device: Device = "auto"
     """Device for rendering and for codebooks."""
 
@@ -77,6 +82,8 @@ class Compress:
                 self._file(wanted)
 
     def _run(self, wanted: Target) -> None:
+        if self.axes != "auto":
+            raise BadInput(f"--axes {self.axes}: {self.target} is a run, whose axes are known; leave --axes out")
         if self.out is not None:
             raise BadInput(f"--out {self.out}: a run keeps its compressed model in its folder; leave --out out")
         with loaded(self.target, self.device) as (ctx, made):
@@ -89,7 +96,7 @@ class Compress:
     def _file(self, wanted: Target) -> None:
         if wanted.decibels is not None:
             raise BadInput("--target-loss needs a run, whose photographs tell what is lost; use --target-size")
-        model, frame = model_of_file(self.target)
+        model, frame = model_of_file(self.target, self.axes)
         path = self.out or self.target.with_suffix(".surfkit")
         if path.suffix.lower() != ".surfkit":
             raise BadInput(f"--out {path}: the name must end in .surfkit")

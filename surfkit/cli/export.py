@@ -17,8 +17,9 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
 from surfkit.core.memory import size
 from surfkit.core.registry import choice, name_of
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.base import Format
-from surfkit.export.files import format_for, format_of, has_suffix
+from surfkit.export.files import format_for, format_of, has_suffix, read_splat_file
 from surfkit.export.ply import PLY
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.tiles3d import Tiles3D
@@ -61,12 +62,18 @@ class Export:
     out: Path | None = None
     """File to write; by default RUN/point_cloud with the suffix of the format, or beside FILE."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in a FILE, as SPZ names them: rdf for right, down, forward, those of a PLY file. auto: those
+    that the file names, or that its format has."""
+
     strict_2dgs: bool = False
     """Leave out the third scale of surfels, as programs written for 2DGS alone expect; ply only."""
 
     def __post_init__(self) -> None:
         if self.strict_2dgs and not isinstance(self.format, PLY):
             raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
+        if self.axes != "auto" and self.source.is_dir() and not (self.source / "meta.json").exists():
+            raise BadInput(f"--axes {self.axes}: {self.source} is a run, whose axes are known; leave it out")
 
     def run(self) -> None:
         """Write the file, and say what is in it."""
@@ -101,7 +108,7 @@ class Export:
     def _opened(self) -> Iterator[tuple[SplatTable, Frame, Tile | None]]:
         """Within, the splats in the frame of the input, that frame, and their tiles if the format wants some."""
         if not self.source.is_dir():
-            table = format_of(self.source).read(self.source)
+            table = read_splat_file(self.source, self.axes)
             yield table, Frame.of_positions(table.means.numpy()), one_tile(table) if self.format.wants_tree else None
             return
         refuse_no_run(self.source)

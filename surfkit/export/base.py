@@ -46,6 +46,8 @@ class Format(Component):
     def read(self, path: Path) -> SplatTable:
         """The splats of a file, in any order, as `write` was given them but for the rounding of the format.
 
+        Where files have other axes than PLY files, they are turned to those, and `SplatTable.axes` says from which.
+
         What is allocated is in proportion to the size of the file, whatever its header says.
 
         Raises:

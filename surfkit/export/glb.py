@@ -155,6 +155,13 @@ class Document:
         """An error that names the file."""
         return BadInput(f"{self.path}: {what}")
 
+    def entry(self, *keys: str) -> Any:
+        """The value at a path of keys from the root; None where there is none."""
+        found: Any = self.root
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
+
     def item(self, kind: str, index: Any) -> dict[str, Any]:
         """An element of one of the top-level lists, such as ("nodes", 0)."""
         found = self.root.get(kind)

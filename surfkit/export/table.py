@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput, expect
+from surfkit.export.axes import PLY_AXES, FileAxes
 from surfkit.scene.scene import Frame
 
 THINNESS = 1e-3
@@ -41,6 +42,7 @@ class SplatTable:
         sh0: (N, 3) coefficients of degree 0.
         sh_rest: (N, K - 1, 3) coefficients of degrees 1 to 3, K in {1, 4, 9, 16}.
         antialias: Gaussians only: to be drawn dimmed by what the blur of the rasterizer adds to them (Mip-Splatting).
+        axes: Of the numbers in the file that the splats were read from; the reader has turned them to PLY_AXES.
     """
 
     kind: Literal["surfel", "gaussian"]
@@ -51,6 +53,7 @@ class SplatTable:
     sh0: Tensor
     sh_rest: Tensor
     antialias: bool = False
+    axes: FileAxes = FileAxes(PLY_AXES)
 
     def __post_init__(self) -> None:
         sizes = expect("means", self.means, ("N", 3))

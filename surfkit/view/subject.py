@@ -15,6 +15,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.place import Y_UP, Z_UP, notes_in, own_notes, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.files import read_splat_file
 from surfkit.export.gltf_reader import UPS
 from surfkit.export.models import refuse_unsound
@@ -95,12 +96,13 @@ class Subject:
 
 
 @contextmanager
-def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
+def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Iterator[Subject]:
     """Within, what a run folder or a file holds.
 
     Args:
         path: Folder of a finished run, or a file of splats, of a mesh or of points.
         device: That draws.
+        axes: Of the numbers in a file of splats.
 
     Raises:
         BadInput: It is neither, damaged, or there is nothing in it to look at.
@@ -111,7 +113,7 @@ def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
         return
     if not path.exists():
         raise BadInput(f"{path}: there is no such run or file")
-    yield of_file(path, device)
+    yield of_file(path, device, axes)
 
 
 def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
@@ -156,14 +158,14 @@ def textured_mesh(out: Path) -> Textured | None:
         return None
 
 
-def of_file(path: Path, device: Device) -> Subject:
+def of_file(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Subject:
     """What a file holds."""
     if path.suffix.lower() in CLOUDS:
         xyz, rgb, notes = read_las(path)
         frame = frame_of(xyz, notes)
         return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):
-        return of_splats(path, device)
+        return of_splats(path, device, axes)
     pictures, up = None, Z_UP
     if path.suffix.lower() in MESHES:
         surface, colors, place, pictures = other_mesh(path)
@@ -182,9 +184,9 @@ def of_file(path: Path, device: Device) -> Subject:
     return Subject(path, frame, up, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
 
 
-def of_splats(path: Path, device: Device) -> Subject:
+def of_splats(path: Path, device: Device, axes: AxesOrAuto) -> Subject:
     """What a file of splats holds."""
-    table = read_splat_file(path)
+    table = read_splat_file(path, axes)
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
@@ -198,19 +200,19 @@ def of_splats(path: Path, device: Device) -> Subject:
 
 
 def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
-    """What a file of splats says of its coordinates, and its (3,) up: z on a map, y in glTF, else -y.
+    """What a file of splats says of its coordinates, and its (3,) up: z on a map, what a GLB of surfkit says, else -y.
 
-    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it.
+    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it, and what the y of
+    glTF and of SPZ becomes.
     """
     notes = coordinates_of(path)
     if "crs" in notes:
         return notes, Z_UP
-    root = root_of(path)
-    if not root:
+    told = own_notes(root_of(path))
+    if not told:
         return notes, -Y_UP
-    told = own_notes(root) or {}
     unit = {"metres per unit": told.get("metres_per_unit"), "crs": told.get("crs")}
-    return {name: str(value) for name, value in unit.items() if value}, UPS[told.get("up", "y")].T @ Y_UP
+    return {name: str(value) for name, value in unit.items() if value}, UPS[told["up"]].T @ Y_UP
 
 
 def holds_splats(path: Path) -> bool:

@@ -47,6 +47,7 @@ def test_a_file_becomes_a_run_folder(given, here, capsys):
     assert json.loads((out / "recipe.json").read_text())["method"] == {
         "use": "import",
         "file": str(here / "splats.ply"),
+        "axes": "auto",
     }
     (here / "splats.ply").unlink()
     for words in (
