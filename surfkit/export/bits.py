@@ -23,6 +23,16 @@ def logits(opacities: np.ndarray) -> np.ndarray:
     return np.log(inside / (1 - inside)).astype(np.float32)
 
 
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def from_linear(values: np.ndarray) -> np.ndarray:
+    """sRGB values of linear ones, both in [0, 1]."""
+    return np.where(values <= 0.0031308, values * 12.92, 1.055 * values.clip(0) ** (1 / 2.4) - 0.055)
+
+
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """The nearest uint8 of values on the scale of 0 to 255; what lies outside is clipped."""
     return (values + 0.5).clip(0, 255).astype(np.uint8)

@@ -89,6 +89,51 @@ def test_y_is_up_in_files_of_others(tmp_path):
         assert np.allclose(subject.frame.to_input(subject.mesh.vertices), CORNERS, atol=1e-5)
 
 
+GREYS = np.array([[0, 128, 255], [10, 20, 30], [1, 2, 3], [200, 100, 50]], np.uint8)
+
+
+def with_attribute(path, generator, kind, values):
+    """A GLB like that of `write_mesh`, whose COLOR_0 is replaced by other values, of the end of the file."""
+    raw = path.read_bytes()
+    size = int.from_bytes(raw[12:16], "little")
+    root, data = json.loads(raw[20 : 20 + size]), raw[28 + size :]
+    accessor = root["accessors"][2]
+    view = root["bufferViews"][accessor["bufferView"]]
+    data = data[: view["byteOffset"]] + values.tobytes()
+    accessor["componentType"], view["byteStride"], view["byteLength"] = kind, values[0].nbytes, values.nbytes
+    root["asset"]["generator"], root["buffers"][0]["byteLength"] = generator, len(data)
+    text = json.dumps(root).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = len(text).to_bytes(4, "little") + b"JSON" + text + len(data).to_bytes(4, "little") + b"BIN\0" + data
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+
+
+@pytest.mark.parametrize("case", ["surfkit", "surfkit 0.1", "others, bytes", "others, float"])
+def test_vertex_colours_of_glb_are_shown_as_they_were(tmp_path, case):
+    """Linear ones by glTF, but bytes of sRGB in files of earlier versions."""
+    path = tmp_path / "a.glb"
+    write_mesh(path, Mesh(CORNERS, MESH.faces, GREYS), LOCAL)
+    opaque = np.full((4, 1), 255, np.uint8)
+    share = GREYS / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    if case == "surfkit 0.1":
+        with_attribute(path, "surfkit 0.1.0", 5121, np.concatenate([GREYS, opaque], 1))
+    elif case == "others, bytes":
+        with_attribute(path, "other", 5121, np.concatenate([np.round(255 * linear).astype(np.uint8), opaque], 1))
+    elif case == "others, float":
+        with_attribute(path, "other", 5126, np.concatenate([linear, opaque / 255], 1).astype("<f4"))
+    with opened_subject(path, "cpu") as subject:
+        apart = np.abs(subject.mesh.colors.astype(int) - GREYS)
+    assert apart.max() <= (7 if case == "others, bytes" else 0), "8 bits of linear values are few for dark ones"
+
+
+def test_bytes_of_trimesh_are_shown_as_they_were(tmp_path):
+    trimesh = needs("trimesh")
+    trimesh.Trimesh(CORNERS, MESH.faces, vertex_colors=GREYS, process=False).export(tmp_path / "a.glb")
+    with opened_subject(tmp_path / "a.glb", "cpu") as subject:
+        assert np.array_equal(subject.mesh.colors, GREYS)
+
+
 def test_the_texture_of_a_run(tmp_path):
     assert textured_mesh(tmp_path) is None
     (tmp_path / "texture").mkdir()
