@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput
 from surfkit.export.axes import Axes, FileAxes, turn_between
 from surfkit.export.bits import unit
 from surfkit.export.glb import Document, read_glb
-from surfkit.export.spz import spz_table
+from surfkit.export.spz import SPZ_ROUNDING, spz_table
 from surfkit.export.table import COLUMNS, SplatTable
 from surfkit.export.turn import parts_of, turned
 
@@ -73,7 +73,8 @@ def read_splats(path: Path) -> SplatTable:
     table = _joined(tables, notes.get("sh_degree", 0))
     if not notes:
         axes = FileAxes(GLTF_AXES, str(document.entry("asset", "generator")).startswith(WRITERS))
-        return replace(table.as_surfels_if_thin(ROUNDING), axes=axes)
+        is_coarse = COMPRESSED in _list(document, document.root, "extensionsUsed")
+        return replace(table.as_surfels_if_thin(*(SPZ_ROUNDING if is_coarse else (ROUNDING,))), axes=axes)
     table = replace(table, antialias=notes["antialias"])
     return table.as_surfels() if notes["kind"] == "surfel" else table
 

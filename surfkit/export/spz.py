@@ -44,6 +44,9 @@ TURNED = [(-1) ** ((m < 0) + (degree - abs(m)) % 2) for degree in (1, 2, 3) for 
 LEVEL = 12
 """Of zstd, as in the library of Niantic."""
 
+SPZ_ROUNDING = (STEP / 2 + 1e-4, SMALLEST)
+"""Of logarithms of scales, and the smallest of them, for `as_surfels_if_thin`."""
+
 Encode = Callable[[np.ndarray], np.ndarray]
 """Makes the bytes of an attribute from rows of its column."""
 
@@ -147,7 +150,7 @@ class SPZ(Format):
         axes = FileAxes(named or ("rub" if self.axes == "rub" else PLY_AXES), named is not None)
         table = half_turn(table) if axes.name == "rub" else turned(table, turn_between(axes.name))
         table = replace(table, axes=axes)
-        return table.as_surfels_if_thin(STEP / 2 + 1e-4, SMALLEST)
+        return table.as_surfels_if_thin(*SPZ_ROUNDING)
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""

@@ -89,7 +89,7 @@ class SplatTable:
         return self if self.kind == "surfel" else replace(self, kind="surfel", log_scales=self.log_scales[:, :2])
 
     def as_surfels_if_thin(self, rounding: float, least: float = -math.inf) -> SplatTable:
-        """As surfels, if that is what `ellipsoid_log_scales` made all of them from; ellipsoids otherwise.
+        """As surfels, if all are as flat as `ellipsoid_log_scales` makes them, or flatter; ellipsoids otherwise.
 
         Args:
             rounding: Largest difference between a scale in the file and what was written, in logarithms.
@@ -99,7 +99,7 @@ class SplatTable:
             return self
         smaller, third = self.log_scales[:, :2].amin(1), self.log_scales[:, 2]
         expected = (smaller + math.log(THINNESS)).clamp_min(least)
-        thin = (third - expected).abs().max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
+        thin = (third - expected).max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
         return self.as_surfels() if thin else self
 
     def without_infinities(self) -> SplatTable:
@@ -131,6 +131,11 @@ class SplatTable:
                 row = int((~(column.abs() <= LARGEST)).nonzero()[0, 0])
                 what = f"{name} of splat {row} of {len(self)} has NaN, Inf or a value beyond {LARGEST:g}"
                 raise BadInput(f"{where}: {what}; remove such splats first")
+
+    def shown(self) -> Tensor:
+        """(N,) about how much is seen of each splat: opacity times the product of its two larger radii."""
+        larger = self.log_scales.detach().double().topk(2, dim=1).values.sum(1)
+        return larger.exp() * torch.sigmoid(self.opacity_logits.detach().double())
 
     def median_scale(self) -> float:
         """Median radius in the plane of surfels, or along the first two axes of ellipsoids; 1 without splats."""
