@@ -72,7 +72,7 @@ class Export:
     def __post_init__(self) -> None:
         if self.strict_2dgs and not isinstance(self.format, PLY):
             raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
-        if self.axes != "auto" and self.source.is_dir() and not (self.source / "meta.json").exists():
+        if self.axes != "auto" and self.source.is_dir():
             raise BadInput(f"--axes {self.axes}: {self.source} is a run, whose axes are known; leave it out")
 
     def run(self) -> None:

@@ -59,6 +59,8 @@ def format_of(path: Path) -> Format:
     head = b""
     try:
         if not path.is_dir():
+            if path.exists() and not path.is_file():  # a pipe would wait for someone to write
+                raise BadInput(f"{path}: neither a file nor a folder; name a file of splats")
             with path.open("rb") as file:
                 head = file.read(HEAD)
     except OSError as error:

@@ -107,7 +107,9 @@ def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Ite
     Raises:
         BadInput: It is neither, damaged, or there is nothing in it to look at.
     """
-    if path.is_dir() and not (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
+    if path.is_dir() and (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
+        path /= "meta.json"
+    if path.is_dir():
         with loaded(path, device) as (ctx, made):
             yield of_run(ctx, made)
         return
@@ -217,8 +219,6 @@ def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
 
 def holds_splats(path: Path) -> bool:
     """Whether a file is one of splats: what is neither a mesh nor a cloud is left to the readers of splats."""
-    if path.is_dir():
-        return True
     head = head_of(path)
     if head.startswith(b"ply"):
         return b"\nelement chunk " in head or b" f_dc_0" in head
@@ -236,8 +236,6 @@ def head_of(path: Path) -> bytes:
 
 def coordinates_of(path: Path) -> dict[str, str]:
     """What the header of a PLY file says of its coordinates, by name."""
-    if path.is_dir():
-        return {}
     text = head_of(path).decode("ascii", "replace")
     return notes_in(text) if text[:3] == "ply" else {}
 

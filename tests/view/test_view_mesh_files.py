@@ -1,6 +1,7 @@
 """Meshes of GLB and OBJ files: their coordinates, what is up, and their pictures on the page."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.export.gltf_reader import UPS
+from surfkit.export.sog import SOG
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes
+from surfkit.testing.files import splat_table
 from surfkit.texture.files import Part, write_obj, write_textured_glb
 from surfkit.view.page import show
 from surfkit.view.screen import WORLD
@@ -179,3 +182,11 @@ def test_a_textured_mesh_is_compared_where_it_lies(tmp_path, case):
         words = ["--gt", str(tmp_path / "plain.ply"), "--align", "none", "--crop", "none", "--tau", str(0.01 * width)]
         assert main(["evaluate", str(tmp_path / name), *words, "--out", str(tmp_path / name[-3:])]) == 0
         assert json.loads((tmp_path / name[-3:] / "metrics.json").read_text())["geometry"]["f1"] > 0.99
+
+
+def test_a_folder_of_unpacked_sog_is_shown(tmp_path):
+    SOG().write(tmp_path / "a.sog", splat_table(count=20))
+    zipfile.ZipFile(tmp_path / "a.sog").extractall(tmp_path / "there")
+    for path in (tmp_path / "there", tmp_path / "there" / "meta.json"):
+        with opened_subject(path, "cpu") as subject:
+            assert len(subject.splats) == 20
