@@ -59,6 +59,10 @@ class Format(Component):
         """Whether a file is of this format; `head` is what it begins with, up to HEAD bytes."""
         return False
 
+    def kept(self, table: SplatTable) -> SplatTable:
+        """Those of the splats that a file gets: all, but for formats with a limit, whose `write` tells of the rest."""
+        return table
+
     def rounding(self, table: SplatTable) -> str:
         """What a file does not keep of such splats as it is, in one line for the user."""
         return ""
