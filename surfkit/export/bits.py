@@ -8,8 +8,8 @@ SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0."""
 QUARTER = 0.25 / 255
 """Least opacity that a byte of 0 stands for: it becomes the same byte again, and has a logit."""
-NEARLY_NONE = 0.005
-"""Share of the splats at either end of an axis that say nothing about the extent of all."""
+ENDS = 0.1
+"""Share of the splats at either end of an axis that say nothing about the extent of the others."""
 OUTLYING = 4.0
 """Extents from the middle beyond which splats are far from the others."""
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -88,8 +88,8 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarray:
     """(N,) indices that sort (N, 3) positions as `morton_order`, with those far from the others together at the end.
 
-    Splats of a group share the range of their positions. Those that lie outside of OUTLYING times the extent of nearly
-    all come last, octave by octave of their distance. What fills up the first group with such ones, as groups have a
+    Splats of a group share the range of their positions. Those that lie outside of OUTLYING times the extent of most
+    come last, octave by octave of their distance. What fills up the first group with such ones, as groups have a
     fixed size, are those splats of which least is seen.
 
     Args:
@@ -99,7 +99,7 @@ def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarr
     """
     if len(means) <= group:
         return morton_order(means)
-    low, high = np.quantile(means, (NEARLY_NONE, 1 - NEARLY_NONE), axis=0)
+    low, high = np.quantile(means, (ENDS, 1 - ENDS), axis=0)
     away = np.abs(means - (low + high) / 2).max(1)
     extent = max(float((high - low).max()), away.max() * 2.0**-40, np.finfo(float).tiny)
     octave = np.ceil(np.log2(np.maximum(away / (OUTLYING * extent), 1))).astype(int)

@@ -1,11 +1,10 @@
 """The compressed PLY files of PlayCanvas: 16 bytes for a splat, and a byte for each coefficient of higher degree.
 
 Splats lie along a Z-order curve, those far from all others at its end, in chunks of 256, each with the bounds of its
-positions, scales and colours; a splat
-has its place within them in 11, 10 and 11 bits (positions, scales), four bytes (colour within the bounds, opacity), and
-its rotation wxyz as the index of the largest component in 2 bits and the others in 10 bits each. A coefficient f of
-higher degree is the byte floor(256 (f / 8 + 1/2)). Source: the PLY format in the user manual at
-developer.playcanvas.com, and what its program splat-transform writes and reads.
+positions, scales and colours; a splat has its place within them in 11, 10 and 11 bits (positions, scales), four bytes
+(colour within the bounds, opacity), and its rotation wxyz as the index of the largest component in 2 bits and the
+others in 10 bits each. A coefficient f of higher degree is the byte floor(256 (f / 8 + 1/2)). Source: the PLY format in
+the user manual at developer.playcanvas.com, and what its program splat-transform writes and reads.
 """
 
 from __future__ import annotations

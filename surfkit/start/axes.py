@@ -38,7 +38,7 @@ CLEAR_SHARE = 0.5
 """Of the median distance for all other axes, what that for the best must stay below."""
 
 
-def read_in_scene(path: Path, scene: Scene, axes: AxesOrAuto) -> SplatTable:
+def read_in_scene(path: Path, scene: Scene, axes: AxesOrAuto, flag: str = "--axes") -> SplatTable:
     """The splats of a file in the local frame, all float32.
 
     Args:
@@ -46,6 +46,7 @@ def read_in_scene(path: Path, scene: Scene, axes: AxesOrAuto) -> SplatTable:
         scene: The data set that its coordinates are of.
         axes: Of the numbers in the file. For auto, those that the file names or its format has, or else the photographs
             and sparse points of the scene decide, which a note says.
+        flag: That sets `axes`.
 
     Raises:
         BadInput: No file of splats, or one without splats, or with values that cannot be drawn.
@@ -57,7 +58,7 @@ def read_in_scene(path: Path, scene: Scene, axes: AxesOrAuto) -> SplatTable:
         return in_scene(table, scene.frame)
     best, why = _best(table, scene)
     told = f"{best} ({in_words(best)}) {why}" if best else f"{assumed_axes(table)}, as {why}"
-    emit(Warned(f"{untold_axes(path)}: {told}; --axes NAME says otherwise"))
+    emit(Warned(f"{untold_axes(path)}: {told}; {flag} NAME says otherwise"))
     return in_scene(from_axes(table, best or table.axes.name), scene.frame)
 
 

@@ -80,7 +80,7 @@ class SplatStart(Start):
 
     def _table(self, scene: Scene) -> SplatTable:
         path = existing_model(self.file, "start.file")
-        return read_in_scene(path, scene, self.axes)
+        return read_in_scene(path, scene, self.axes, "--start.axes")
 
 
 def is_thin(table: SplatTable) -> bool:

@@ -15,6 +15,8 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.start.axes import read_in_scene
+from surfkit.start.base import StartInput
+from surfkit.start.splats import SplatStart
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +85,14 @@ def test_survey_coordinates_are_turned_before_their_offset_is_added(tmp_path):
     with collect_notes():
         table = read_in_scene(path, scene, "auto")
     assert table.axes.name == "luf" and apart(table, scene) < 2e-3
+
+
+def test_the_note_of_a_start_names_its_own_flag(tmp_path, scene):
+    path = stored(tmp_path / "a.spz", scene, "luf")
+    with collect_notes() as notes:
+        cloud = SplatStart(path).cloud(StartInput(scene, (), None, None, torch.Generator()))
+    assert "luf" in notes.texts[0] and "; --start.axes NAME says otherwise" in notes.texts[0]
+    assert float(torch.cdist(scene.cloud.xyz, cloud.xyz).min(1).values.max()) < 2e-3
+    with collect_notes() as notes:
+        SplatStart(path, "luf").cloud(StartInput(scene, (), None, None, torch.Generator()))
+    assert notes.texts == []
