@@ -77,13 +77,15 @@ def _best(table: SplatTable, scene: Scene) -> tuple[Axes | None, str]:
 
 
 def _decibels(table: SplatTable, scene: Scene) -> dict[Axes, float]:
-    """Mean PSNR of some photographs at a small size, for each axes; 0 where none can be read."""
+    """Mean PSNR of some photographs at a small size, for each axes; 0 where none can be read. Spherical harmonics above
+    degree 0 are left out: to turn them takes more memory than all else."""
+    plain = replace(table, sh_rest=table.sh_rest[:, :0])
     photos = [photo for view in scene.train[:: math.ceil(len(scene.train) / VIEWS)] if (photo := _small(view))]
     rasterizer, _ = select("cpu")
     found = {}
     for name in dict.fromkeys((table.axes.name, *TRIED)):
-        local, primitive = in_scene(from_axes(table, name), scene.frame), primitive_of(table)
-        model = SplatModel(primitive, primitive.from_table(local, torch.Generator()), table.sh_degree)
+        local, primitive = in_scene(from_axes(plain, name), scene.frame), primitive_of(plain)
+        model = SplatModel(primitive, primitive.from_table(local, torch.Generator()))
         draws, total = drawn_by(primitive, rasterizer), 0.0
         for view, photo in photos:
             maps = draws.render(model.splats, view.camera, model.near, geometry=False, distortion=False).maps
