@@ -15,6 +15,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
 from surfkit.scene.arrays import map_array, write_array
+from surfkit.scene.names import safe_path
 from surfkit.scene.photos import open_picture
 
 EXR = ".exr"
@@ -105,8 +106,8 @@ class DepthFile:
 
 
 def map_path(root: Path, name: str) -> Path:
-    """Where surfkit and CityGaussianV2 keep the inverse depth of a photograph."""
-    path = root / FOLDER / name.replace("\\", "/")
+    """Where surfkit and CityGaussianV2 keep the inverse depth of a photograph, whose name may lead anywhere."""
+    path = root / FOLDER / safe_path(name)
     return path.with_name(f"{path.name}.npy")
 
 

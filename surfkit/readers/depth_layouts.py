@@ -11,6 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
 from surfkit.readers.depth_files import EXR, FOLDER, DepthFile, map_path, read_record
 from surfkit.readers.depth_layout import DepthLayout, DepthQuery
+from surfkit.scene.names import safe_path
 
 MILLIMETRE = 1e-3
 """Nerfstudio's `depth_unit_scale_factor`, where a data set does not say another."""
@@ -50,7 +51,7 @@ class HierarchicalDepths(DepthLayout):
             return None
         params, found = read_json(path, dict[str, Any]), {}
         for name in query.names:
-            stem = str(PurePosixPath(_posix(name)).with_suffix(""))
+            stem = str(safe_path(name).with_suffix(""))
             entry = params.get(stem)
             if isinstance(entry, dict) and {"scale", "offset"} <= entry.keys():
                 scale, offset = (_number(path, f"{stem}.{part}", entry[part]) for part in ("scale", "offset"))
@@ -106,7 +107,7 @@ class MatrixCityDepths(DepthLayout):
             return None
         found = {}
         for name in query.names:
-            if path := next((place for place in _city_places(query.root, name) if place.is_file()), None):
+            if path := next((place for place in _city_places(query.root, safe_path(name)) if place.is_file()), None):
                 found[name] = DepthFile(path, True, CENTIMETRE / query.metres, metric=True)
         return found or None
 
@@ -122,12 +123,12 @@ def _number(path: Path, at: str, value: Any) -> float:
         raise BadInput(f"{path}: {error}") from error
 
 
-def _city_places(root: Path, name: str) -> Iterator[Path]:
+def _city_places(root: Path, photo: PurePosixPath) -> Iterator[Path]:
     """Where MatrixCity may have the depth of a photograph."""
-    block = PurePosixPath(name).parent
+    block = photo.parent
     if block.name in PHOTOS or block.name == block.parent.name:
         block = block.parent
-    stem = f"{PurePosixPath(name).stem}{EXR}"
+    stem = f"{photo.stem}{EXR}"
     depth = f"{block.name}_depth"
     below = (block / "depth" / stem, block.parent / depth / stem, block.parent / depth / depth / stem)
     for tree in _city_trees(root.resolve()):
