@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -20,6 +21,17 @@ SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
 """What of a name must agree: all but the case, nor the ending, nor the folders."""
 OUTSIDE = "_outside"
 """Folder for files named after photographs whose own names lead elsewhere."""
+
+
+def named_file(folder: Path, name: str) -> Path:
+    """The file below a folder that a data set names; a backslash is a slash, as on Windows, unless a file has it."""
+    path = folder / name
+    return path if "\\" not in name or path.is_file() else folder / name.replace("\\", "/")
+
+
+def name_below(root: Path, path: Path) -> str:
+    """What a photograph of a data set is called: its path from there, without the `..` of what lies beside it."""
+    return "/".join(part for part in Path(os.path.relpath(path, root)).parts if part != "..")
 
 
 def safe_path(name: str) -> PurePosixPath:
@@ -42,7 +54,7 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
     Another spelling counts when it fits one file only and no other name. A name without an ending is no other spelling.
     """
-    found = {name: path for name in names if (path := folder / name.replace("\\", "/")).is_file()}
+    found = {name: path for name in names if (path := named_file(folder, name)).is_file()}
     lost = [name for name in names if name not in found]
     if not lost:
         return found
