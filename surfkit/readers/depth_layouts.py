@@ -36,8 +36,9 @@ class EstimatedDepths(DepthLayout):
         """See `DepthLayout.find`."""
         if not (query.root / FOLDER).is_dir():
             return None
-        aligned = read_record(query.root).get("aligned") is True
-        return {name: DepthFile(map_path(query.root, name), aligned) for name in query.names}
+        record = read_record(query.root)
+        aligned, own = record.get("aligned") is True, "estimator" in record
+        return {name: DepthFile(map_path(query.root, name), aligned, straight=own) for name in query.names}
 
 
 @dataclass(frozen=True)
@@ -65,10 +66,10 @@ class HierarchicalDepths(DepthLayout):
 
 @dataclass(frozen=True)
 class NerfstudioDepths(DepthLayout):
-    """Depth maps that the frames of transforms.json, or of transforms_train.json and its like, name.
+    """Nerfstudio: `depth_file_path` of the frames in transforms.json, depth times depth_unit_scale_factor.
 
-    Nerfstudio: `depth_file_path`, depth times depth_unit_scale_factor. instant-ngp: `depth_path`, depth times
-    integer_depth_scale, unless enable_depth_loading is false.
+    Also `depth_path` of instant-ngp, depth times integer_depth_scale, unless enable_depth_loading is false; and both in
+    transforms_train.json and its like.
     """
 
     priority: ClassVar[int] = -2
