@@ -138,7 +138,7 @@ def show(diagnosis: Diagnosis, estimate_wanted: bool) -> None:
         estimate_wanted: Whether an estimate was wanted.
     """
     console = Console(soft_wrap=not sys.stdout.isatty(), highlight=False)
-    print_table((str(diagnosis.data), ""), list(diagnosis.found.items()))
+    print_table(("data set", str(diagnosis.data)), list(diagnosis.found.items()))
     if diagnosis.will:
         console.print("\nA run will", style="bold")
         for text in diagnosis.will:

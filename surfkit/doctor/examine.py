@@ -16,21 +16,19 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.memory import peak_memory_bytes, size
 from surfkit.core.registry import name_of
-from surfkit.depth.prepare import REMEDY, others_warning
 from surfkit.doctor.estimate import Estimate
 from surfkit.doctor.exposure import exposures
-from surfkit.doctor.finding import LEVELS, Finding, from_errors, of_each
-from surfkit.doctor.gather import Gathered, depth_maps, gather
+from surfkit.doctor.finding import LEVELS, Finding, of_each
+from surfkit.doctor.gather import Gathered, gather
 from surfkit.doctor.geometry import Geometry, seen_by, survey
 from surfkit.doctor.photographs import Photograph, Wanted, look_at
+from surfkit.doctor.priors import priors
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
-from surfkit.readers.depth_prior import OFF, normals_warning, prepare_command
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.scene.groups import groups_warning, untied_warning
-from surfkit.train.material import needs_normals, needs_priors
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -110,7 +108,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *_groups(gathered),
         *_untied(gathered),
         *_exposure(gathered, known, recipe),
-        *_priors(data, gathered, recipe),
+        *priors(data, gathered, recipe, quick),
     ]
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     found = _found(data, gathered, geometry, looks)
@@ -255,50 +253,6 @@ def _exposure(gathered: Gathered, known: dict[str, Photograph], recipe: Recipe) 
         "add pretrain.appearance:exposure, which learns an exposure for each"
     )
     return [Finding("warning", "exposure", text)]
-
-
-def _priors(data: Data, gathered: Gathered, recipe: Recipe) -> list[Finding]:
-    """Depth priors, where the recipe uses them."""
-    train, losses = gathered.train, recipe.pretrain.losses
-    stereo = recipe.start.needs_prior or recipe.method.needs_prior
-    if not train or not (stereo or needs_priors(losses)):
-        return []
-    normals = needs_normals(losses)
-    make = prepare_command(data)
-    try:
-        maps = depth_maps(data, gathered)
-    except BadInput as error:
-        return from_errors("depth-priors", [error])
-    if not maps and recipe.depth is not None:
-        text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
-        return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
-    if not maps and stereo:
-        begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
-        return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
-    if not maps:
-        text = f"the recipe uses depth priors, and there are no depth priors, so {OFF}; {make}"
-        return [Finding("warning", "depth-priors", text)]
-    found = []
-    if missing := [shot.name for shot in train if shot.name not in maps]:
-        text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
-        found.append(Finding("warning", "depth-priors", text, tuple(missing)))
-    longest = max(max(data.size(shot.camera.width, shot.camera.height)) for shot in train)
-    if recipe.depth is not None and (text := others_warning(data.path, maps.values(), recipe.depth, longest)):
-        found.append(Finding("warning", "depth-priors", f"{text}{REMEDY}"))
-    if normals and (text := normals_warning(data, list(maps.values()))):
-        found.append(Finding("warning", "prior-normals", text))
-    return found
-
-
-def _normals_to_come(recipe: Recipe) -> list[Finding]:
-    """Maps that the run makes have no normals if its estimator gives none."""
-    if recipe.depth is not None and recipe.depth.oriented:
-        return []
-    text = (
-        f"the loss normal-prior learns nothing from depth priors without normals, and {name_of(recipe.depth)} gives "
-        "none; depth:patch-match does"
-    )
-    return [Finding("warning", "prior-normals", text)]
 
 
 def _found(data: Data, gathered: Gathered, geometry: Geometry, looks: dict[Path, Photograph]) -> dict[str, str]:

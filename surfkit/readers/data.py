@@ -154,6 +154,8 @@ def _listed(path: Path, names: Sequence[str]) -> set[str]:
     chosen = {line.strip() for line in lines} - {""}
     if not chosen:
         raise BadInput(f"--test-list {path}: names no photograph; write one name a line")
+    slashes = {name.replace("\\", "/"): name for name in names}
+    chosen = {name if name in names else slashes.get(name.replace("\\", "/"), name) for name in chosen}
     for name in sorted(chosen - set(names)):
         raise BadInput(f"--test-list {path}: no photograph {name!r} in the model{nearest(name, names)}")
     return chosen

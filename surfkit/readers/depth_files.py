@@ -15,6 +15,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
 from surfkit.core.optional import needed
 from surfkit.scene.arrays import map_array, write_array
+from surfkit.scene.names import safe_path
 from surfkit.scene.photos import open_picture
 
 EXR = ".exr"
@@ -22,6 +23,8 @@ NO_DEPTH = 65504.0
 """The largest half float: the sky in MatrixCity's depth maps."""
 FOLDER = "estimated_depths"
 RECORD = "depth.json"
+APART = ("path", "straight")
+"""Fields of a depth file that say nothing of its numbers."""
 UNIT = 127
 """What a component of 1 of a normal is stored as."""
 warnings.filterwarnings("ignore", r"Reading `\.npy`", UserWarning)  # of Python 2, whose arrays are as good
@@ -40,6 +43,8 @@ class DepthFile:
         scale: Stored values are multiplied by it; where `metric`, before they are inverted.
         offset: Added after that; unused where `metric`.
         metric: Whether depths are stored, not inverse depths.
+        straight: Whether the map is of the undistorted photograph, as surfkit makes them, and not of the one in the
+            data set, with which it is undistorted.
     """
 
     path: Path
@@ -47,6 +52,7 @@ class DepthFile:
     scale: float = 1.0
     offset: float = 0.0
     metric: bool = False
+    straight: bool = False
 
     def stored(self) -> np.ndarray:
         """The numbers in the file, (h, w), (1, h, w) or (h, w, 1).
@@ -59,7 +65,7 @@ class DepthFile:
     @property
     def meaning(self) -> tuple[Any, ...]:
         """Everything but the file that decides what `read` gives."""
-        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "path")
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name not in APART)
 
     def read(self) -> np.ndarray:
         """(h, w) float32 inverse depth, up to an affine map unless `aligned`; NaN where there is none.
@@ -105,8 +111,8 @@ class DepthFile:
 
 
 def map_path(root: Path, name: str) -> Path:
-    """Where surfkit and CityGaussianV2 keep the inverse depth of a photograph."""
-    path = root / FOLDER / name.replace("\\", "/")
+    """Where surfkit and CityGaussianV2 keep the inverse depth of a photograph, whose name may lead anywhere."""
+    path = root / FOLDER / safe_path(name)
     return path.with_name(f"{path.name}.npy")
 
 

@@ -11,9 +11,13 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json
 from surfkit.readers.depth_files import EXR, FOLDER, DepthFile, map_path, read_record
 from surfkit.readers.depth_layout import DepthLayout, DepthQuery
+from surfkit.scene.names import name_below, named_file, safe_path
 
 MILLIMETRE = 1e-3
 """Nerfstudio's `depth_unit_scale_factor`, where a data set does not say another."""
+NERFSTUDIO_UNIT, NGP_UNIT = "depth_unit_scale_factor", "integer_depth_scale"
+"""What stored depths are multiplied by, in the units of the poses."""
+TRANSFORMS = ("transforms.json", *(f"transforms_{part}.json" for part in ("train", "val", "test")))
 CENTIMETRE = 0.01
 PHOTOS = ("rgb", "images", "input")
 """Folders of photographs inside a block of MatrixCity, which has none or one of them."""
@@ -32,8 +36,9 @@ class EstimatedDepths(DepthLayout):
         """See `DepthLayout.find`."""
         if not (query.root / FOLDER).is_dir():
             return None
-        aligned = read_record(query.root).get("aligned") is True
-        return {name: DepthFile(map_path(query.root, name), aligned) for name in query.names}
+        record = read_record(query.root)
+        aligned, own = record.get("aligned") is True, "estimator" in record
+        return {name: DepthFile(map_path(query.root, name), aligned, straight=own) for name in query.names}
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class HierarchicalDepths(DepthLayout):
             return None
         params, found = read_json(path, dict[str, Any]), {}
         for name in query.names:
-            stem = str(PurePosixPath(_posix(name)).with_suffix(""))
+            stem = str(safe_path(name).with_suffix(""))
             entry = params.get(stem)
             if isinstance(entry, dict) and {"scale", "offset"} <= entry.keys():
                 scale, offset = (_number(path, f"{stem}.{part}", entry[part]) for part in ("scale", "offset"))
@@ -61,34 +66,50 @@ class HierarchicalDepths(DepthLayout):
 
 @dataclass(frozen=True)
 class NerfstudioDepths(DepthLayout):
-    """Nerfstudio: `depth_file_path` of the frames in transforms.json, depth times depth_unit_scale_factor."""
+    """Nerfstudio: `depth_file_path` of the frames in transforms.json, depth times depth_unit_scale_factor.
+
+    Also `depth_path` of instant-ngp, depth times integer_depth_scale, unless enable_depth_loading is false; and both in
+    transforms_train.json and its like.
+    """
 
     priority: ClassVar[int] = -2
 
     def find(self, query: DepthQuery) -> Mapping[str, DepthFile] | None:
         """See `DepthLayout.find`."""
-        path = query.root / "transforms.json"
-        if not path.exists():
-            return None
-        contents = read_json(path, Any)
-        listed = contents.get("frames") if isinstance(contents, dict) else None
-        frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
-        depths = {
-            str(f["file_path"]): str(f["depth_file_path"])
-            for f in frames
-            if f.keys() >= {"file_path", "depth_file_path"}
-        }
-        if not depths:
-            return None
-        unit = _number(path, "depth_unit_scale_factor", contents.get("depth_unit_scale_factor", MILLIMETRE))
-        by_name = {PurePosixPath(photo.removeprefix("./")): depth for photo, depth in depths.items()}
-        by_name |= {PurePosixPath(*photo.parts[1:]): depth for photo, depth in list(by_name.items())}
-        own = {name: by_name.get(PurePosixPath(_posix(name))) for name in query.names}
-        return {
-            name: DepthFile(query.root / depth, True, unit, metric=True)
-            for name, depth in own.items()
-            if depth is not None
-        }
+        depths: dict[str, DepthFile] = {}
+        for path in (query.root / name for name in TRANSFORMS):
+            if path.exists():
+                depths |= _of_frames(path)
+        own = {name: depths.get(_posix(name), depths.get(_bare(_posix(name)))) for name in query.names}
+        return {name: file for name, file in own.items() if file is not None} if depths else None
+
+
+def _of_frames(path: Path) -> dict[str, DepthFile]:
+    """The depth maps that a file of transforms names, by the photographs' names, with and without their folder."""
+    contents = read_json(path, Any)
+    if not isinstance(contents, dict) or not isinstance(contents.get("frames"), list):
+        return {}
+    root, by_photo, below = path.parent, {}, {}
+    unit = _number(path, NERFSTUDIO_UNIT, contents.get(NERFSTUDIO_UNIT, MILLIMETRE))
+    ngp_unit = _number(path, NGP_UNIT, contents.get(NGP_UNIT, unit))
+    ngp = contents.get("enable_depth_loading") is not False
+    for frame in contents["frames"]:
+        if not isinstance(frame, dict) or not frame.get("file_path"):
+            continue
+        named, scale = frame.get("depth_file_path"), unit
+        if not named and ngp:
+            named, scale = frame.get("depth_path"), ngp_unit
+        if named:
+            photo = name_below(root, named_file(root, str(frame["file_path"])))
+            file = DepthFile(named_file(root, str(named)), True, scale, metric=True)
+            by_photo[photo] = file
+            below["/".join(photo.split("/")[1:])] = file
+    return below | by_photo
+
+
+def _bare(name: str) -> str:
+    """A name without its ending, which frames may leave out."""
+    return str(PurePosixPath(name).with_suffix("")) if name else name
 
 
 @dataclass(frozen=True)
@@ -106,7 +127,7 @@ class MatrixCityDepths(DepthLayout):
             return None
         found = {}
         for name in query.names:
-            if path := next((place for place in _city_places(query.root, name) if place.is_file()), None):
+            if path := next((place for place in _city_places(query.root, safe_path(name)) if place.is_file()), None):
                 found[name] = DepthFile(path, True, CENTIMETRE / query.metres, metric=True)
         return found or None
 
@@ -122,12 +143,12 @@ def _number(path: Path, at: str, value: Any) -> float:
         raise BadInput(f"{path}: {error}") from error
 
 
-def _city_places(root: Path, name: str) -> Iterator[Path]:
+def _city_places(root: Path, photo: PurePosixPath) -> Iterator[Path]:
     """Where MatrixCity may have the depth of a photograph."""
-    block = PurePosixPath(name).parent
+    block = photo.parent
     if block.name in PHOTOS or block.name == block.parent.name:
         block = block.parent
-    stem = f"{PurePosixPath(name).stem}{EXR}"
+    stem = f"{photo.stem}{EXR}"
     depth = f"{block.name}_depth"
     below = (block / "depth" / stem, block.parent / depth / stem, block.parent / depth / depth / stem)
     for tree in _city_trees(root.resolve()):

@@ -17,18 +17,16 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import DepthFile, normal_path, read_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_layouts import EstimatedDepths
+from surfkit.readers.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
+from surfkit.readers.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
 from surfkit.readers.made_maps import located
 from surfkit.readers.read import model_folder, observations
-from surfkit.scene.align import MAX_ERROR_PX, MIN_POINTS, SCALE_BAND, align, sample
+from surfkit.scene.align import MAX_ERROR_PX, SCALE_BAND, align, sample
 from surfkit.scene.cache import Cache
 from surfkit.scene.observations import Observations
-from surfkit.scene.scene import Scene, View
+from surfkit.scene.scene import Lens, Scene, View
 from surfkit.scene.vectors import unit
 
-UNITS = 1.25
-"""A map in input units that is off by a larger factor from the sparse points is in other units."""
-EDGE = 0.05
-"""Neighbouring pixels whose inverse depths differ by a larger share lie on two surfaces and are not averaged."""
 TRUSTED = 0.5
 """Pixels of a higher confidence count as trusted."""
 HARDLY = 0.02
@@ -79,13 +77,16 @@ class Alignment:
 class Fit:
     """A map, and the scale and offset that turn its values into inverse depths in 1/local units.
 
-    `trusted` is the share of its pixels with high confidence, 1 where that is not known.
+    `trusted` is the share of its pixels with high confidence, 1 where that is not known; `unit` is what tells its unit,
+    if it has one; `lens` what distorts it, if anything does.
     """
 
     file: DepthFile
     scale: float
     offset: float
     trusted: float = 1.0
+    unit: Unit | None = None
+    lens: Lens | None = None
 
 
 def prior_cache(
@@ -126,23 +127,31 @@ def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
         normal = fit.file.read_normal() if normals else None
     except BadInput as error:
         raise BadInput(f"{fit.file.path}: {error}") from error
-    if normal is not None:
-        normal = _nearest(torch.from_numpy(np.array(normal)), size)
-    inverse = resized(inverse.nan_to_num(0, 0, 0).clamp_min(0), size)
+    inverse = inverse.nan_to_num(0, 0, 0).clamp_min(0)
+    beside = [None if part is None else torch.from_numpy(np.array(part)) for part in (confidence, normal)]
+    trust, facing = (None if part is None else part.reshape(-1, *inverse.shape) for part in beside)
+    if (lens := _lens(view, fit.file, inverse.shape)) is not None:
+        trust, facing = (None if part is None else straightened_nearest(part, lens) for part in (trust, facing))
+        inverse = straightened(inverse, lens)
+    facing = None if facing is None else nearest(facing, size)
+    inverse = resized(inverse, size)
     there = (inverse > 0).to(torch.float32)
-    if confidence is None:
-        return DepthPrior(inverse, there, typical, normal)
-    grown = interpolate(torch.from_numpy(confidence)[None, None], size, mode="nearest-exact")[0, 0]
-    return DepthPrior(inverse, grown * there, typical, normal)
+    if trust is None:
+        return DepthPrior(inverse, there, typical, facing)
+    grown = interpolate(trust[None], size, mode="nearest-exact")[0, 0]
+    return DepthPrior(inverse, grown * there, typical, facing)
 
 
-def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """(3, H, W) of (3, h, w) of any type: the value of the pixel in whose place the middle of each one lies."""
-    rows, columns = (
-        ((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new)).long().clamp_max(old - 1)
-        for new, old in zip(size, values.shape[1:], strict=True)
-    )
-    return values[:, rows][:, :, columns]
+def _lens(view: View, file: DepthFile, shape: Sequence[int]) -> Lens | None:
+    """The lens of a map of (height, width) that is of the distorted photograph; None if nothing in it is distorted."""
+    lens = view.lens
+    return None if lens is None or file.straight or not _fits(shape, lens.width, lens.height) else lens
+
+
+def _fits(shape: Sequence[int], width: int, height: int) -> bool:
+    """Whether a map of (height, width) has the shape of a picture of a width and height."""
+    wanted = shape[1] * height / width
+    return abs(shape[0] - wanted) <= 1 + 0.01 * wanted
 
 
 def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
@@ -199,8 +208,9 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
         answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
-    for at in _outliers(fits, band):
-        reasons[scene.train[at].name] = "its scale is far from that of the other images"
+    unfit = dict.fromkeys(_outliers(fits, band), "its scale is far from that of the other images")
+    for at, reason in (unfit | in_other_units([fit and fit.unit for fit in fits])).items():
+        reasons[scene.train[at].name] = reason
         fits[at] = None
     if not any(fits):
         emit(Warned(f"no depth prior of {data.path} can be used, so {OFF}: {list_reasons(reasons)}"))
@@ -208,6 +218,10 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {list_reasons(reasons)}"))
     _warn_of_leaks(data, scene)
+    if bent := sum(fit is not None and fit.lens is not None for fit in fits):
+        emit(Warned(f"{bent} depth maps are of distorted photographs, and are undistorted with them"))
+    if text := far_warning([fit and fit.unit for fit in fits], scene):
+        emit(Warned(text))
     if text := trust_warning(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
         emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
@@ -222,19 +236,6 @@ def trust_warning(share: float) -> str | None:
         return None
     causes = "are mirrored, are all the same, show no texture, or belong to other cameras"
     return f"only {share:.1%} of the pixels of the depth maps are trusted; see whether the photographs {causes}"
-
-
-def resized(inverse: Tensor, size: tuple[int, int]) -> Tensor:
-    """A map (h, w) at another size (H, W), smooth on surfaces and sharp between them; 0 stays 0."""
-    if inverse.shape == size:
-        return inverse
-    smaller = size[0] < inverse.shape[0]
-    near = interpolate(inverse[None, None], size, mode="nearest-exact")[0, 0]
-    there = (inverse > 0).to(inverse.dtype)
-    both = torch.stack([inverse, there])[None]
-    smooth, full = interpolate(both, size, mode="area" if smaller else "bilinear")[0]
-    one_surface = (full == 1) & ((smooth - near).abs() < EDGE * near)
-    return torch.where(one_surface, smooth, near)
 
 
 def typical_inverse_depth(views: Sequence[View], observations: Observations, scene: Scene) -> float:
@@ -268,23 +269,23 @@ def _fit(view: View, file: DepthFile | None, observations: Observations, scene: 
     try:
         values = file.read()
         confidence, normal = file.read_confidence(), file.read_normal()
-        _check_map(values, view)
+        lens = _lens(view, file, values.shape)
+        _check_map(values, view, lens)
         _check_beside(values, {"confidence": confidence, "normals": normal})
         trusted = 1.0 if confidence is None else float((confidence > TRUSTED).mean())
-        at, inverse = observations.of(view, MAX_ERROR_PX)
-        values = sample(values, at)
+        at, inverse, tracked = points_in(view, observations, scene, guess=file.aligned)
+        at = at if lens is None else distorted(at, lens)
         if not file.aligned:
-            return Fit(file, *align(values, inverse), trusted)
-        _check_units(values / scene.frame.scale, inverse)
-        return Fit(file, 1 / scene.frame.scale, 0.0, trusted)
+            return Fit(file, *align(sample(values, at), inverse), trusted, lens=lens)
+        unit = unit_of(values / scene.frame.scale, at, inverse, tracked)
+        return Fit(file, 1 / scene.frame.scale, 0.0, trusted, unit, lens)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
 
 
-def _check_map(values: np.ndarray, view: View) -> None:
+def _check_map(values: np.ndarray, view: View, lens: Lens | None) -> None:
     height, width = values.shape
-    wanted = width * view.camera.height / view.camera.width
-    if abs(height - wanted) > 1 + 0.01 * wanted:
+    if lens is None and not _fits(values.shape, view.camera.width, view.camera.height):
         raise BadInput(f"{width} x {height} px is not the shape of its photograph")
     known = values[np.isfinite(values)]
     if not len(known):
@@ -299,13 +300,6 @@ def _check_beside(values: np.ndarray, beside: Mapping[str, np.ndarray | None]) -
         if array is not None and array.shape[-2:] != values.shape:
             size = f"{array.shape[-1]} x {array.shape[-2]} px"
             raise BadInput(f"it has {width} x {height} px, and its {what} {size}")
-
-
-def _check_units(values: np.ndarray, inverse: np.ndarray) -> None:
-    known = np.isfinite(values) & (values > 0)
-    ratio = float(np.median(values[known] / inverse[known])) if known.sum() > MIN_POINTS else 1.0
-    if not 1 / UNITS < ratio < UNITS:
-        raise BadInput("its depths are not those of the sparse points")
 
 
 def _outliers(fits: Sequence[Fit | None], band: tuple[float, float]) -> list[int]:

@@ -21,14 +21,14 @@ from surfkit.readers.data import Data
 from surfkit.readers.masks import check_mask, find_masks
 from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
-from surfkit.readers.undistort import Picture, check_camera, is_pinhole, undistort
+from surfkit.readers.undistort import Picture, check_camera, is_pinhole, lens_of, pinhole_of, undistort
 from surfkit.scene.camera import Camera
 from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
-from surfkit.scene.scene import Cloud, Frame, Scene, View
+from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
 
 RANDOM_POINTS = 50_000
 """Where a data set has no sparse points."""
@@ -73,7 +73,13 @@ def _placed(data: Data, reader: Reader) -> Placed | None:
     return None if reader.model_folder(data) is not None else read_placed(data.path)
 
 
-def build_scene(data: Data, capture: Capture, keep: Path | None = None, only: Collection[str] | None = None) -> Scene:
+def build_scene(
+    data: Data,
+    capture: Capture,
+    keep: Path | None = None,
+    only: Collection[str] | None = None,
+    pixels: bool = True,
+) -> Scene:
     """The scene of a capture.
 
     Args:
@@ -81,6 +87,7 @@ def build_scene(data: Data, capture: Capture, keep: Path | None = None, only: Co
         capture: What its reader has found in it.
         keep: Folder of the undistorted photographs; by default one that later runs find again.
         only: Names of the photographs to make views of; all by default.
+        pixels: Whether photographs are undistorted; if not, views have the right cameras and nothing is written.
     """
     held_out = data.held_out(capture)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
@@ -89,7 +96,7 @@ def build_scene(data: Data, capture: Capture, keep: Path | None = None, only: Co
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
     wanted = [shot for shot in shots if only is None or shot.name in only]
-    views = _views(*reduced(data, wanted), frame, keep)
+    views = _views(*reduced(data, wanted), frame, keep, pixels)
     return Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
@@ -221,8 +228,14 @@ def _wanted() -> str:
     )
 
 
-def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -> list[View]:
+def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None, pixels: bool) -> list[View]:
     """The photographs at the size to use them at, undistorted."""
+
+    def straight(picture: Picture) -> Picture:
+        if is_pinhole(picture.camera):
+            return picture
+        return undistort(picture, data.path, keep) if pixels else pinhole_of(picture)
+
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
     masks = find_masks(data.path, data.masks, shots)
@@ -237,7 +250,7 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -
             Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
             for shot, size in zip(shots, sizes, strict=True)
         ]
-        pictures = list(pool.map(lambda p: p if is_pinhole(p.camera) else undistort(p, data.path, keep), given))
+        pictures = list(pool.map(straight, given))
     if any(turned):
         first = shots[turned.index(True)].name
         emit(
@@ -246,7 +259,8 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None) -
                 "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
             )
         )
-    return [_view(shot, picture, frame) for shot, picture in zip(shots, pictures, strict=True)]
+    lenses = [None if is_pinhole(p.camera) else lens_of(p.camera, p.size) for p in given]
+    return [_view(*parts, frame) for parts in zip(shots, pictures, lenses, strict=True)]
 
 
 def check_size(shot: Shot, size: tuple[int, int]) -> None:
@@ -267,7 +281,7 @@ def check_size(shot: Shot, size: tuple[int, int]) -> None:
     )
 
 
-def _view(shot: Shot, picture: Picture, frame: Frame) -> View:
+def _view(shot: Shot, picture: Picture, bent: Lens | None, frame: Frame) -> View:
     lens = picture.camera
     full = Camera(
         world_to_camera=frame.local_pose(shot.pose),
@@ -278,7 +292,7 @@ def _view(shot: Shot, picture: Picture, frame: Frame) -> View:
         width=int(lens.width),
         height=int(lens.height),
     )
-    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white)
+    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white, bent)
 
 
 def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:
@@ -305,4 +319,4 @@ def _cloud(capture: Capture, poses: np.ndarray, frame: Frame) -> Cloud:
     corners = np.concatenate([centres, centres + local[:, 2, :3]])  # one extent ahead, along the optical axes
     draw = np.random.default_rng(0)
     xyz = draw.uniform(corners.min(0), corners.max(0), (RANDOM_POINTS, 3)).astype(np.float32)
-    return Cloud(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8))
+    return Cloud(torch.from_numpy(xyz), torch.full((RANDOM_POINTS, 3), 128, dtype=torch.uint8), drawn=True)

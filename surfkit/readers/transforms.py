@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput, leaving_out, reject
+from surfkit.core.check import BadInput, few, leaving_out, reject
 from surfkit.core.codec import read_json
+from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot, camera_of, shorten
 from surfkit.readers.data import Data
@@ -20,6 +21,7 @@ from surfkit.readers.depth_cloud import sample_depth_maps
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_layouts import MatrixCityDepths
 from surfkit.readers.sparse_ply import read_points
+from surfkit.scene.names import name_below, named_file
 from surfkit.scene.photos import photo_size
 
 ENDS = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
@@ -43,9 +45,7 @@ class Nerfstudio(Reader):
     def read(self, data: Data) -> Capture:
         path = data.path / "transforms.json"
         contents, shots = frames(path, data)
-        names = {shot.name for shot in shots}
-        listed = [f"{part}_filenames" for part in ("val", "test") if f"{part}_filenames" in contents]
-        held = {str(Path(str(name))) for part in listed for name in contents[part]} & names
+        held = _listed(path, contents, data, {shot.name for shot in shots})
         return Capture(shots, *points(data.path, contents), frozenset(held) if held else None)
 
 
@@ -116,8 +116,8 @@ def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
             pose = _pose(where, frame)
             camera = _camera(where, {**contents, **frame}, photo)
             camera = cameras.setdefault(str(camera), camera)  # one for all frames that share it
-            mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-            shots.append(Shot(_name(photo, data.path), pose, camera, photo, mask))
+            mask = named_file(path.parent, str(frame["mask_path"])) if frame.get("mask_path") else None
+            shots.append(Shot(name_below(data.path, photo), pose, camera, photo, mask))
     if len({shot.name for shot in shots}) < len(shots):
         reject(BadInput(f"{path}: two frames have the same photograph; delete one"))
     return contents, shots
@@ -128,7 +128,7 @@ def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndar
     named = contents.get("ply_file_path") or next((name for name in POINTS if (root / name).is_file()), None)
     with leaving_out():
         if named:
-            return read_points(root / str(named))
+            return read_points(named_file(root, str(named)))
     return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
 
 
@@ -143,19 +143,34 @@ def _metres(contents: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _name(photo: Path, root: Path) -> str:
-    """What lies beside the data set, as in ../../train/0000.png, is named from there on."""
-    parts = Path(os.path.relpath(photo, root)).parts
-    return "/".join(part for part in parts if part != "..")
+def _listed(path: Path, contents: Mapping[str, Any], data: Data, names: set[str]) -> set[str]:
+    """Names of the photographs that a file lists for validation or tests; a line tells of those it has no frame of."""
+    found, unknown = set(), []
+    for part in ("val_filenames", "test_filenames"):
+        listed = contents.get(part, [])
+        if not isinstance(listed, list):
+            raise BadInput(f"{path}: {part} is {shorten(listed)}, not a list of photographs")
+        for said in map(str, listed):
+            name = None
+            with suppress(BadInput):
+                name = name_below(data.path, _photo(part, path.parent, {"file_path": said}, data))
+            if name in names:
+                found.add(name)
+            else:
+                unknown.append(said)
+    if unknown:
+        text = f"{path}: {len(unknown)} photographs listed for validation or tests are not among its frames"
+        emit(Warned(f"{text}, {few(unknown)}: correct the list, or they are not held out"))
+    return found
 
 
 def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Path:
     """The photograph of a frame: as its file_path says, or as its number does in MatrixCity."""
-    said = str(frame.get("file_path") or "").replace("\\", "/").removeprefix("./")
+    said = str(frame.get("file_path") or "")
     index = frame.get("frame_index")
     if not said and not isinstance(index, int):
         raise BadInput(f"{where}: has no file_path")
-    places: Sequence[str] = [said, Path(said).name] if said else []
+    places: Sequence[str] = [said, said.replace("\\", "/").rpartition("/")[2]] if said else []
     if isinstance(index, int):
         numbered = f"{index:04d}.png"
         places = [*places, *(f"{below}/{numbered}".lstrip("/") for below in (*NUMBERED, folder.name))]
@@ -163,7 +178,7 @@ def _photo(where: str, folder: Path, frame: Mapping[str, Any], data: Data) -> Pa
     for place in places:
         for base in reversed(bases):  # --images first
             for end in ENDS:
-                path = base / f"{place}{end}"
+                path = named_file(base, f"{place}{end}")
                 if path.is_file():
                     return path
     raise BadInput(f"{where}: no photograph {said or places[0]!r} in {folder}; put it there, or delete the frame")

@@ -19,6 +19,7 @@ from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.masks import read_mask
 from surfkit.scene.copies import digest, place
 from surfkit.scene.photos import read_photo
+from surfkit.scene.scene import Lens
 
 FOLDER = "undistorted"
 RECIPE = "1"
@@ -79,8 +80,8 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
     Raises:
         BadInput: The photograph is damaged, or its camera has no pinhole equivalent.
     """
-    lens = _Lens.of(picture.camera, picture.size)
-    camera, grid, inside = _warp(lens)
+    lens = lens_of(picture.camera, picture.size)
+    camera, grid, inside = warp(lens)
     path = (keep or cache_folder(root)) / _cached(picture, lens, root)
     mask = path.with_name(f"{path.stem}-mask.png") if picture.mask is not None or not inside.all() else None
     if not path.exists():
@@ -92,31 +93,32 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
     return replace(picture, path=path, mask=mask, camera=camera, size=(camera.width, camera.height))
 
 
-@dataclass(frozen=True)
-class _Lens:
-    """A camera as plain values, at the size it is used at."""
+def pinhole_of(picture: Picture) -> Picture:
+    """The picture that `undistort` gives, without its pixels: its paths are those of the distorted photograph."""
+    camera, _, _ = warp(lens_of(picture.camera, picture.size))
+    return replace(picture, camera=camera, size=(camera.width, camera.height))
 
-    model: str
-    params: tuple[float, ...]
-    width: int
-    height: int
 
-    @classmethod
-    def of(cls, camera: Any, size: tuple[int, int]) -> _Lens:
-        scaled = load_pycolmap().Camera(
-            model=camera.model.name, width=camera.width, height=camera.height, params=list(camera.params)
-        )
-        scaled.rescale(*size)
-        return cls(camera.model.name, tuple(scaled.params), *size)
-
-    def camera(self) -> Any:
-        return load_pycolmap().Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+def lens_of(camera: Any, size: tuple[int, int]) -> Lens:
+    """A pycolmap camera as plain values, at the width and height it is used at."""
+    scaled = load_pycolmap().Camera(
+        model=camera.model.name, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    scaled.rescale(*size)
+    return Lens(camera.model.name, tuple(scaled.params), *size)
 
 
 @lru_cache(maxsize=8)
-def _warp(lens: _Lens) -> tuple[Any, Tensor, Tensor]:
-    """The pinhole camera, where its pixels lie in the photograph, (1, h, w, 2), and (h, w) which of them do."""
-    source = lens.camera()
+def warp(lens: Lens) -> tuple[Any, Tensor, Tensor]:
+    """The pinhole camera for a lens, and where its pixels lie in the photograph.
+
+    Returns:
+        The camera; (1, h, w, 2) places as `grid_sample` has them; (h, w) bool, whether a pixel lies in the photograph.
+
+    Raises:
+        BadInput: The camera has no pinhole equivalent.
+    """
+    source = load_pycolmap().Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
     try:
         camera = load_pycolmap().undistort_camera(load_pycolmap().UndistortCameraOptions(), source)
     except (ValueError, RuntimeError) as error:
@@ -139,10 +141,10 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
     return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
 
 
-def _cached(picture: Picture, lens: _Lens, root: Path) -> str:
-    """The name of the undistorted picture, which depends on all that it was made from."""
+def _cached(picture: Picture, lens: Lens, root: Path) -> str:
+    """The name of the undistorted picture, which depends on all that it was made from; as earlier versions spelt it."""
     paths = [path for path in (picture.path, picture.mask) if path is not None]
-    return f"{picture.path.stem}-{digest(root, f'{RECIPE} {lens} {picture.white}', paths)}.png"
+    return f"{picture.path.stem}-{digest(root, f'{RECIPE} _{lens} {picture.white}', paths)}.png"
 
 
 def cache_folder(root: Path) -> Path:

@@ -1,7 +1,9 @@
-"""Photographs that are called otherwise than their data set says."""
+"""Names of photographs: files that are called otherwise than their data set says, and names as paths of other files."""
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
@@ -21,6 +23,34 @@ SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
     lambda path: path.stem.lower(),
 )
 """What of a name must agree: all but the case, nor the ending, nor the folders."""
+OUTSIDE = "_outside"
+"""Folder for files named after photographs whose own names lead elsewhere."""
+
+
+def named_file(folder: Path, name: str) -> Path:
+    """The file below a folder that a data set names; a backslash is a slash, as on Windows, unless a file has it."""
+    path = folder / name
+    return path if "\\" not in name or path.is_file() else folder / name.replace("\\", "/")
+
+
+def name_below(root: Path, path: Path) -> str:
+    """What a photograph of a data set is called: its path from there, without the `..` of what lies beside it."""
+    return "/".join(part for part in Path(os.path.relpath(path, root)).parts if part != "..")
+
+
+def safe_path(name: str) -> PurePosixPath:
+    """A relative path, below whatever folder it is joined to, for a file that is named after a photograph.
+
+    Names of photographs come from files of others. A usual one, such as left/a.jpg, is its own path; a backslash is a
+    slash, as in `find_files`. One with `..`, `.` or an empty part, or from the root of a disk, gets a folder of its own
+    in `_outside/`, so that two names never share a path.
+    """
+    parts = name.replace("\\", "/").split("/")
+    if not any(part in ("", ".", "..") for part in parts) and parts[0][1:2] != ":":
+        return PurePosixPath(*parts)
+    own = hashlib.blake2b(name.encode(errors="surrogateescape"), digest_size=8).hexdigest()
+    last = next((part for part in reversed(parts) if part not in ("", ".", "..")), "photograph")
+    return PurePosixPath(OUTSIDE, own, last.replace(":", "_"))
 
 
 def is_video(path: Path) -> bool:
@@ -33,7 +63,7 @@ def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
     Another spelling counts when it fits one file only and no other name. A name without an ending is no other spelling.
     """
-    found = {name: path for name in names if (path := folder / name.replace("\\", "/")).is_file()}
+    found = {name: path for name in names if (path := named_file(folder, name)).is_file()}
     lost = [name for name in names if name not in found]
     if not lost:
         return found

@@ -19,6 +19,23 @@ FAR = 16
 
 
 @dataclass(frozen=True)
+class Lens:
+    """A distorted camera as plain values.
+
+    Attributes:
+        model: As COLMAP calls it.
+        params: As COLMAP orders them.
+        width: Of the photographs at the size used, pixels.
+        height: The same.
+    """
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
 class View:
     """One photograph and the camera that took it.
 
@@ -28,6 +45,7 @@ class View:
         path: The photograph on disk.
         mask: Its mask on disk, black where the photograph is to be ignored.
         white: Whether its transparent pixels lie over white, or over black.
+        lens: That of the photograph of which `path` is the undistorted picture; None where nothing was distorted.
     """
 
     name: str
@@ -35,6 +53,7 @@ class View:
     path: Path
     mask: Path | None = None
     white: bool = False
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True)
@@ -47,6 +66,7 @@ class Cloud:
         normals: (P, 3) float32 unit vectors, or None.
         opacity: (P,) float32 in (0, 1) to begin with; None leaves it to the primitive.
         size: (P,) float32 standard deviation to begin with, local units; None takes the gaps between the points.
+        drawn: Whether the points are random ones, as the data set has none.
     """
 
     xyz: Tensor
@@ -54,6 +74,7 @@ class Cloud:
     normals: Tensor | None = None
     opacity: Tensor | None = field(default=None, metadata={"digest": False})  # no part of a data set's fingerprint
     size: Tensor | None = field(default=None, metadata={"digest": False})
+    drawn: bool = field(default=False, metadata={"digest": False})
 
 
 @dataclass(frozen=True)

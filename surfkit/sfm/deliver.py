@@ -19,6 +19,7 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing, replacing_folder
 from surfkit.readers.placed import FILE, Placed
+from surfkit.scene.names import safe_path
 from surfkit.scene.photos import read_photo
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
@@ -98,7 +99,8 @@ def deliver(
                 write_json(work / RECORD, before | kept)
         pinholes.append(_rebuilt(model, images, cameras, sights))
     for name in set(before) - set(kept):
-        (scene / "images" / name).unlink(missing_ok=True)
+        if str(safe_path(name)) == name:  # the record may be another's
+            (scene / "images" / name).unlink(missing_ok=True)
     write_json(work / RECORD, kept)
     with replacing_folder(scene / "sparse") as folder:
         for number, (pinhole, (_, placed)) in enumerate(zip(pinholes, models, strict=True)):

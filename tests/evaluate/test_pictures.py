@@ -70,9 +70,15 @@ def test_png_is_rounded_and_whole(tmp_path):
         ("a.jpg", "a.jpg.png"),
         ("left/a.jpg", "left/a.jpg.png"),
         ("left\\a.jpg", "left/a.jpg.png"),
-        ("../../a.jpg", "a.jpg.png"),
-        ("/etc/a.jpg", "etc/a.jpg.png"),
+        ("left/a:1.jpg", "left/a_1.jpg.png"),
     ],
 )
-def test_names_stay_below_the_folder(tmp_path, name, file):
+def test_pictures_are_called_as_their_photographs(tmp_path, name, file):
     assert picture_path(tmp_path, name) == tmp_path / file
+
+
+def test_names_that_lead_elsewhere_stay_below_the_folder_and_apart(tmp_path):
+    names = ["a.jpg", "../a.jpg", "../../a.jpg", "/a.jpg", "..\\a.jpg", "b/../a.jpg"]
+    paths = [picture_path(tmp_path, name) for name in names]
+    assert len(set(paths)) == len(names)
+    assert all(path.resolve().is_relative_to(tmp_path.resolve()) for path in paths)

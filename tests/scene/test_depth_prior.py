@@ -182,6 +182,37 @@ def test_nerfstudio(farm, end):
     check_exact(priors, scene, exact)
 
 
+@pytest.mark.parametrize(
+    ("keys", "file"),
+    [
+        ({"integer_depth_scale": 1 / 1000}, "transforms.json"),
+        ({"integer_depth_scale": 1 / 1000, "enable_depth_loading": True}, "transforms_train.json"),
+    ],
+)
+@pytest.mark.parametrize("slash", ["/", "\\"])
+def test_instant_ngp(farm, keys, file, slash):
+    data, scene, exact = farm
+    (data.path / "depth").mkdir()
+    frames = []
+    for name, inverse in exact.items():
+        millimetres = np.where(inverse > 0, 1000 / np.maximum(inverse, 1e-9), 0).round().clip(0, 65535)
+        Image.fromarray(millimetres.astype(np.uint16)).save(data.path / f"depth/{Path(name).stem}.png")
+        frames.append(
+            {"file_path": f"images{slash}{Path(name).stem}", "depth_path": f"depth{slash}{Path(name).stem}.png"}
+        )
+    (data.path / file).write_text(json.dumps(keys | {"frames": frames}))
+    priors, notes = priors_of(data, scene)
+    assert notes == []
+    check_exact(priors, scene, exact)
+
+
+def test_depth_that_instant_ngp_is_told_not_to_load_is_not_read(farm):
+    data, scene, exact = farm
+    frames = [{"file_path": f"images/{name}", "depth_path": "depth.png"} for name in exact]
+    (data.path / "transforms.json").write_text(json.dumps({"enable_depth_loading": False, "frames": frames}))
+    assert find_maps(DepthQuery(data.path, list(exact), data.path)) == {}
+
+
 def test_what_cannot_be_used_is_listed_once(farm):
     data, scene, exact = farm
     relative(data, exact)

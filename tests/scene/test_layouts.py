@@ -237,3 +237,62 @@ def test_opendronemap_on_the_map(tmp_path, truth):
         assert float(here.norm()) == pytest.approx(float(east.norm()), abs=1e-3), (
             "the same flight at the same scale of the extent"
         )
+
+
+def windows(contents):
+    """File names as programs on Windows write them."""
+    for frame in contents["frames"]:
+        for key in ("file_path", "mask_path", "depth_file_path", "depth_path"):
+            if key in frame:
+                frame[key] = frame[key].replace("/", "\\")
+    contents["ply_file_path"] = ".\\points\\sparse.ply"
+    contents["test_filenames"] = ["images\\view_002.png", ".\\images\\view_004.png"]
+
+
+def test_backslashes_in_transforms_are_slashes(tmp_path, truth):
+    def change(contents):
+        for frame in contents["frames"]:
+            frame["mask_path"] = "kept/" + frame["file_path"][-12:]
+            save(tmp_path / frame["mask_path"], np.full((30, 40), 255, np.uint8))
+        windows(contents)
+
+    nerfstudio(tmp_path, truth, change)
+    (tmp_path / "points").mkdir()
+    (tmp_path / "sparse_pc.ply").rename(tmp_path / "points/sparse.ply")
+    scene = read(Data(tmp_path))
+    same(scene, truth)
+    assert [view.name for view in scene.held_out] == ["images/view_002.png", "images/view_004.png"]
+    assert all(view.mask is not None for view in scene.train)
+    assert len(scene.cloud.xyz) == len(truth.scene.cloud.xyz)
+
+
+def test_a_file_that_has_a_backslash_in_its_name_is_that_file(tmp_path, truth):
+    def change(contents):
+        contents["frames"][0]["file_path"] = "images\\view_000.png"
+        contents["test_filenames"] = ["images\\view_000.png"]
+
+    nerfstudio(tmp_path, truth, change)
+    (tmp_path / "images/view_000.png").rename(tmp_path / "images\\view_000.png")
+    scene = read(Data(tmp_path))
+    assert [view.name for view in scene.held_out] == ["images\\view_000.png"]
+
+
+@pytest.mark.parametrize("said", ["images/view_002", "images\\view_002"])
+def test_lists_of_tests_name_photographs_as_frames_may(tmp_path, truth, said):
+    scene = read(Data(nerfstudio(tmp_path, truth, lambda contents: contents.update(test_filenames=[said]))))
+    assert [view.name for view in scene.held_out] == ["images/view_002.png"]
+
+
+def test_lists_that_name_no_photograph_are_told(tmp_path, truth):
+    listed = ["images/view_002.png", "images/gone.png"]
+    nerfstudio(tmp_path, truth, lambda contents: contents.update(test_filenames=listed))
+    with collect_notes() as kept:
+        scene = read(Data(tmp_path))
+    assert [view.name for view in scene.held_out] == ["images/view_002.png"]
+    assert len(kept.texts) == 1 and "'images/gone.png'" in kept.texts[0] and "not held out" in kept.texts[0]
+
+
+def test_a_list_of_tests_may_have_backslashes(tmp_path, truth):
+    (tmp_path / "list.txt").write_text("images\\view_001.png\n")
+    scene = read(Data(nerfstudio(tmp_path / "data", truth), test_list=tmp_path / "list.txt"))
+    assert [view.name for view in scene.held_out] == ["images/view_001.png"]

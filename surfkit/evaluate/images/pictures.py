@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from surfkit.core.files import replacing
 from surfkit.raster.api import Maps
+from surfkit.scene.names import safe_path
 
 RAMP = np.array(
     [
@@ -79,8 +80,8 @@ def panel(photo: Tensor, maps: Maps) -> Tensor:
 
 def picture_path(folder: Path, name: str) -> Path:
     """The PNG of a view below `folder`: its photograph's name, folders included, with .png added."""
-    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")]
-    return folder.joinpath(*parts[:-1], f"{parts[-1].replace(':', '_')}.png")
+    path = safe_path(name)
+    return folder / path.with_name(f"{path.name.replace(':', '_')}.png")
 
 
 def write_picture(path: Path, image: Tensor) -> None:

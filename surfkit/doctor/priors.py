@@ -1,0 +1,79 @@
+"""What doctor says of depth priors: whether there are any, and what training will find wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+from surfkit.core.check import BadInput, few
+from surfkit.core.registry import name_of
+from surfkit.depth.prepare import REMEDY, others_warning
+from surfkit.doctor.finding import Finding, from_errors
+from surfkit.doctor.gather import Gathered, depth_maps, heard
+from surfkit.readers.data import Data
+from surfkit.readers.depth_prior import OFF, alignment, normals_warning, prepare_command
+from surfkit.readers.read import build_scene
+from surfkit.recipe import Recipe
+from surfkit.train.material import needs_normals, needs_priors
+
+
+def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[Finding]:
+    """Depth priors, where the recipe uses them; with `quick`, their numbers are not looked at."""
+    train, losses = gathered.train, recipe.pretrain.losses
+    stereo = recipe.start.needs_prior or recipe.method.needs_prior
+    if not train or not (stereo or needs_priors(losses)):
+        return []
+    normals = needs_normals(losses)
+    make = prepare_command(data)
+    try:
+        maps = depth_maps(data, gathered)
+    except BadInput as error:
+        return from_errors("depth-priors", [error])
+    if not maps and recipe.depth is not None:
+        text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
+        return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
+    if not maps and stereo:
+        begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
+        return [Finding("error", "depth-priors", f"{begins} depth maps, and there are none; {make}")]
+    if not maps:
+        text = f"the recipe uses depth priors, and there are no depth priors, so {OFF}; {make}"
+        return [Finding("warning", "depth-priors", text)]
+    found = []
+    if missing := [shot.name for shot in train if shot.name not in maps]:
+        text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
+        found.append(Finding("warning", "depth-priors", text, tuple(missing)))
+    longest = max(max(data.size(shot.camera.width, shot.camera.height)) for shot in train)
+    if recipe.depth is not None and (text := others_warning(data.path, maps.values(), recipe.depth, longest)):
+        found.append(Finding("warning", "depth-priors", f"{text}{REMEDY}"))
+    if normals and (text := normals_warning(data, list(maps.values()))):
+        found.append(Finding("warning", "prior-normals", text))
+    return found if quick else [*found, *_numbers(data, gathered, maps)]
+
+
+def _numbers(data: Data, gathered: Gathered, maps: Collection[str]) -> list[Finding]:
+    """What training will say of the numbers in the maps."""
+    held_out = gathered.held_out
+    shots = [shot for shot in gathered.capture.shots if shot.path.is_file()]
+    capture = replace(gathered.capture, shots=shots)
+    with heard():  # of these, doctor tells in its own words
+        try:
+            scene = build_scene(data, capture, only=set(maps) - held_out, pixels=False)
+        except BadInput:
+            return []
+    with heard() as said:
+        try:
+            alignment(data, scene)
+        except BadInput as error:
+            return from_errors("depth-maps", [error])
+    return [Finding("warning", "depth-maps", text) for text in said]
+
+
+def _normals_to_come(recipe: Recipe) -> list[Finding]:
+    """Maps that the run makes have no normals if its estimator gives none."""
+    if recipe.depth is not None and recipe.depth.oriented:
+        return []
+    text = (
+        f"the loss normal-prior learns nothing from depth priors without normals, and {name_of(recipe.depth)} gives "
+        "none; depth:patch-match does"
+    )
+    return [Finding("warning", "prior-normals", text)]
