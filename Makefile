@@ -10,7 +10,7 @@ WORKERS ?= logical
 .PHONY: demo test lint docs bench fuzz clean
 
 demo: $(VENV)/.installed
-	$(VENV)/bin/surfkit train recipe:surface --scale $(SCALE) --steps $(STEPS) --out $(OUT)
+	$(VENV)/bin/surfkit train recipe:surface --test-every 8 --scale $(SCALE) --steps $(STEPS) --out $(OUT)
 
 # In a process for each core, four at most, as each takes 1 GB of memory; `WORKERS=0` is in this one. One that dies
 # ends the run: pytest-xdist would begin its test again in another, and may wait for ever.

@@ -36,7 +36,7 @@ def hashes(words: list[str], steps: int) -> dict[str, str]:
     """Of the results of one run, by file; "-" for one that is not written."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "surfkit.cli", "train", *words, "--data", str(EXAMPLE), "--scale", "6"]
-        command += ["--steps", str(steps), "--out", folder + "/run"]
+        command += ["--test-every", "8", "--steps", str(steps), "--out", folder + "/run"]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             return {"error": done.stderr.strip().splitlines()[-1]}

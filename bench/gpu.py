@@ -202,6 +202,7 @@ def training(device: str, recipe: str, steps: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         words = [f"recipe:{recipe}", "--data", SCENE, "--scale", 4, "--steps", steps, "--device", device, "--out", out]
+        words += ["--test-every", 8]  # with every recipe, as for the figures before
         began = time.perf_counter()
         subprocess.run([sys.executable, "-m", "surfkit.cli", "train", *map(str, words)], check=True)
         metrics = json.loads((out / "metrics.json").read_text())

@@ -2,7 +2,7 @@
 
     python bench/walk.py SCRIPTS OUT
     surfkit prepare points OUT/posed --out OUT/scene
-    surfkit train recipe:surface --data OUT/scene --scale 1 --metres-per-unit 1 --steps 1300
+    surfkit train recipe:surface --data OUT/scene --scale 1 --metres-per-unit 1 --test-every 8 --steps 1300
     surfkit evaluate RUN --gt OUT/truth.ply --tau 0.2 --draws 1
 
 SCRIPTS has the data set's own city_scene.py, make_city_pack.py and shibuya-tiles.npz; they need numba. Photographs are

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,15 @@ from surfkit.readers.read import observations, read
 from surfkit.recipe import Recipe, complete, refuse_unused
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
-from surfkit.run.folder import Run, discard_results, read_data, refuse_file, refuse_no_run
+from surfkit.run.folder import (
+    Run,
+    discard_results,
+    read_data,
+    refuse_file,
+    refuse_foreign,
+    refuse_links,
+    refuse_no_run,
+)
 from surfkit.run.journal import record_events
 from surfkit.run.lod import has_levels, make_wanted_levels
 from surfkit.run.measure import evaluate, measure_compressed
@@ -45,7 +53,7 @@ from surfkit.run.method import (
 from surfkit.run.notes import collect_notes, prefix_notes
 from surfkit.run.prepare import with_maps, with_maps_to_mesh
 from surfkit.run.refine import refine_model, stage_scene
-from surfkit.run.resume import refuse_changed, refuse_other_run, write_run_files
+from surfkit.run.resume import read_unchanged, refuse_changed, refuse_other_run, write_run_files
 from surfkit.run.shared import Shares
 from surfkit.run.stage import Intervals, StageJob, load_state, optimise, select_rasterizer
 from surfkit.run.start import InitialPoints, align_priors
@@ -205,6 +213,7 @@ class Stages:
 def refuse_unready(run: Run, compute: Compute, caches: CacheSettings) -> None:
     """BadInput for what can be told before anything is read or written."""
     refuse_file(run.out)
+    refuse_foreign(run.out)
     refuse_unused(run.recipe)
     refuse_unsaved(run.recipe)
     caches.bytes(), caches.maps_bytes()
@@ -314,30 +323,37 @@ def opened(out: Path) -> Run:
         BadInput: The folder holds no run.
     """
     refuse_no_run(out)
+    refuse_links(out)
     return Run(out, read_json(out / "recipe.json", Recipe), read_data(out))
 
 
 @contextmanager
-def loaded(out: Path, device: Device, compressed: bool = False) -> Iterator[tuple[RunContext, Reconstruction]]:
+def loaded(
+    out: Path, device: Device, compressed: bool = False, read_data: Callable[[Run], Scene] = read_unchanged
+) -> Iterator[tuple[RunContext, Reconstruction]]:
     """Within, what a finished run has come to, and what it was made from.
 
     Args:
         out: Run folder.
         device: For rendering.
         compressed: Give its compressed model instead, and the folder of that one for results.
+        read_data: Reads the data set; by default, one that has changed since the run was trained is refused.
 
     Raises:
-        BadInput: The folder holds no run, or one that is not finished, or no compressed model.
+        BadInput: The folder holds no run, or one that is not finished, or no compressed model; or the data set is gone
+            or has changed.
     """
-    with _loaded(out, device) as (ctx, made):
+    with _loaded(out, device, read_data) as (ctx, made):
         yield decompressed(ctx, made) if compressed else (ctx, made)
 
 
 @contextmanager
-def _loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstruction]]:
+def _loaded(
+    out: Path, device: Device, read_data: Callable[[Run], Scene]
+) -> Iterator[tuple[RunContext, Reconstruction]]:
     run = opened(out)
     if run.recipe.has_stages:
-        run, state, scene = load_run(out)
+        run, state, scene = load_run(out, read_data)
         ctx = RunContext(run, scene, select_rasterizer(device)[0], Intervals(), CacheSettings())
         yield ctx, with_drawing(optimised(run, state), ctx.rasterizer)
         return
@@ -345,21 +361,21 @@ def _loaded(out: Path, device: Device) -> Iterator[tuple[RunContext, Reconstruct
         raise BadInput(
             f"{out}: method:{name_of(run.recipe.method)} has not finished; give its surfkit train command again"
         )
-    ctx = RunContext(run, read(run.data), select_rasterizer(device)[0], Intervals(), CacheSettings())
+    ctx = RunContext(run, read_data(run), select_rasterizer(device)[0], Intervals(), CacheSettings())
     with method_input(ctx, device) as given:
         yield ctx, reopened(run, given)
 
 
-def load_run(out: Path) -> tuple[Run, StageState, Scene]:
+def load_run(out: Path, read_data: Callable[[Run], Scene] = read_unchanged) -> tuple[Run, StageState, Scene]:
     """The folder of a run in stages, the state of its optimisation, and the scene that it was made from.
 
     Raises:
-        BadInput: The folder holds no run, or one that is not finished.
+        BadInput: The folder holds no run, or one that is not finished; or the data set is gone or has changed.
     """
     run = opened(out)
     if not run.recipe.has_stages:
         raise BadInput(f"{out}: method:{name_of(run.recipe.method)} has no stages, and so no state of an optimisation")
-    scene = read(run.data)
+    scene = read_data(run)
     state, missing = None, None
     for stage in reversed(run.stages):
         if (state := load_state(run, stage, stage_scene(run, stage, scene))) is not None:

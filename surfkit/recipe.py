@@ -24,6 +24,7 @@ from surfkit.partition.base import Partition
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.columns import RATES
 from surfkit.primitives.surfel2d import Surfel2D
+from surfkit.readers.data import TEST_EVERY
 from surfkit.refine.base import Refine
 from surfkit.start.base import Start
 from surfkit.start.plain import SparseStart
@@ -39,6 +40,10 @@ class Recipe:
 
     about: Annotated[str, tyro.conf.Suppress] = ""
     """What the recipe is, in one line."""
+
+    test_every: Annotated[int, tyro.conf.Suppress] = TEST_EVERY
+    """Photographs that `surfkit train` holds out where --test-every does not say: every Nth; 0 for none, as for a
+    surface to deliver. It belongs to that command: in Python and in ablation tables, `Data` says what is held out."""
 
     method: Annotated[Method, choice(Method)] = SplatOptimisation()
     """How the scene is reconstructed as a whole. Other methods than `splats` leave out most settings below: those that
@@ -96,6 +101,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**63:
             raise BadInput(f"seed is {self.seed}; it must be 0 or more and below 2^63")
+        if self.test_every < 0:
+            raise BadInput(f"test_every is {self.test_every}; it must be 0 (hold out none) or more")
         if self.min_views < 1:
             raise BadInput(f"min_views is {self.min_views}; a block needs 1 or more")
         for at, refine in enumerate(self.refine):
@@ -171,7 +178,7 @@ class Recipe:
     @property
     def unused(self) -> tuple[str, ...]:
         """Names of the fields that the method does not use."""
-        used = {"about", "method", "seed", *self.method.uses, *["depth"] * self.method.needs_prior}
+        used = {"about", "test_every", "method", "seed", *self.method.uses, *["depth"] * self.method.needs_prior}
         return tuple(each.name for each in fields(self) if each.name not in used)
 
 
@@ -187,8 +194,18 @@ def _refuse_weights(path: str, stage: Stage) -> None:
                 )
 
 
+def _refuse_no_loss(path: str, stage: Stage) -> None:
+    """BadInput for a stage in which no loss counts at its beginning, middle or end: nothing would be learnt."""
+    if not any(stage.weights_at(index) for index in (1, (stage.steps + 1) // 2, stage.steps)):
+        left = f"{', '.join(stage.losses)} have a weight of 0" if stage.losses else "none is left"
+        raise BadInput(
+            f"{path}.losses: {left}, so nothing would be learnt from the photographs; add {path}.losses.l1:l1"
+        )
+
+
 def _refuse_unfit_stage(path: str, stage: Stage, primitive: Primitive) -> None:
     _refuse_weights(path, stage)
+    _refuse_no_loss(path, stage)
     columns = primitive.columns()
     lacking = [name for name in stage.rates if name not in columns]
     if unknown := [name for name in lacking if name not in RATES]:

@@ -79,5 +79,5 @@ def test_what_must_not_happen_is_noticed(bench, tmp_path, monkeypatch):
 
     assert found(lambda path: 1 // 0) == "ZeroDivisionError in transforms.py points"
     assert found(writing).startswith("wrote outside the run folder: ['open ")
-    monkeypatch.setattr(bench.limits, "SECONDS", 1)
+    monkeypatch.setattr(bench.limits, "CPU_SECONDS", 1)
     assert found(looping).startswith("TimeoutError")

@@ -10,7 +10,8 @@ from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.densify import ADC, Importance, Trim
-from surfkit.densify.base import Prune
+from surfkit.densify.base import Prune, Signal
+from surfkit.densify.signal import LossGradient
 from surfkit.losses import L1, SSIM, DepthRegression, Distortion, NormalConsistency
 from surfkit.mesh.tsdf import TSDF
 from surfkit.partition import ContractedGrid, QuantileGrid
@@ -210,3 +211,26 @@ def test_weights_that_make_no_sense_are_refused(loss, said):
     stage = replace(recipe.pretrain, losses=recipe.pretrain.losses | {"other": loss})
     with pytest.raises(BadInput, match=rf"^pretrain\.losses\.other: {said}"):
         replace(recipe, pretrain=stage).refuse_unfit()
+
+
+@pytest.mark.parametrize("losses", [{}, {"l1": L1(weight=0.0)}, {"l1": L1(weight=0.0), "ssim": SSIM(weight=0.0)}])
+@pytest.mark.parametrize("path", ["pretrain", "tune"])
+def test_a_stage_without_any_loss_is_refused(losses, path):
+    recipe = recipes()["citygs2"]
+    stage = replace(getattr(recipe, path), losses=losses, signal=LossGradient(terms=None))
+    with pytest.raises(BadInput, match=rf"^{path}\.losses: .*nothing would be learnt.*{path}\.losses\.l1:l1"):
+        replace(recipe, **{path: stage}).refuse_unfit()
+
+
+def test_a_signal_needs_no_terms_of_its_own(tmp_path):
+    """As a package may write one: it looks at the total alone."""
+
+    @dataclass(frozen=True)
+    class Half(Signal):
+        def combine(self, chosen, total):
+            return 0.5 * total
+
+    recipe = with_steps(recipes()["2dgs"], 3)
+    recipe = replace(recipe, pretrain=replace(recipe.pretrain, signal=Half()), mesh=None)
+    recipe.refuse_unfit()
+    assert recipe.pretrain.signal.terms is None

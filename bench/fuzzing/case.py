@@ -80,7 +80,7 @@ class Fuzz:
             *(f"{self.here}/{place}" for place in WRITTEN),
             f"{tempfile.gettempdir()}/surfkit-doctor-",
         )
-        start = time.monotonic()
+        start = time.process_time()
         try:
             with (
                 damaged_output(others.get(OUTPUT), out) as to,
@@ -98,7 +98,7 @@ class Fuzz:
             return f"{type(error).__name__} in {place}", out.getvalue() + traceback.format_exc()
         finally:
             self.watch.allowed = None
-        said, seconds = out.getvalue(), time.monotonic() - start
+        said, seconds = out.getvalue(), time.process_time() - start
         if status == 141 and OUTPUT in others:
             status = 0
         if MEMORY in others:
@@ -137,7 +137,7 @@ class Fuzz:
             return f"wrote outside the run folder: {self.watch.found[:1]}"
         if grown > HELD:
             return f"took {grown >> 20} MiB"
-        return f"took {seconds:.0f} s" if seconds > limits.SECONDS else None
+        return f"took {seconds:.0f} s of CPU time" if seconds > limits.CPU_SECONDS else None
 
     def state(self) -> dict[str, tuple[int, int]]:
         """Size and time of every file that is not to be changed."""

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from surfkit.blocks.eta import describe_progress, seconds_elapsed, seconds_left, total_seconds_left
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, printable
 from surfkit.core.clock import clock
 from surfkit.execute.state import BlockState, read_state
 from surfkit.train.progress import larger
@@ -106,7 +106,7 @@ class BlockDisplay:
         elif self.live is not None:
             self.live.update(progress_table(now), refresh=True)
         else:
-            self.console.print(now.line(), highlight=False, soft_wrap=True)
+            self.console.print(now.line(), highlight=False, soft_wrap=True, markup=False)
 
 
 def progress_table(now: BlockProgress) -> Table | Text:
@@ -123,5 +123,5 @@ def progress_table(now: BlockProgress) -> Table | Text:
         word = (state.error or "") if state.status == "failed" else f"silent for {clock(silent)}" * (silent > 60)
         notes = "; ".join(filter(None, (word, *state.reduced)))
         bar = ProgressBar(max(1, state.steps), state.step, width=20)
-        drawn.add_row(str(index), bar, f"{state.step:,}/{state.steps:,}", *times, notes)
+        drawn.add_row(str(index), bar, f"{state.step:,}/{state.steps:,}", *times, Text(printable(notes)))
     return drawn

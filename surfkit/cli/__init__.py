@@ -11,12 +11,22 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
 
-from surfkit.cli.streams import READER_LEFT, reopen_closed, replace_unknown_letters, silence_lost_streams
-from surfkit.core.check import BadInput, Fault
+from surfkit.cli.help_cache import HELP, keep, kept_help, show_kept
+from surfkit.cli.streams import (
+    READER_LEFT,
+    outlive_terminal,
+    recorded,
+    reopen_closed,
+    replace_unknown_letters,
+    silence_lost_streams,
+)
+from surfkit.core.check import BadInput, Fault, printable
 from surfkit.core.files import DISK_FULL
 from surfkit.core.memory import is_out_of_memory, out_of_memory
 from surfkit.core.signals import terminable
@@ -68,8 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status.
 
     2 is for arguments or data that the user can correct, 1 for a run that ran out of memory or disk or met NaN or Inf,
-    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C or SIGTERM, and 141 for output that
-    nobody reads any more.
+    3 for one with blocks that failed, 130 for one that was interrupted, by Ctrl-C, SIGTERM or a terminal that is closed
+    (SIGHUP), and 141 for output that nobody reads any more.
 
     Args:
         argv: Words after `surfkit`; those of this process if None.
@@ -80,9 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # wait 2^4 cycles
     reopen_closed()
     replace_unknown_letters()
+    outlive_terminal()
     try:
         with terminable():
-            status = _guarded(words)
+            status = _guarded(words) if argv is not None else _helped(words)
         sys.stdout.flush()
         return status
     except OSError as error:
@@ -93,14 +104,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         where = f"standard {lost[0]}" if lost else os.fsdecode(error.filename or "what was being written")
         with suppress(OSError):
-            print(f"surfkit: {where}: {error.strerror}; what is finished is kept", file=sys.stderr)
+            print(printable(f"surfkit: {where}: {error.strerror}; what is finished is kept"), file=sys.stderr)
         return 1
 
 
 def overview() -> str:
     """The text of `surfkit --help`."""
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    column, width = max(map(len, COMMANDS)) + 4, max(60, shutil.get_terminal_size().columns)
+    lines = [
+        textwrap.fill(text, width, initial_indent=f"  {name}".ljust(column), subsequent_indent=" " * column)
+        for name, text in COMMANDS.items()
+    ]
     return "\n".join(
         [
             "surfkit reconstructs surfaces of large scenes from photographs, with Gaussian splatting.",
@@ -110,9 +124,29 @@ def overview() -> str:
             "",
             *lines,
             "",
-            "`surfkit COMMAND --help` tells more.",
+            "`surfkit help COMMAND` tells more.",
         ]
     )
+
+
+def _helped(words: list[str]) -> int:
+    """The exit status of the words of this process; what `--help` prints is kept for the next time."""
+    words = as_help(words)
+    if (path := kept_help(words)) is None:
+        return _guarded(words)
+    if show_kept(path):
+        return 0
+    with recorded() as text:
+        status = _guarded(words)
+    print(text.getvalue(), end="")
+    if status == 0:
+        keep(path, text.getvalue())
+    return status
+
+
+def as_help(words: Sequence[str]) -> list[str]:
+    """The same words, with `help COMMAND` rewritten to `COMMAND --help`."""
+    return [*words[1:], "--help"] if words[:1] == ["help"] else list(words)
 
 
 def _guarded(words: list[str]) -> int:
@@ -134,7 +168,7 @@ def _guarded(words: list[str]) -> int:
         if (found := _error_line(error, words)) is None:
             raise
         text, status = found
-        print(f"surfkit: {text}", file=sys.stderr)
+        print(printable(f"surfkit: {text}"), file=sys.stderr)
         return status
 
 
@@ -161,7 +195,8 @@ def _release(error: BaseException | None) -> None:
 
 
 def _dispatch(words: list[str]) -> int:
-    if not words or words[0] in ("-h", "--help", "help"):
+    words = as_help(words)
+    if not words or words[0] in HELP:
         print(overview())
         return 0
     if words[0] in ("-V", "--version"):
@@ -180,7 +215,7 @@ def _dispatch(words: list[str]) -> int:
     if isinstance(command, dict):
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
-            if rest and rest[0] not in ("-h", "--help", "help"):
+            if rest and rest[0] not in (*HELP, "help"):
                 raise BadInput(f"{name} has no {rest[0]!r}; usage: {wanted}")
             print(f"{COMMANDS[name]}\n\nusage: {wanted}\n\n`surfkit {name} {next(iter(command))} --help` tells more.")
             return 0

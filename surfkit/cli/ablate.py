@@ -123,7 +123,7 @@ class Ablate:
             with Screen() as screen:
                 report = ablate(plan, screen, self.before)
         except KeyboardInterrupt:
-            print(f"{out} keeps what is finished; give the same command again to continue", file=sys.stderr)
+            say(f"{out} keeps what is finished; give the same command again to continue")
             raise
         show(report)
         print()
@@ -132,7 +132,7 @@ class Ablate:
         print_table(("written", "path"), [(what, str(path)) for what, path in written])
         broken = failures(report)
         for line in broken:
-            print(f"surfkit: {line}", file=sys.stderr)
+            say(f"surfkit: {line}")
         return 1 if broken else 0
 
     def before(self, plan: Plan, left: Sequence[Trial]) -> None:
@@ -173,7 +173,7 @@ def show(report: dict[str, Any]) -> None:
     else:
         print_table(*lines(report))
     for line in sharing_lines(report):
-        print(line, file=sys.stderr)
+        say(line)
 
 
 COMMAND = Ablate

@@ -12,7 +12,7 @@ import tyro
 
 from surfkit.cli.recipes import part_of_run
 from surfkit.cli.result import compressed_rows
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.compress.base import Compressor
 from surfkit.compress.format import model_of_file
 from surfkit.compress.vectree import Vectree
@@ -99,7 +99,7 @@ class Compress:
         with full_disk_in_one_line(path.parent):
             size = write(path, fitted(self.compress, wanted, write) if wanted.is_set else self.compress)
         before = self.target.stat().st_size
-        print(
+        tell(
             f"wrote {len(model):,} points to {path}: {size:,} bytes, {before / size:.1f} times fewer than {self.target}"
         )
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.chart import write_lines
 from surfkit.report.curves import Place, What, lines
@@ -50,7 +50,7 @@ class Curves:
         shown = "{:,.0f}".format if self.of == "points" else "{:.4g}".format
         rows = [(line.name, *map(shown, (line.y[0], line.y.max(), line.y[-1]))) for line in found]
         print_table(("run", "first", "highest", "last"), rows)
-        print(f"wrote {self.out}")
+        tell(f"wrote {self.out}")
 
 
 COMMAND = Curves

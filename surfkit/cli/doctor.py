@@ -14,9 +14,10 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from surfkit.cli.length import with_usual_steps
 from surfkit.cli.recipes import chosen_recipe, settled
 from surfkit.cli.table import print_table
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, printable
 from surfkit.core.codec import dump
 from surfkit.core.memory import size
 from surfkit.core.registry import name_of
@@ -85,8 +86,11 @@ class Doctor:
 
     def run(self) -> int:
         """Check, and print the findings."""
-        data = self.reading.of(self.data)
-        recipe = self.recipe if self.steps is None else with_steps(self.recipe, self.steps)
+        data = self.reading.of(self.data, self.recipe.test_every)
+        if self.steps is None:
+            recipe = with_usual_steps(self.recipe, data, self.device)
+        else:
+            recipe = with_steps(self.recipe, self.steps)
         with progress_bars() as report:
             examined = examine(data, recipe, self.quick, report)
             diagnosis = examined.diagnosis
@@ -109,13 +113,13 @@ class Doctor:
 def progress_bars() -> Iterator[Told]:
     """Progress bars on the terminal; nothing where there is no terminal."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     tasks: dict = {}
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
 
         def report(what: str, done: int, total: int) -> None:
             if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total)
+                tasks[what] = bar.add_task(printable(what), total=total)
             bar.update(tasks[what], completed=done, total=total)
 
         yield report
@@ -138,14 +142,14 @@ def show(diagnosis: Diagnosis, estimate_wanted: bool) -> None:
     if diagnosis.will:
         console.print("\nA run will", style="bold")
         for text in diagnosis.will:
-            console.print(f"  {text}", markup=False)
+            console.print(printable(f"  {text}"), markup=False)
     if diagnosis.estimate is not None:
         print()
         print_table(("it will take", ""), rows(diagnosis.estimate))
     print()
     for finding in diagnosis.findings:
         console.print(f"{finding.level}: ", style=COLOURS[finding.level], end="")
-        console.print(finding.text, markup=False)
+        console.print(printable(finding.text), markup=False)
     console.print(verdict(diagnosis, estimate_wanted), style="bold")
 
 

@@ -10,6 +10,7 @@ import tyro
 
 from surfkit.cli.result import show, show_geometry, show_levels
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
 from surfkit.core.lock import locked
 from surfkit.evaluate.geometry.comparison import Comparison
@@ -27,6 +28,8 @@ from surfkit.run.lod import load_levels, measure_levels
 from surfkit.run.measure import evaluate, note_compressed
 from surfkit.run.method import refuse_not_drawn, splats_of
 from surfkit.run.notes import collect_notes
+from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import NONE_HELD_OUT
 from surfkit.scene.scene import Scene
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -47,7 +50,8 @@ class Evaluate:
     """Run folder that `surfkit train` made, or a mesh or point cloud to compare with --gt."""
 
     gt: Path | None = None
-    """Ground truth: a point cloud or a mesh. PLY of any size; OBJ, STL, GLB and OFF are read by trimesh."""
+    """Ground truth: a point cloud or a mesh. PLY, LAS and LAZ of any size; E57; OBJ, STL, GLB and OFF; or a raster of
+    heights (GeoTIFF)."""
 
     views: Path | None = None
     """When a file is measured: run folder or data set whose training views define the crop volume."""
@@ -113,6 +117,8 @@ class Evaluate:
         run, scene = ctx.run, ctx.scene
         refuse_not_drawn(run)
         zones.refuse_too_many(scene)
+        if not scene.held_out:
+            emit(Warned(f"{run.out}: {NONE_HELD_OUT}"))
         seams = None if self.seams is None else seams_of(run, scene.frame, self.seams)
         tree = load_levels(run, splats_of(run, made)) if self.lod else None
         metrics = evaluate(run, made, scene, lpips_weights=self.lpips_weights)
@@ -181,10 +187,12 @@ class Evaluate:
         if run is not None and self.views is not None:
             raise BadInput(f"--views {self.views}: a run has views of its own; leave it out, or name a file")
         if run is not None:
-            return read(run.data)
+            return read_unchanged(run)
         if self.views is None:
             return None
-        return read(opened(self.views).data if (self.views / "run.json").exists() else Data(self.views))
+        if (self.views / "run.json").exists():
+            return read_unchanged(opened(self.views))
+        return read(Data(self.views))
 
 
 def refuse_no_mesh(run: Run) -> None:

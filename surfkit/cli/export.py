@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from surfkit.cli.recipes import ARGV
+from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
@@ -64,7 +65,15 @@ class Export:
     strict_2dgs: bool = False
     """Leave out the third scale of surfels, as programs written for 2DGS alone expect; ply only."""
 
+    geoid: str | None = None
+    """The geoid, where heights are above sea level: a grid of it (GTX, GeoTIFF), or the metres by which it lies above
+    the ellipsoid; tiles3d only."""
+
     def __post_init__(self) -> None:
+        if self.geoid is not None and not isinstance(self.format, Tiles3D):
+            raise BadInput(
+                f"--geoid: files of the format {name_of(self.format)} keep heights as they are; leave it out"
+            )
         if self.strict_2dgs and not isinstance(self.format, PLY):
             raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
 
@@ -75,11 +84,13 @@ class Export:
             path.parent.mkdir(parents=True, exist_ok=True)
             form.write(path, table, frame, tree)
         told = form.rounding(table)
-        print(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
+        tell(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
         if any(frame.shift) and not (isinstance(form, Tiles3D) and form.georeference and frame.crs):
-            print(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
+            tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
+        if self.geoid is not None:
+            return replace(self.format, geoid=self.geoid)
         return replace(self.format, strict_2dgs=True) if self.strict_2dgs else self.format
 
     def _path(self) -> Path:

@@ -12,12 +12,15 @@ from surfkit.cli.evaluate import refuse_no_mesh
 from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.evaluate.geometry.highest import highest
+from surfkit.evaluate.geometry.place import same_plan
+from surfkit.evaluate.geometry.surface import Surface, read_surface, system_of
 from surfkit.maps.grid import same_crs
 from surfkit.maps.make import RECORD, MapSettings, make_maps
 from surfkit.pipeline import opened
-from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
+from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import note_held_out
 from surfkit.scene.scene import Frame
 from surfkit.texture.make import Subject
 from surfkit.train.bars import bars
@@ -43,8 +46,9 @@ class MapsOf:
     """What is drawn."""
 
     against: Path | None = None
-    """A run, or a file with a mesh, in the same coordinates: also write the heights of RUN minus those of this one, as
-    GeoTIFF and as a picture, with the volumes by which RUN lies above (fill) and below (cut)."""
+    """A run, or a file in the same coordinates, with a mesh, a raster of heights (GeoTIFF) or a cloud (LAS, LAZ, PLY):
+    also write the heights of RUN minus those of this one, as GeoTIFF and as a picture, with the volumes by which RUN
+    lies above (fill) and below (cut)."""
 
     metres_per_unit: float | None = None
     """Metres per unit of the data set's coordinates, if the data set does not state it."""
@@ -60,21 +64,28 @@ class MapsOf:
         refuse_no_mesh(run)
         out = self.out or run.out / "maps"
         with collect_notes(), bars():
-            scene, surface = read(run.data), mesh_of(run.mesh)
+            scene, surface = read_unchanged(run), mesh_of(run.mesh)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             other = None if self.against is None else self._other(frame)
             record = make_maps(Subject(surface, frame, scene.train), self.settings, out, other)
+            note_held_out(run, scene)
         show(out, record)
 
     def _other(self, frame: Frame) -> Surface:
         """The mesh to subtract; BadInput if it is known to lie in other coordinates."""
         if not self.against.is_dir():
-            return mesh_of(self.against)
+            theirs = system_of(self.against)
+            if theirs is not None and frame.crs is not None and not same_plan(theirs, frame.crs):
+                raise BadInput(
+                    f"--against {self.against}: its coordinates are in {theirs}, and those of {self.run_folder} in "
+                    f"{frame.crs}; heights can be subtracted in one system only"
+                )
+            return heights_of(self.against)
         run = opened(self.against)
         refuse_no_mesh(run)
-        theirs = read(run.data).frame
+        theirs = read_unchanged(run).frame
         if not same_crs(theirs.crs, frame.crs):
             raise BadInput(
                 f"--against {self.against}: its coordinate reference system is {theirs.crs or 'not known'}, and that "
@@ -91,6 +102,15 @@ def mesh_of(path: Path) -> Surface:
     if found.faces is None:
         raise BadInput(f"{path}: a cloud of points; name a mesh")
     return found
+
+
+def heights_of(path: Path) -> Surface:
+    """The surface in a file whose heights can be subtracted: a mesh, a raster of heights, or the highest points of a
+    cloud."""
+    found = read_surface(path)
+    if "f_dc_0" in (found.rows.dtype.names or ()):
+        raise BadInput(f"{path}: splats, which are no surface; name a mesh, a raster of heights or a cloud")
+    return highest(found) if found.faces is None else found
 
 
 def show(out: Path, record: dict[str, Any]) -> None:

@@ -26,6 +26,7 @@ from surfkit.run.mesh import MeshOutput, make_mesh, mesh_input
 from surfkit.run.method import refuse_mesher
 from surfkit.run.notes import collect_notes
 from surfkit.run.prepare import with_maps_to_mesh
+from surfkit.run.warn import note_held_out
 from surfkit.scene.memory import cache_bytes
 from surfkit.train.bars import bars
 from surfkit.train.faults import full_disk_in_one_line
@@ -92,6 +93,7 @@ class MeshOf:
             with locked(run.out), full_disk_in_one_line(run.out), maps as run, record_events(run.out):
                 what = mesh_input(run, made, scene, ctx.rasterizer, budget, mesher)
                 record = make_mesh(run, mesher or made.mesh, self.delivery, what, made.last_steps)
+            note_held_out(run, scene)
         show(run, record)
 
 

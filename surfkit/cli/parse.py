@@ -25,9 +25,10 @@ from tyro._errors import (
 )
 
 from surfkit.cli.flags import explain_flag, flags, negations_with_their_flag
-from surfkit.cli.help_text import one_paragraph_each
+from surfkit.cli.help_cache import HELP
+from surfkit.cli.help_text import described, rules_of_help
 from surfkit.cli.recipes import ARGV
-from surfkit.cli.slots import WHOLE, choices_first, explain_choice, flags_as_choices, slots
+from surfkit.cli.slots import WHOLE, bare_words, choices_first, explain_bare, explain_choice, flags_as_choices, slots
 from surfkit.cli.tables import files_as_choices
 from surfkit.core.check import BadInput
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+USUAL = ("surface", "citygs2", "2dgs", "3dgs")
+"""Recipes that an error names where there are more than so many; a command lists them all."""
 _CONFIG = (tyro.conf.CascadeSubcommandArgs,)
 _NO_TYPE = re.compile(r"no type matching (.*) could be instantiated from \[(.*?)\]\. Got errors:.*")
 _REWORDED = {
@@ -43,7 +46,7 @@ _REWORDED = {
     r"could not convert string to float: (.*)": r"expected a number, got \1",
 }
 """What Python says, and how a user would want it said."""
-_TYPES = {"INT": "a whole number", "FLOAT": "a number", "{None}": "None", "|": " or "}
+_TYPES = {"INT": "a whole number", "FLOAT": "a number", "{None}": "none", "|": " or "}
 
 
 def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
@@ -69,8 +72,9 @@ def parse(command: type[T], argv: Sequence[str], prog: str) -> T:
 
     try:
         with on_parse_error(refuse):
-            words, rules = choices_first(command, argv), one_paragraph_each()
-            found = tyro.cli(command, prog=prog, args=words, config=_CONFIG, registry=rules)
+            words, rules = choices_first(command, argv), rules_of_help()
+            with described(command):
+                found = tyro.cli(command, prog=prog, description="", args=words, config=_CONFIG, registry=rules)
             _refuse_flags_without_values(found, argv)
             return _refuse_nan(found)
     finally:
@@ -113,7 +117,7 @@ def _default(command: type, argv: Sequence[str]) -> list[str]:
     or in `default_table`."""
     for whole in WHOLE:
         name = getattr(command, f"default_{whole.rstrip(':')}", None)
-        if name is not None and not any(word.startswith(whole) for word in argv) and not {"-h", "--help"} & set(argv):
+        if name is not None and not any(word.startswith(whole) for word in argv) and not HELP & set(argv):
             return [f"{whole}{name}"]
     return []
 
@@ -124,7 +128,7 @@ def _explained(event: ParseErrorEvent, command: type, argv: Sequence[str], prog:
     for whole in WHOLE:
         slot = whole.rstrip(":")
         if slot in known and not any(word.startswith(whole) for word in argv):
-            return f"no {slot} chosen: add one of {', '.join(whole + name for name in known[slot])}"
+            return _nothing_chosen(slot, known[slot], command, argv)
     if isinstance(event, UnrecognizedArgs):
         return _unrecognised(event.tokens[0], command, argv, prog)  # the next may be its value
     if isinstance(event, MissingArgs):
@@ -144,6 +148,17 @@ def _explained(event: ParseErrorEvent, command: type, argv: Sequence[str], prog:
     if isinstance(event, InstantiationFailure):
         return ": ".join(filter(None, [_place(event), _reworded(event.message)]))
     return None
+
+
+def _nothing_chosen(slot: str, names: Sequence[str], command: type, argv: Sequence[str]) -> str:
+    """No recipe or table was named; perhaps a word that stands alone was meant to be it."""
+    meant = next(filter(None, (explain_bare(command, word, argv) for word in bare_words(command, argv))), None)
+    if meant is not None and f"{slot}:" in meant:
+        return f"no {slot} chosen: {meant}"
+    shown = names if len(names) <= len(USUAL) else [name for name in USUAL if name in names] or names[: len(USUAL)]
+    listed = f"; `surfkit {slot}s` lists all {len(names)}" if len(shown) < len(names) else ""
+    chosen = f"no {slot} chosen: add one of {', '.join(f'{slot}:{name}' for name in shown)}{listed}"
+    return f"{meant} And {chosen}" if meant is not None else chosen
 
 
 def _without_value(event: BadValue, command: type, argv: Sequence[str], prog: str) -> str:
@@ -187,7 +202,8 @@ def _reworded(message: str) -> str:
 def _unrecognised(word: str, command: type, argv: Sequence[str], prog: str) -> str:
     """What to do about a word that has no place."""
     if not word.startswith("-"):
-        return explain_choice(command, word, argv) or f"unexpected {word!r}; settings are given as --NAME VALUE"
+        found = explain_choice(command, word, argv) or explain_bare(command, word, argv)
+        return found or f"unexpected {word!r}; settings are given as --NAME VALUE"
     flag = word.partition("=")[0]
     if names := slots(command, argv).get(flag.removeprefix("--")):
         return f"{flag}: one of {', '.join(names)} must follow"

@@ -12,9 +12,9 @@ import torch
 import tyro
 from rich.console import Console
 
-from surfkit.cli.table import print_table
-from surfkit.core.check import BadInput
-from surfkit.core.events import Progress, Warned, emit
+from surfkit.cli.table import print_table, tell
+from surfkit.core.check import BadInput, printable
+from surfkit.core.events import Progress, Warned, emit, say
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
 from surfkit.core.registry import choice
@@ -68,7 +68,7 @@ class Depth:
         with collect_notes():
             done = self.make()
         show(done)
-        print(f"depth maps in {self.folder}; look at {self.folder / OVERVIEW}")
+        tell(f"depth maps in {self.folder}; look at {self.folder / OVERVIEW}")
 
     @property
     def folder(self) -> Path:
@@ -85,7 +85,7 @@ class Depth:
         Raises:
             BadInput: There are maps that are not to be replaced, or nothing can be estimated.
         """
-        data = self.reading.of(self.data)
+        data = self.reading.of(self.data, test_every=0)
         preparation = Preparation(data, self.estimator, torch_device(self.device))
         scene = read(data)
         if notice := self.estimator.notice():
@@ -115,7 +115,7 @@ def with_progress(steps: Iterable[Prepared], total: int) -> list[Prepared]:
                 continue
             covered = "nothing" if step.coverage is None else f"{step.coverage:.0%} covered"
             line = f"{len(done)}/{total} {step.view.name}: {covered}, {step.seconds:.1f} s"
-            console.print(line, highlight=False, soft_wrap=True)
+            console.print(printable(line), highlight=False, soft_wrap=True, markup=False)
     return done
 
 
@@ -127,9 +127,9 @@ def show(done: list[Prepared]) -> None:
     row = (str(len(covered)), mean, least, f"{sum(step.seconds for step in done):.1f}")
     print_table(("photographs", "covered", "least covered", "seconds"), [row])
     if failed := [step.view.name for step in done if step.coverage is None]:
-        print(f"too few sparse points or neighbours, no depth: {', '.join(failed)}")
+        tell(f"too few sparse points or neighbours, no depth: {', '.join(failed)}")
     if covered and (text := trust_warning(sum(covered) / len(covered))):
-        print(f"note: {text}", file=sys.stderr)
+        say(f"note: {text}")
 
 
 def refuse_none(root: Path, views: Sequence[View], tried: int) -> None:

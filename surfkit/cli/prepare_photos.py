@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from surfkit.cli.prepare_depth import OVERVIEW, Depth
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import Warned, emit
@@ -29,6 +29,7 @@ from surfkit.readers.depth_prior import trust_warning
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
+from surfkit.scene.names import VIDEOS, is_video
 from surfkit.scene.scene import View
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.prepare import PICTURE, Preparation
@@ -41,20 +42,20 @@ SHOWN = 10
 
 @dataclass(frozen=True)
 class Photos:
-    """Find the cameras of a folder of photographs by structure from motion, and write a data set that
+    """Find the cameras of a folder of photographs, or of a video, by structure from motion, and write a data set that
     `surfkit train` reads.
 
     SCENE gets undistorted photographs in images/, a COLMAP model in sparse/0, report.json and cameras.png. With
-    positions in EXIF it lies on the map, else it is level. An interrupted command continues when it is given again; one
-    with other settings or photographs does again only what depends on them. `depth:patch-match` or another estimator
-    makes depth maps too, as `surfkit prepare depth SCENE` does.
+    positions in EXIF, XMP or geo.txt it lies on the map, else it is level. An interrupted command continues when it is
+    given again; one with other settings or photographs does again only what depends on them. `depth:patch-match` or
+    another estimator makes depth maps too, as `surfkit prepare depth SCENE` does.
     """
 
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
-    """Folder of photographs, in folders inside it or not; nothing is written there."""
+    """Folder of photographs and videos, in folders inside it or not, or one video; nothing is written there."""
 
     out: Path | None = None
-    """SCENE, the folder of the data set; by default FOLDER-scene beside the folder of photographs."""
+    """SCENE, the folder of the data set; by default FOLDER-scene beside the folder of photographs, or VIDEO-scene."""
 
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
     """How cameras are found."""
@@ -74,19 +75,21 @@ class Photos:
     @property
     def scene(self) -> Path:
         """The folder of the data set."""
-        return self.out or self.photos.resolve().with_name(f"{self.photos.resolve().name}-scene")
+        name = self.photos.stem if is_video(self.photos) else self.photos.resolve().name
+        return self.out or self.photos.resolve().with_name(f"{name}-scene")
 
     def run(self) -> None:
         """Prepare, and print the results and what to do next."""
         self.prepare()
         uses = ", which uses the depth maps if its losses or its mesh look at some" if self.depth is not None else ""
-        print(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
+        tell(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
 
     def prepare(self) -> None:
         """Prepare, and print the results."""
         root, scene = self.photos, self.scene
-        if not root.is_dir():
-            raise BadInput(f"{root}: {'a file' if root.exists() else 'no such folder'}; name a folder of photographs")
+        if not root.is_dir() and not is_video(root):
+            what = "a file, and no video that is known by its ending" if root.exists() else "no such folder"
+            raise BadInput(f"{root}: {what}; name a folder of photographs, or a video ({', '.join(sorted(VIDEOS))})")
         refuse_overlap(root, scene)
         refuse_foreign(scene)
         if self.depth is not None:
@@ -116,7 +119,7 @@ class Photos:
         """Make the depth maps that are not there; what the report says of them, and the time of all stages."""
         stages, command = Stages(self.scene / WORK), Depth(self.scene, estimator, device=self.device)
         done = stages.run("depth maps", key_of(estimator), lambda: command.make(renew=True))
-        preparation = DepthMaps(Data(self.scene), estimator, torch_device(self.device))
+        preparation = DepthMaps(Data(self.scene, test_every=0), estimator, torch_device(self.device))
         scene = read(preparation.data)
         count, lacking = len(preparation.views(scene)), preparation.lacking(scene)
         covered = [step.coverage for step in done if step.coverage is not None]
@@ -186,7 +189,7 @@ def maps_before(scene: Path) -> dict[str, Any] | None:
 
 def warn_outdated(scene: Path, maps: dict[str, Any]) -> None:
     """Say that the depth maps of a scene were made from other cameras or photographs than it has now, if so."""
-    data = Data(scene)
+    data = Data(scene, test_every=0)
     try:
         preparation = DepthMaps(data, load(DepthEstimator, maps.get("estimator")), torch.device("cpu"))
         outdated = preparation.is_outdated(preparation.material(read(data)))
@@ -210,10 +213,16 @@ def show(report: dict[str, Any], scene: Path) -> None:
     first = models[0]
     rows.append(("points", f"{first['points']:,}, each in {first['track_length']:.1f} photographs on average"))
     rows.append(("reprojection error", f"{first['reprojection_error_px']:.2f} px"))
+    lenses, heights = first["weighed"]["focal_lengths_px"], first["weighed"]["heights_times"]
+    lens, more = lenses[0], f" (first of {len(lenses)} lenses)" if len(lenses) > 1 else ""
+    exif = "none in EXIF" if lens["exif"] is None else f"{lens['exif']:.0f} px in EXIF"
+    said = f"{exif}, {lens['photographs_alone']:.0f} by the photographs alone, {lens['final']:.0f} in the end{more}"
+    rows.append(("focal length", f"{said}; heights are {heights:.2f} times those by the photographs alone"))
     if place := first.get("georeference"):
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))
-        rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north, {up:.2f} up of {place['positions']}"))
+        above = f", {up:.2f} up" if up is not None else ""
+        rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north{above} of {place['positions']}"))
     if ground := first.get("ground_control"):
         rows.append(("on the map", f"{ground['crs']}, offset {' '.join(f'{value:.0f}' for value in ground['offset'])}"))
         for what in ("control", "checkpoints"):
@@ -229,9 +238,9 @@ def show(report: dict[str, Any], scene: Path) -> None:
     print_table(("cameras", "value"), rows)
     lost = report["not_registered"]
     for name, why in list(lost.items())[:SHOWN]:
-        print(f"no camera for {name!r}: {why}")
+        tell(f"no camera for {name!r}: {why}")
     if len(lost) > SHOWN:
-        print(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
-    print(f"data set in {scene}; look at {scene / PICTURE}")
+        tell(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
+    tell(f"data set in {scene}; look at {scene / PICTURE}")
     if report.get("depth_maps"):
-        print(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")
+        tell(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from surfkit.cli.prepare_photos import refuse_foreign
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.files import sweep
 from surfkit.core.lock import locked
@@ -89,4 +89,4 @@ def show(report: dict[str, Any], scene: Path) -> None:
         ("seconds", ", ".join(f"{name} {value:.0f}" for name, value in report["seconds"].items())),
     ]
     print_table(("points", "value"), rows)
-    print(f"data set in {scene}")
+    tell(f"data set in {scene}")

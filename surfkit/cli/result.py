@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.run.folder import Run
@@ -55,7 +56,19 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
     written += [("picture", path) for path in pictures[:8]]
     print_table(("written", "path"), [(what, str(path)) for what, path in written])
     if len(pictures) > 8:
-        print(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
+        tell(f"... and {len(pictures) - 8} more pictures in {run.pictures}")
+
+
+def what_next(run: Run) -> str:
+    """The commands that one would give after training, on one line."""
+    out = shlex.quote(str(run.out))
+    mesh = (
+        f"`surfkit maps {out}` draws maps of its mesh"
+        if run.mesh_record.exists()
+        else f"`surfkit mesh {out} mesh:tsdf` makes its mesh"
+    )
+    smaller = f"; `surfkit compress {out}` makes the model smaller" if run.cloud.exists() else ""
+    return f"next: `surfkit view {out}` shows it in a browser; {mesh}{smaller}"
 
 
 def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:
@@ -104,7 +117,7 @@ def refuse_damaged(path: Path, complaint: str) -> Iterator[None]:
 def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """What metrics.json says of a run, without the geometry."""
     images = metrics["images"]
-    rows = [] if "not_measured" in images else [("views held out", str(len(images["per_image"])))]
+    rows = [] if "not_measured" in images else [("views held out", _held_out(len(images["per_image"])))]
     if images["psnr"] is not None:
         rows += [("PSNR", f"{images['psnr']:.2f} dB"), ("SSIM", f"{images['ssim']:.3f}")]
         rows += [(label, f"{images[name]:.3f}") for name, label in LPIPS.items() if name in images]
@@ -128,6 +141,10 @@ def result_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics.get("fps"):
         rows.append(("frames a second", f"{metrics['fps']:.1f}"))
     return rows
+
+
+def _held_out(count: int) -> str:
+    return f"{count}, which training has not seen" if count else "none, so nothing to measure with"
 
 
 def before_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
@@ -248,6 +265,9 @@ def geometry_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     where = "all" if crop is None else f"area {crop['area']:.4g}, heights {crop['low']:.4g} to {crop['high']:.4g}"
     rows = [(label, figure(label.lower())) for label in ("Precision", "Recall", "F1")]
     rows += [("tau", f"{found['tau']:.3g} ({found['tau_from']})"), ("crop volume", where)]
+    if outside := found.get("outside"):  # not in metrics of older versions
+        shares = ", ".join(f"{share:.1%} {name}" for name, share in outside.items())
+        rows.append(("outside of it", f"{shares}: not measured"))
     for label, name in (("chamfer", "chamfer"), ("chamfer, as DTU", "chamfer_dtu")):
         values = [found[name][part] for part in ("accuracy", "completeness", "overall")]
         texts = ["-" if value is None else f"{value:.3g}" for value in values]

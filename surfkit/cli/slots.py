@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import os
 import types
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from surfkit.cli.parts import open_places, with_parts
@@ -88,6 +90,34 @@ def explain_choice(command: type, word: str, argv: Sequence[str]) -> str | None:
         files = {"recipe": "; or name a file, recipe:FILE.json", "table": "; or name a file, FILE.json or FILE.py"}
         return unknown(slot, name, known[slot]) + files.get(slot, "")
     return f"{slot} is chosen twice: {', '.join(w for w in argv if w.startswith(slot + ':'))}; keep one"
+
+
+def explain_bare(command: type, word: str, argv: Sequence[str]) -> str | None:
+    """What a word without a flag and without a slot was meant to be, in one line; None if nothing is known.
+
+    It may be the name of a recipe or of another part without its slot, or a path without its flag.
+    """
+    known = slots(command, argv)
+    if slot := next((slot for slot in (*_whole(known), *known) if word in known[slot]), None):
+        return f"unexpected {word!r}; did you mean {slot}:{word}?"
+    if "data" in hints_of(command) and (os.sep in word or Path(word).exists()):
+        return f"unexpected {word!r}; did you mean --data {word}?"
+    for slot in _whole(known):
+        if near := difflib.get_close_matches(word, known[slot], n=1):
+            return f"unexpected {word!r}; did you mean {slot}:{near[0]}?"
+    return None
+
+
+def bare_words(command: type, argv: Sequence[str]) -> list[str]:
+    """The words that stand alone: no flag, no choice, and not behind a flag, whose value they would be."""
+    known = slots(command, argv)
+    pairs = zip(["", *argv], argv, strict=False)
+    alone = (word for before, word in pairs if not word.startswith("-") and not before.startswith("--"))
+    return [word for word in alone if word.partition(":")[0] not in known or ":" not in word]
+
+
+def _whole(known: Slots) -> list[str]:
+    return [mark.rstrip(":") for mark in WHOLE if mark.rstrip(":") in known]
 
 
 def _below(hint: Any, value: Any, path: str) -> Slots:

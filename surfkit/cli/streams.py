@@ -2,14 +2,46 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import select
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
 
 READER_LEFT = 141
 """What a shell reports for a program that SIGPIPE ends, and so what a command returns whose output nobody reads."""
 STREAMS = ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w"))
+
+
+class Record(io.StringIO):
+    """What was printed, in the colours and the letters of a screen."""
+
+    def __init__(self, screen: TextIO) -> None:
+        super().__init__()
+        self.screen = screen
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """Of the screen; where there is none, boxes are drawn in ASCII."""
+        return self.screen.encoding
+
+    def isatty(self) -> bool:
+        """Whether the screen is a terminal."""
+        return self.screen.isatty()
+
+
+@contextmanager
+def recorded() -> Iterator[Record]:
+    """Within, what would go to stdout is recorded, and does not appear."""
+    screen = sys.stdout
+    sys.stdout = record = Record(screen)
+    try:
+        yield record
+    finally:
+        sys.stdout = screen
 
 
 def reopen_closed() -> None:
@@ -33,6 +65,35 @@ def replace_unknown_letters() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
+
+
+def outlive_terminal() -> None:
+    """Let output to a terminal go nowhere once that is closed: an error of writing must not end what is to be saved.
+
+    SIGHUP, which asks to stop, comes a moment later, or never to a process that a shell has disowned.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if not isinstance(stream, io.TextIOWrapper) or not stream.isatty():
+            continue
+        if not isinstance(getattr(stream.buffer, "raw", None), _Terminal):
+            file = io.BufferedWriter(_Terminal(stream.fileno(), "wb", closefd=False))
+            settings = {"encoding": stream.encoding, "errors": stream.errors, "line_buffering": True}
+            setattr(sys, name, io.TextIOWrapper(file, **settings))
+
+
+class _Terminal(io.FileIO):
+    """Writes to a terminal, and to nobody when it is gone."""
+
+    def write(self, content: bytes) -> int | None:
+        """As FileIO does."""
+        try:
+            return super().write(content)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            _give_to_null(self.fileno())
+            return super().write(content)
 
 
 def silence_lost_streams() -> list[str]:

@@ -14,8 +14,9 @@ from surfkit.cli.table import print_table
 from surfkit.core.check import BadInput
 from surfkit.mesh.simplify import require_simplification
 from surfkit.pipeline import opened
-from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
+from surfkit.run.resume import read_unchanged
+from surfkit.run.warn import note_held_out
 from surfkit.scene.memory import cache_bytes
 from surfkit.texture.make import RECORD, Subject, TextureSettings, make_texture
 from surfkit.train.bars import bars
@@ -59,17 +60,18 @@ class TextureOf:
         refuse_no_mesh(run)
         out = self.out or run.out / "texture"
         with collect_notes(), bars(), full_disk_in_one_line(out):
-            scene = read(run.data)
+            scene = read_unchanged(run)
             frame = scene.frame
             if self.metres_per_unit is not None:
                 frame = replace(frame, metres=self.metres_per_unit)
             record = make_texture(Subject(mesh_of(run.mesh), frame, scene.train), self.settings, out, budget)
+            note_held_out(run, scene)
         show(out, record)
 
 
 def show(out: Path, record: dict[str, Any]) -> None:
     """Print what the textured mesh is, and the paths of what was written."""
-    unit = "m" if record["metres_per_unit"] == 1 else "units"
+    unit = record["unit"]
     pages = ", ".join(f"{width} x {height}" for width, height in record["pages"][:4])
     rows = [
         ("texel", f"{record['texel']:g} {unit}"),

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, printable
 from surfkit.raster.select import Device
 from surfkit.run.notes import collect_notes
 from surfkit.view.page import show
@@ -85,7 +85,7 @@ class View:
                 subject = replace(subject, up=-direction if self.up.startswith("-") else direction)
             with served(address, f"surfkit: {self.source.resolve().name}") as page:
                 show(subject, page, self.folder, self.most, self.draw)
-                print(f"{self.source} is shown at\n\n    {page.url}\n\nCtrl-C ends it.", flush=True)
+                print(f"{printable(str(self.source))} is shown at\n\n    {page.url}\n\nCtrl-C ends it.", flush=True)
                 if not address.is_local:
                     print("Whoever has this address can look; what is sent is not encrypted.", flush=True)
                 if self.open:

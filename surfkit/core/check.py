@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
+
+CONTROLS = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Characters that are not shown but obeyed: of C0 and C1, ends of lines and paragraphs, directions of writing."""
+BETWEEN_LINES = re.compile(f"(?![\n\t]){CONTROLS.pattern}")
 
 
 class BadInput(ValueError):
@@ -76,6 +81,19 @@ def few(names: Sequence[str], most: int = 3) -> str:
     """The first of some names, and how many there are beyond them: `'a', 'b', 'c' and 39 more`."""
     shown = ", ".join(repr(name) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
+
+
+def printable(text: str, lines: bool = False) -> str:
+    """A text as it may go to a terminal or a page: control characters in it are written out, a newline as ``\\n``.
+
+    All that is printed goes through this, as names of photographs and folders may hold anything: a line of their own,
+    or what tells a terminal to change its colours, its title or the direction of writing.
+
+    Args:
+        text: To be printed.
+        lines: Whether newlines and tabs are the writer's own, and stay.
+    """
+    return (BETWEEN_LINES if lines else CONTROLS).sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def expect(name: str, array: Any, shape: tuple[int | str, ...], sizes: dict[str, int] | None = None) -> dict[str, int]:

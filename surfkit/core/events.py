@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surfkit.core.check import printable
 from surfkit.core.registry import plugins
 
 
@@ -184,7 +185,7 @@ Event = (
 
 def say(text: str) -> None:
     """Tell the person who watches."""
-    print(text, file=sys.stderr)
+    print(printable(text), file=sys.stderr)
 
 
 _silenced: set[tuple[str, int]] = set()
@@ -201,8 +202,7 @@ def emit(event: Any) -> None:
             impl.function(*[event] * len(impl.argnames))
         except Exception as error:
             _silenced.add(key)
-            print(
+            say(
                 f"surfkit: plugin {impl.plugin_name} failed at {type(event).__name__} and gets no more events: "
-                f"{type(error).__name__}: {' '.join(str(error).split())}",
-                file=sys.stderr,
+                f"{type(error).__name__}: {' '.join(str(error).split())}"
             )

@@ -11,8 +11,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-UNFINISHED = (".*.part", ".tmp??????")
-"""Names of files and folders that are being written, by us and by safetensors."""
+MARK = ".surfkit-"
+"""What names of files begin with that are surely ours, in folders that hold files of others too."""
+UNFINISHED = f"{MARK}*.part"
+"""Names of files and folders that are being written."""
 DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """Errors of a disk that has no room."""
 
@@ -26,9 +28,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     path = Path(path)
     refuse_special(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_native_id()}.part")
+    unfinished = being_written(path)
     try:
-        with unfinished.open("wb") as file:
+        unfinished.unlink(missing_ok=True)  # of a dead process that had our number
+        with unfinished.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -49,8 +52,7 @@ def replacing_folder(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_dir():
         raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
-    former = path.with_name(f".{path.name}.{os.getpid()}.old.part")
+    unfinished, former = being_written(path), being_written(path.with_name(f"{path.name}.old"))
     try:
         unfinished.mkdir()
         yield unfinished
@@ -62,7 +64,20 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         if former.exists() and not path.exists():  # the second renaming failed
             os.replace(former, path)
         for folder in (unfinished, former):
-            shutil.rmtree(folder, ignore_errors=True)
+            remove(folder)
+
+
+def being_written(path: Path) -> Path:
+    """Where this thread writes what is to take the place of a file or folder; `sweep` deletes what is left of it."""
+    return path.with_name(f"{MARK}{path.name}.{os.getpid()}-{threading.get_native_id()}.part")
+
+
+def remove(path: Path) -> None:
+    """Delete a file, or a folder with all in it, if it is there; of a link, only the link."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def refuse_own(folder: Path) -> None:
@@ -101,13 +116,8 @@ def sync_folder(folder: Path) -> None:
 def sweep(folder: Path, but: Path | None = None, deep: bool = True) -> None:
     """Delete what dead processes left unfinished in a folder that no other process works in, `but` for one inside.
 
-    `deep`: also in the folders inside.
+    `deep`: also in the folders inside, linked ones left out.
     """
-    for pattern in UNFINISHED:
-        for path in list(folder.rglob(pattern) if deep else folder.glob(pattern)):
-            if but is not None and path.is_relative_to(but):
-                continue
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
+    for path in list(folder.rglob(UNFINISHED) if deep else folder.glob(UNFINISHED)):
+        if but is None or not path.is_relative_to(but):
+            remove(path)

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,15 +14,22 @@ from pathlib import Path
 from typing import Any
 
 from surfkit.core.check import BadInput
-from surfkit.core.codec import read_json
+from surfkit.core.codec import from_json, read_json
 from surfkit.core.events import Warned, emit
+from surfkit.core.files import MARK
 
-NAME = "lock"
+NAME = f"{MARK}lock"
+FORMER = "lock"
+"""So processes of older versions call it, which are waited for; a file of that name may also be the user's own."""
 USED = "in-use"
 """File of a folder that several processes may use at once; its time is when one last began to."""
 DAY_S = 86_400
+HERE = os.O_NOFOLLOW | os.O_NONBLOCK
+"""How a file is opened that somebody else may have put there: no link is followed, no pipe waited for."""
 PATIENCE_S = 0.5
 """How long to ask again: a process that only looks (`lock_holder`) has the lock for a moment."""
+LONGEST = 4096
+"""Bytes that the file of a lock may have."""
 
 
 @contextmanager
@@ -29,7 +37,7 @@ def locked(folder: Path) -> Iterator[None]:
     """Within, no other process can lock this folder. It is created if missing, and removed again if left empty.
 
     Raises:
-        BadInput: Another process has it; names the process and its host.
+        BadInput: Another process has it; names the process and its host. Or something else than our file has the name.
     """
     made = _make(folder)
     try:
@@ -48,16 +56,20 @@ def locked(folder: Path) -> Iterator[None]:
 
 def lock_holder(folder: Path) -> str | None:
     """The process that has locked a folder, as "process PID on HOST"; None if none has."""
+    return next((holder for name in (NAME, FORMER) if (holder := _holder(folder / name)) is not None), None)
+
+
+def _holder(path: Path) -> str | None:
     import fcntl
 
     try:
-        file = os.open(folder / NAME, os.O_RDONLY)
+        file = os.open(path, os.O_RDONLY | HERE)
     except OSError:
         return None
     try:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError as error:
-        return _named(folder / NAME) if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
+        return _named(path) if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
     finally:
         os.close(file)
     return None
@@ -69,14 +81,14 @@ def mark_used(folder: Path) -> Iterator[None]:
     import fcntl
 
     try:
-        file = os.open(folder / USED, os.O_RDWR | os.O_CREAT, 0o666)
+        file = os.open(folder / USED, os.O_RDWR | os.O_CREAT | HERE, 0o666)
     except OSError as error:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
             raise
         yield  # what cannot be written to, nobody deletes either
         return
     try:
-        os.utime(folder / USED)
+        os.utime(file)
         with suppress(OSError):  # where there are no locks, the time alone tells
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         yield
@@ -89,7 +101,7 @@ def is_used(folder: Path) -> bool:
     import fcntl
 
     try:
-        file = os.open(folder / USED, os.O_RDWR)
+        file = os.open(folder / USED, os.O_RDWR | HERE)
     except FileNotFoundError:
         return False
     try:
@@ -114,9 +126,11 @@ def _lock(path: Path, folder: Path) -> int | None:
     """The open, locked file; None where the file system has no locks."""
     import fcntl
 
+    if (holder := _holder(folder / FORMER)) is not None:
+        raise _in_use(folder, holder)
     until = time.monotonic() + PATIENCE_S
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        file = _opened(path)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(file, path):
@@ -131,18 +145,53 @@ def _lock(path: Path, folder: Path) -> int | None:
             if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
                 raise
             if time.monotonic() > until:
-                raise BadInput(
-                    f"{folder}: {_named(path)} works in it; wait for its end or stop it, or name another folder"
-                ) from error
+                raise _in_use(folder, _named(path)) from error
             time.sleep(PATIENCE_S / 10)
         else:
             os.close(file)  # the one before had deleted it by the time we had it
 
 
+def _opened(path: Path) -> int:
+    """The file, made if it is not there.
+
+    Raises:
+        BadInput: There is something that surfkit has not made: a link, a folder, a file with anything else in it.
+    """
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | HERE, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+            raise _foreign(path) from error
+        raise
+    if not stat.S_ISREG(os.fstat(file).st_mode) or not _is_ours(os.pread(file, LONGEST + 1, 0)):
+        os.close(file)
+        raise _foreign(path)
+    return file
+
+
+def _is_ours(content: bytes) -> bool:
+    """Whether a file holds what `_lock` writes, or nothing: a process died before it had written."""
+    if not content:
+        return True
+    try:
+        said = from_json(content.decode())
+    except ValueError:  # BadInput, bytes that are no UTF-8
+        return False
+    return isinstance(said, dict) and said.keys() == {"pid", "host"}
+
+
+def _foreign(path: Path) -> BadInput:
+    return BadInput(f"{path}: not a file that surfkit made, where it keeps its lock; move it away")
+
+
+def _in_use(folder: Path, holder: str) -> BadInput:
+    return BadInput(f"{folder}: {holder} works in it; wait for its end or stop it, or name another folder")
+
+
 def _is_at(file: int, path: Path) -> bool:
     """Whether an open file is still the one of that name."""
     try:
-        return os.path.samestat(os.fstat(file), os.stat(path))
+        return os.path.samestat(os.fstat(file), os.lstat(path))
     except FileNotFoundError:
         return False
 

@@ -12,11 +12,16 @@ from surfkit.core.memory import is_out_of_memory
 
 EXTRAS = {
     "OpenEXR": "exr", "cv2": "video", "fast_simplification": "texture", "laspy": "maps", "lazrs": "maps",
-    "lpips": "lpips", "open3d": "mesh", "pyogrio": "maps", "pyproj": "crs", "rasterio": "maps", "ray": "ray",
-    "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "trimesh": "mesh", "viser": "view",
+    "lpips": "lpips", "open3d": "mesh", "pillow_heif": "heic", "pyogrio": "maps", "pyproj": "crs", "rasterio": "maps",
+    "ray": "ray", "submitit": "slurm", "tensorboard": "tensorboard", "transformers": "depth", "trimesh": "mesh",
+    "viser": "view",
 }  # fmt: skip
 """By package, which extra of surfkit brings it; any other is installed by its own name."""
-INSTALLED_AS = {"cv2": "opencv-python-headless", "fast_simplification": "fast-simplification"}
+INSTALLED_AS = {
+    "cv2": "opencv-python-headless",
+    "fast_simplification": "fast-simplification",
+    "pillow_heif": "pillow-heif",
+}
 """By package, the name that it is installed by, where that is another one."""
 LIBRARIES = {
     "open3d": {

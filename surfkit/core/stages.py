@@ -97,6 +97,8 @@ def kept_parts(folder: Path, key: str) -> Iterator[None]:
     Raises:
         BadInput: The folder has files of somebody else.
     """
+    if folder.is_symlink():
+        raise BadInput(f"{folder}: a link, where surfkit makes and deletes a folder; move it away")
     folder.mkdir(parents=True, exist_ok=True)
     ours = (folder / KEY).exists()
     sweep(folder, deep=ours)

@@ -177,7 +177,7 @@ class Signal(Component):
     absolute: ClassVar[bool] = False
     """Whether the pixels' shares of the chosen gradient are to be summed without their signs."""
 
-    terms: tuple[str, ...] | None
+    terms: tuple[str, ...] | None = None
     """Losses, by name, whose gradient is computed separately; None when only the total is needed."""
 
     @abstractmethod

@@ -17,6 +17,8 @@ EVENT_BYTES = 260
 """A line of events.jsonl."""
 LONG_S = 48 * 3600.0
 """A run that takes longer is worth a warning."""
+FIRST_LOOK_S = 2 * 3600.0
+"""Before a run of recipe:surface that takes longer, a first look is worth its minutes."""
 MARGIN = 0.9
 """Share of what is free that advice counts on."""
 LEAST_CACHE = 200e6
@@ -188,6 +190,14 @@ def slope(x: np.ndarray, y: np.ndarray) -> float:
 def advice(found: Estimate) -> list[Finding]:
     """What to lower where a run will not fit, or take days."""
     return [*_memory(found), *_gpu_memory(found), *_disk(found), *_time(found)]
+
+
+def first_look(found: Estimate) -> list[Finding]:
+    """The recipe for a first look, where one that begins at stereo depth takes hours."""
+    if found.seconds <= FIRST_LOOK_S:
+        return []
+    text = f"the run will take about {duration(found.seconds)}; recipe:surface-short --steps 500 is a first look"
+    return [Finding("note", "first-look", text)]
 
 
 def _gpu_memory(found: Estimate) -> list[Finding]:

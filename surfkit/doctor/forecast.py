@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
-from surfkit.doctor.estimate import Estimate, Load, Room, advice, estimate
+from surfkit.doctor.estimate import Estimate, Load, Room, advice, estimate, first_look
 from surfkit.doctor.examine import Examined, Told
 from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.gather import depth_maps, heard
@@ -80,7 +80,7 @@ def forecast(
             return None, from_errors("probe", [error])
         pixels = sum(w * h for w, h in _sizes(data, examined, {s.name for s in examined.gathered.train}))
         first = recipe.start.expected(len(scene.cloud.xyz), pixels)
-        rising = growth(recipe.pretrain, first, pixels, plan.points)
+        rising = growth(recipe.pretrain, first, pixels, plan.points, recipe.start.is_dense)
         parts = schedule(recipe.pretrain.steps, rising)
         held_back = within(parts, min(MOST_POINTS, int(0.4 * room.memory_bytes / POINT_BYTES)))
         wanted = load.view_bytes > 0 and needs_priors(recipe.pretrain.losses)
@@ -91,7 +91,8 @@ def forecast(
         return None, [_failed(probed, held_back)]
     found = estimate(load, parts, rising, probed, room)
     found = replace(found, probe_seconds=time.perf_counter() - begun)
-    return found, [*beyond(recipe), *advice(found)]
+    look = first_look(found) if recipe.start.is_dense and recipe.start.needs_prior else []
+    return found, [*beyond(recipe), *advice(found), *look]
 
 
 def beyond(recipe: Recipe) -> list[Finding]:

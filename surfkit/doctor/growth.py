@@ -13,6 +13,9 @@ MAX_FACTOR, HALF_AFTER = 36.0, 22.0
 """Many edits multiply the number of sparse points by up to the first; the second is the number of edits after which
 half of that is reached. A rule of thumb: runs of 2DGS on two aerial scenes multiplied theirs by 1.6, 5 to 8, and 15 to
 25 with 1, 5 and 17 edits, and published runs of 3DGS theirs by 6 to 110, mostly 20 to 60, with 145."""
+DENSE_FACTOR = 5.0
+"""The same for points that begin dense. Runs of recipe:surface on two aerial scenes multiplied theirs by 1.1, 1.2 and
+1.5 with 2, 6 and 11 edits, and by 1.4, 1.8 and 3.3 with 2, 4 and 14."""
 PER_PIXEL = 0.3
 """Never more points than this share of the pixels of all training photographs."""
 SPREAD = 3.0
@@ -30,44 +33,48 @@ class Growth:
         last: Points at the end.
         edits: When points are added, as shares of the run, in order.
         known: Whether the recipe or the user sets `last`; else it is only likely.
+        most: By how much edits multiply the points at most.
     """
 
     first: int
     last: int
     edits: Sequence[float]
     known: bool
+    most: float = MAX_FACTOR
 
     def at(self, share: float) -> int:
         """Points after a share of the run."""
         if not self.edits:
             return self.first
         done = bisect_right(self.edits, share)
-        risen = (factor(done) - 1) / (factor(len(self.edits)) - 1)
+        risen = (factor(done, self.most) - 1) / (factor(len(self.edits), self.most) - 1)
         return round(self.first + risen * (self.last - self.first))
 
 
-def factor(edits: int) -> float:
-    """By how much edits multiply the points of a sparse cloud."""
-    return 1 + (MAX_FACTOR - 1) * edits / (edits + HALF_AFTER)
+def factor(edits: int, most: float = MAX_FACTOR) -> float:
+    """By how much edits multiply the points; never by more than `most`."""
+    return 1 + (most - 1) * edits / (edits + HALF_AFTER)
 
 
-def growth(stage: Stage, sparse: int, pixels: int, given: int | None = None) -> Growth:
+def growth(stage: Stage, first: int, pixels: int, given: int | None = None, is_dense: bool = False) -> Growth:
     """How the number of points will rise.
 
     Args:
         stage: What the run does.
-        sparse: Points that it starts with.
+        first: Points that it starts with.
         pixels: Of all training photographs, at the size they are used at.
         given: Points at the end, where the user says so.
+        is_dense: Whether the first points lie on most of the surface already.
     """
     if stage.densify is None:
-        return Growth(sparse, sparse, (), True)
+        return Growth(first, first, (), True)
     edits = edit_shares(stage.densify, stage.steps)
-    likely = max(sparse, min(round(sparse * factor(len(edits))), round(PER_PIXEL * pixels)))
+    most = DENSE_FACTOR if is_dense else MAX_FACTOR
+    likely = max(first, min(round(first * factor(len(edits), most)), round(PER_PIXEL * pixels)))
     limit = stage.densify.most_points
-    last = given if given is not None else min(likely, max(limit or likely, sparse))
+    last = given if given is not None else min(likely, max(limit or likely, first))
     known = given is not None or not edits or (limit is not None and last >= limit)
-    return Growth(sparse, last if edits else sparse, edits, known)
+    return Growth(first, last if edits else first, edits, known, most)
 
 
 def edit_shares(densify: Densify, steps: int) -> tuple[float, ...]:

@@ -131,7 +131,7 @@ class SplatTable:
 
     def median_scale(self) -> float:
         """Median radius in the plane of surfels, or along the first two axes of ellipsoids; 1 without splats."""
-        return math.exp(min(max(float(self.log_scales[:, :2].median()), -60.0), 60.0)) if len(self) else 1.0
+        return math.exp(min(max(float(np.median(self.log_scales[:, :2].cpu())), -60.0), 60.0)) if len(self) else 1.0
 
     def on_cpu(self) -> SplatTable:
         """The same splats on the CPU and without gradients: positions as they are, all else in float32."""

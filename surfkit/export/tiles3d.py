@@ -49,6 +49,10 @@ class Tiles3D(Format):
     up: Up = "auto"
     """Axis of the input that points up, or down with a minus. auto: z of a georeferenced data set, -y otherwise."""
 
+    geoid: str = ""
+    """The geoid that heights are above: a grid (GTX, GeoTIFF), or the metres by which it lies above the ellipsoid.
+    By default they are above what the coordinate reference system says, and without a vertical part the ellipsoid."""
+
     most_splats: int = 200_000
     """Most splats in a tile; full-detail tiles with more are divided."""
 
@@ -82,7 +86,7 @@ class Tiles3D(Format):
     def _place(self, path: Path, frame: Frame | None) -> Place:
         """From the coordinates of the table to metres in a tileset, and from there to Earth."""
         turn = UPS["z"].T @ UPS[up_of(self.up, frame)]
-        ground = ground_of(path, frame, turn, self.georeference)
+        ground = ground_of(path, frame, turn, self.georeference, self.geoid or None)
 
         def moved(table: SplatTable) -> SplatTable:
             means = torch.from_numpy(ground.metres(table.means.detach().cpu().double().numpy()))

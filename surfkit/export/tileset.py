@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.version import own_version
+from surfkit.scene.crs import refuse_other_unit
 from surfkit.scene.earth import Site
+from surfkit.scene.geoid import geoid_of
 from surfkit.scene.scene import Frame
 
 INDEX = "tileset.json"
@@ -35,7 +38,9 @@ class Ground:
     matrix: np.ndarray
 
 
-def ground_of(path: Path, frame: Frame | None, turn: np.ndarray, georeference: bool = True) -> Ground:
+def ground_of(
+    path: Path, frame: Frame | None, turn: np.ndarray, georeference: bool = True, geoid: str | None = None
+) -> Ground:
     """The place of a tileset: on Earth, if the data set has a coordinate reference system, else about its centre.
 
     Args:
@@ -43,9 +48,15 @@ def ground_of(path: Path, frame: Frame | None, turn: np.ndarray, georeference: b
         frame: Of the data set, if one is known.
         turn: (3, 3) from the input to z up, where it is not placed on Earth.
         georeference: Whether to place it on Earth.
+        geoid: What heights are above, see `geoid_of`; None leaves it to the coordinate reference system.
+
+    Raises:
+        BadInput: The coordinate reference system has no place for it, or contradicts the unit of the data set.
     """
-    if frame is not None and frame.crs and georeference:
-        site = Site.at(frame.crs, frame.origin)
+    site = site_of(frame, geoid) if georeference else None
+    if site is not None:
+        for note in site.notes:
+            emit(Warned(note))
         return Ground(site.local, site.unit, site.pose)
     if georeference:
         emit(
@@ -58,6 +69,24 @@ def ground_of(path: Path, frame: Frame | None, turn: np.ndarray, georeference: b
     matrix = np.eye(4)
     matrix[:3, :3] = turn
     return Ground(lambda xyz: (xyz - np.array(shift)) * unit, unit, matrix)
+
+
+def site_of(frame: Frame | None, geoid: str | None = None) -> Site | None:
+    """Where on Earth the scene of a data set lies; None if it has no coordinate reference system.
+
+    Args:
+        frame: Of the data set, if one is known.
+        geoid: What heights are above, see `geoid_of`.
+
+    Raises:
+        BadInput: The coordinate reference system has no place for it, or contradicts the unit of the data set.
+    """
+    if frame is None or not frame.crs:
+        if geoid is not None:
+            raise BadInput(f"--geoid {geoid}: the data set has no coordinate reference system; leave it out")
+        return None
+    refuse_other_unit(frame.crs, frame.metres, frame.origin)
+    return Site.at(frame.crs, frame.origin, None if geoid is None else geoid_of(geoid))
 
 
 def box_json(corners: np.ndarray) -> dict[str, Any]:

@@ -116,10 +116,13 @@ def _percentiles(sheet: Sheet, name: str, side: int) -> tuple[float, float, floa
             absolute += np.histogram(np.abs(values), BINS, (0, most))[0]
     middles = (np.arange(BINS) + 0.5) / BINS * most
 
-    def at(counts: np.ndarray, share: float) -> int:
-        return int(np.searchsorted(np.cumsum(counts), share * counts.sum()))
+    def at(counts: np.ndarray, share: float) -> float:
+        """As numpy's percentile: between two values where it falls there, so the median of an even number is a mean."""
+        rank = share * (counts.sum() - 1)
+        lower, upper = middles[np.searchsorted(np.cumsum(counts), [np.floor(rank), np.ceil(rank)], side="right")]
+        return float(lower + (rank - np.floor(rank)) * (upper - lower))
 
-    return 2 * float(middles[at(signed, 0.5)]) - most, *(float(middles[at(absolute, share)]) for share in (0.5, 0.9))
+    return 2 * at(signed, 0.5) - most, at(absolute, 0.5), at(absolute, 0.9)
 
 
 def draw_difference(path: Path, raster: Path, found: Difference, unit: str) -> None:

@@ -20,8 +20,9 @@ from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import FileWritten, Progress, emit
 from surfkit.core.files import refuse_special, sweep, sync_folder
 from surfkit.core.lock import locked
-from surfkit.core.stages import delete_parts, kept_parts
+from surfkit.core.stages import kept_parts
 from surfkit.maps.grid import Grid
+from surfkit.maps.ours import NAMES, WORK, claim, forget_unfinished, keep_names, own_files, refuse_foreign
 from surfkit.maps.rasters import BLOCK, Kind, Raster
 
 CACHE = 256
@@ -30,8 +31,8 @@ LEAST_FREE = 1 << 20
 """Bytes of a disk, below which it is full."""
 NOT_WRITTEN = re.compile("write (error|failed)|no space", re.IGNORECASE)
 """How GDAL says that a file could not be written."""
-WORK, TILES = "unfinished", ".tiles"
-"""Folder for what is finished of maps, in theirs; ending of the names of folders with the tiles of a raster."""
+TILES = ".tiles"
+"""Ending of the names of folders with the tiles of a raster."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ class Sheet:
         refuse_full(self.folder)
         with finished.open("rb+") as file:
             os.fsync(file.fileno())
+        claim(self.out, finished.name)
         for name in self.replaced:
             (self.out / name).unlink(missing_ok=True)
         os.replace(finished, self.out / finished.name)
@@ -136,7 +138,7 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
 
     Args:
         out: Made if it is missing.
-        names: Files to be written: OSError if something else than a file has such a name.
+        names: Files to be written: OSError if something else than a file has such a name, or a file that is not ours.
         key: Of all that the maps depend on.
 
     Raises:
@@ -146,14 +148,20 @@ def workshop(out: Path, names: tuple[str, ...], key: str = "") -> Iterator[Path]
         refuse_special(out / name)
     folder = out / WORK
     with locked(out):
+        refuse_foreign(out, names)
         sweep(out, deep=False)
+        before = own_files(out)
         try:
             with kept_parts(folder, key):
+                keep_names(out, before)
                 try:
                     yield folder
                 except BadInput:  # the same command would come to it again
-                    delete_parts(folder)
+                    forget_unfinished(out)
                     raise
+                finally:
+                    if not own_files(out):  # nothing is finished, nor was
+                        (folder / NAMES).unlink(missing_ok=True)
         except Exception as error:  # of GDAL's kinds, which do not say why a file could not be written
             full = shutil.disk_usage(out).free < LEAST_FREE or NOT_WRITTEN.search(str(error))
             if isinstance(error, BadInput) or not full:

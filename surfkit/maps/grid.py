@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.scene.earth import TOPOCENTRIC
+from surfkit.scene.crs import TOPOCENTRIC, refuse_other_unit, scale_at
 from surfkit.scene.scene import Frame
 
 MOST_CELLS = 4e10
 """Of a map: twice those of 14 x 14 km at 0.1 m."""
-
-UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft"}
-"""Short names of units of length, by those of GDAL."""
+STRETCHED, TOO_STRETCHED = 0.01, 0.1
+"""Shares by which lengths on a map differ from those on the ground: a line tells of it; no map is drawn."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
     than 2 cm where 1 km from the place and 100 m high. Without a reference the file states a local one with its unit.
 
     Raises:
-        BadInput: rasterio is missing, or the system is unknown or has no easting and northing in units of length.
+        BadInput: rasterio or pyproj is missing, or the system is unknown, has no easting and northing in units of
+            length, has heights in another unit, does not keep lengths, or contradicts the unit of the data set.
     """
     with needed("rasterio", "surfkit maps"):
         from rasterio.crs import CRS
@@ -129,20 +130,21 @@ def map_crs(frame: Frame) -> tuple[Any, str]:
             f"coordinate reference system {frame.crs!r}: maps need easting and northing in units of length; convert "
             "the cameras to a projected system such as UTM"
         )
+    refuse_other_unit(frame.crs, frame.metres, frame.origin)
+    refuse_stretched(frame)
     return found, f"{text}, for coordinates about a place on Earth" if place else text
 
 
-def unit_of(frame: Frame, crs: Any) -> str:
-    """What lengths of a frame are called behind numbers: m, ft, US ft; "units" if nobody knows.
-
-    Args:
-        frame: Of the input.
-        crs: Its coordinate reference system, of rasterio.
-    """
-    if frame.metres == 1 or frame.crs is None:
-        return "m" if frame.metres == 1 else "units"
-    name, _ = crs.linear_units_factor
-    return UNITS.get(name, name)
+def refuse_stretched(frame: Frame) -> None:
+    """BadInput for a map on which areas and volumes would be far from those on the ground; a line if they are off."""
+    longer = 1 / scale_at(frame.crs, frame.origin)
+    told = (
+        f"{frame.crs}: lengths on the map are {longer:.4g} times those on the ground here, areas {longer**2:.4g} times"
+    )
+    if abs(longer - 1) > TOO_STRETCHED:
+        raise BadInput(f"{told}; convert the cameras to a system that keeps lengths, such as UTM")
+    if abs(longer - 1) > STRETCHED:
+        emit(Warned(f"{told}; cells, areas and volumes are those of the map"))
 
 
 def same_crs(one: str | None, other: str | None) -> bool:

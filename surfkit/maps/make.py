@@ -20,13 +20,14 @@ from surfkit.maps.cloud import write_cloud
 from surfkit.maps.contours import even_interval, write_contours
 from surfkit.maps.difference import Difference, draw_difference, write_difference
 from surfkit.maps.geotiff import Sheet, workshop
-from surfkit.maps.grid import Grid, map_crs, shown, unit_of
+from surfkit.maps.grid import Grid, map_crs, shown
 from surfkit.maps.hillshade import draw_hillshade
+from surfkit.maps.ours import FILES, RECORD, claim, own_files
 from surfkit.maps.photographs import FromPhotographs
 from surfkit.maps.surface_model import Drawn, draw_surface, has_colors, needs_double
 from surfkit.mesh.simplify import require_simplification
 from surfkit.scene.crop import Axis
-from surfkit.scene.lengths import Length
+from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.memory import cache_bytes
 from surfkit.scene.up_direction import map_axes, up_direction
 from surfkit.texture.keep import Kept, identity, seen
@@ -35,14 +36,8 @@ from surfkit.texture.resolution import ground_sampling_distance
 
 Product = Literal["orthophoto", "hillshade", "contours", "points"]
 PRODUCTS: tuple[Product, ...] = ("orthophoto", "hillshade", "contours", "points")
-FILES = {
-    "dsm": "dsm.tif", "orthophoto": "orthophoto.tif", "hillshade": "hillshade.tif", "contours": "contours.gpkg",
-    "points": "points.laz", "other": "dsm-other.tif", "difference": "difference.tif", "picture": "difference.png",
-}  # fmt: skip
 COMPARED = ("other", "difference", "picture")
 """Files of a comparison."""
-RECORD = "maps.json"
-"""What the maps are; written last, so maps without it are not whole."""
 PACKAGES = {"contours": ("pyogrio",), "points": ("laspy", "lazrs")}
 """What products need beside rasterio."""
 
@@ -116,12 +111,13 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
     Args:
         subject: What to draw.
         settings: How.
-        out: The folder; maps in it are replaced, files of other names stay. What an interrupted call has finished for
-            the same maps is in it, and is not done again.
+        out: The folder; maps of surfkit in it are replaced, all other files stay. What an interrupted call has finished
+            for the same maps is in it, and is not done again.
         other: A mesh in the same coordinates, to subtract.
 
     Raises:
         BadInput: A package is missing, there is nothing to draw, or the map would be too large.
+        OSError: There are files of the names of the maps that surfkit did not write.
     """
     settings.refuse_missing()
     frame, surface = subject.frame, subject.surface
@@ -132,7 +128,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         refuse_apart(surface, grid)
     if other is not None:
         refuse_apart(other, grid)
-    done, unit = drawable(surface, settings), unit_of(frame, crs)
+    done, unit = drawable(surface, settings), unit_of(frame)
     files = [FILES[name] for name in (*done, *(COMPARED if other is not None else ()))]
     key = key_of(
         replace(settings, memory="auto"), files, frame.crs, frame.metres, told, own_version(), grid.turn.tolist(),
@@ -140,7 +136,7 @@ def make_maps(subject: Subject, settings: MapSettings, out: Path, other: Surface
         seen(subject.views) if settings.colors == "photographs" else "",
     )  # fmt: skip
     with workshop(out, (*files, RECORD), key) as folder:
-        replaced = (RECORD, *sorted({*FILES.values()} - {*files})) if (out / RECORD).exists() else ()
+        replaced = (RECORD, *sorted(own_files(out) - {*files, RECORD}))
         sheet = Sheet(grid, crs, folder, out, needs_double(surface, grid), replaced)
         drawn = Drawn(**sheet.once(
             [FILES[name] for name in ("dsm", "orthophoto") if name in done],
@@ -254,6 +250,7 @@ def subtract(sheet: Sheet, other: Surface, side: int, unit: str) -> dict[str, An
     heights = sheet.out / FILES["dsm"], sheet.out / FILES["other"]
     name = FILES["difference"]
     found = Difference(**sheet.once([name], lambda: asdict(write_difference(sheet, heights, name, side))))
+    claim(sheet.out, FILES["picture"])
     draw_difference(sheet.out / FILES["picture"], sheet.out / name, found, unit)
     return {"other": str(other.path), **asdict(found)}
 

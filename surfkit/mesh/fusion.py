@@ -15,6 +15,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.core.files import MARK, remove
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.cuda.grid import GpuGrid
 from surfkit.mesh.floaters import drop_floaters
@@ -26,7 +27,7 @@ from surfkit.mesh.tiles import Box, join
 from surfkit.scene.arrays import write_array
 from surfkit.scene.camera import Camera
 
-TILES = ".tiles-*"
+TILES = f"{MARK}tiles-*"
 """Pattern of the names of folders with the depth maps of the views."""
 PIXEL_BYTES = 12
 """Bytes per pixel of a view on disk."""
@@ -190,7 +191,7 @@ def _corner(at: np.ndarray) -> Corner:
 def forget_spooled(scratch: Path) -> None:
     """Delete from a folder what `spooled` left there in a process that was killed."""
     for left in scratch.glob(TILES):
-        shutil.rmtree(left, ignore_errors=True)
+        remove(left)
 
 
 @contextmanager

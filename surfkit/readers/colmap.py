@@ -16,7 +16,7 @@ from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot, Tracks, load_pycolmap
 from surfkit.readers.colmap_files import PARTS, cut_off, refuse_cut_off
 from surfkit.readers.data import Data, nearest
-from surfkit.readers.placed import on_the_map, read_placed
+from surfkit.readers.placed import Placed, on_the_map, read_placed
 from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
@@ -51,7 +51,7 @@ class COLMAP(Reader):
         paths = _photographs(data.path, data, [image.name for image in images])
         shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
         capture = Capture(shots, xyz, rgb, groups=groups, numbered=True)
-        placed = read_placed(folder)
+        placed = _placed(data.path, folder)
         return capture if placed is None else on_the_map(capture, placed)
 
     def model_folder(self, data: Data) -> Path:
@@ -59,7 +59,7 @@ class COLMAP(Reader):
 
     def tracks(self, data: Data) -> Tracks:
         folder = self.model_folder(data)
-        model, placed = _reconstruction(folder), read_placed(folder)
+        model, placed = _reconstruction(folder), _placed(data.path, folder)
         points = sorted(model.points3D.items())
         row = {number: at for at, (number, _) in enumerate(points)}
         seen = {}
@@ -81,6 +81,12 @@ class Image:
     name: str
     pose: np.ndarray
     camera: Any
+
+
+def _placed(root: Path, folder: Path) -> Placed | None:
+    """Where a model lies, by a file beside it or in a folder above it, up to that of the data set."""
+    above = folder.relative_to(root).parts if folder.is_relative_to(root) else ()
+    return read_placed(folder, *(root.joinpath(*above[:depth]) for depth in range(len(above))), root)
 
 
 def _places(root: Path) -> list[Path]:

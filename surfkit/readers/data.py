@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +18,8 @@ from surfkit.readers.split import Split
 
 LONGEST = 1600
 """Default for the longest side of a photograph, pixels."""
+TEST_EVERY = 8
+"""Default for which photographs are held out: every so many-th; 0 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +32,10 @@ class Reading:
     longest: int | None = None
     """Longest side of a photograph in pixels; larger ones are downscaled. 1600 when no scale is given."""
 
-    test_every: int = 8
+    test_every: int | None = None
     """Hold out every Nth photograph, in name order from the first on: not trained on, used to measure; 0 holds out
-    none. A data set with test photographs of its own holds out those."""
+    none. Default: 8; 0 for recipe:surface, its variants and recipe:stereo, and where depth maps are prepared. A data
+    set with test photographs of its own holds out those."""
 
     test_list: Path | None = None
     """Hold out the photographs named in this file instead: one name per line, relative to images/."""
@@ -75,7 +78,7 @@ class Reading:
             raise BadInput("--split, --test-list and --test-data each choose what is held out; give one")
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
-        if self.test_every < 0:
+        if self.test_every is not None and self.test_every < 0:
             raise BadInput(f"--test-every {self.test_every}: it must be 0 (hold out none) or more")
 
     def size(self, width: int, height: int) -> tuple[int, int]:
@@ -83,6 +86,26 @@ class Reading:
         longest = self.longest or (LONGEST if self.scale is None else max(width, height))
         by = max(self.scale or 1.0, max(width, height) / longest)
         return max(1, round(width / by)), max(1, round(height / by))
+
+    def of(self, path: Path, test_every: int = TEST_EVERY) -> Data:
+        """The data set at `path`, read so; every so many-th photograph is held out if nobody has said which."""
+        given = {each.name: getattr(self, each.name) for each in fields(Reading)}
+        return Data(path, **{"test_every": test_every} | {name: it for name, it in given.items() if it is not None})
+
+
+@dataclass(frozen=True)
+class Data(Reading):
+    """A data set and how it is read."""
+
+    path: Annotated[Path, tyro.conf.arg(name="data")]
+    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
+    another layout that `surfkit components reader` lists."""
+
+    test_every: int = field(default=TEST_EVERY, kw_only=True)
+    """Hold out every Nth photograph, in name order from the first on, unless another rule is given; 0 for none."""
+
+    priors: Annotated[Path | None, tyro.conf.Suppress] = None
+    """Folder of the depth maps that a run made for it, where it has none of its own."""
 
     def held_out(self, capture: Capture) -> set[str]:
         """Names of the photographs that are held out: not trained on, kept to measure with.
@@ -114,22 +137,6 @@ class Reading:
         if unknown := chosen - {shot.name for shot in capture.shots}:
             raise BadInput(f"{rule} holds out {min(unknown)!r}, which is no photograph of the data set")
         return chosen, rule
-
-    def of(self, path: Path) -> Data:
-        """The data set at `path`, read so."""
-        return Data(path, **{field.name: getattr(self, field.name) for field in fields(Reading)})
-
-
-@dataclass(frozen=True)
-class Data(Reading):
-    """A data set and how it is read."""
-
-    path: Annotated[Path, tyro.conf.arg(name="data")]
-    """Folder of the data set: images/ and a COLMAP model in sparse/0, sparse, colmap/sparse/0 or colmap/sparse, or
-    another layout that `surfkit components reader` lists."""
-
-    priors: Annotated[Path | None, tyro.conf.Suppress] = None
-    """Folder of the depth maps that a run made for it, where it has none of its own."""
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

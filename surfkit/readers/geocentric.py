@@ -12,7 +12,8 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.readers.georeference import POLAR, Similarity, zone_of
 from surfkit.readers.wkt import Node, parse_wkt
-from surfkit.scene.earth import AXIS, FLATTENING, utm
+from surfkit.scene.crs import exact
+from surfkit.scene.earth import AXIS, FLATTENING, to_ecef, utm
 
 GEOGRAPHIC, PROJECTED = ("GEOGCS", "GEOGCRS", "BASEGEOGCRS", "GEODCRS", "BASEGEODCRS"), ("PROJCS", "PROJCRS")
 VERTICAL, LOCAL = ("VERT_CS", "VERTCRS"), ("LOCAL_CS", "ENGCRS")
@@ -87,8 +88,21 @@ def place_of(where: str, text: str, centres: np.ndarray) -> MapPlace | None:
         return np.column_stack([on_map(latitude, longitude), height / unit])
 
     place = MapPlace(_similarity(where, convert, middle), crs, unit)
-    _warn_of_bend(where, flat.name, place, convert, centres)
+    warn_of_bend(where, flat.name, place.move, unit, convert, centres)
     return place
+
+
+def topocentric_to_utm(local: str, crs: str) -> Convert:
+    """The exact way from metres east, north and up of a place, `local` as PROJ names it, to a zone of UTM."""
+    zone = zone_of(crs)
+    if zone is None:
+        raise ValueError(f"{crs} is no zone of UTM")
+
+    def convert(xyz: np.ndarray) -> np.ndarray:
+        found = geodetic(to_ecef(local, xyz))
+        return np.array([[*utm(latitude, longitude, *zone), height] for latitude, longitude, height in found.tolist()])
+
+    return convert
 
 
 def geodetic(xyz: np.ndarray, axis: float = AXIS, flattening: float = FLATTENING) -> np.ndarray:
@@ -118,17 +132,25 @@ def _similarity(where: str, convert: Convert, middle: np.ndarray) -> Similarity:
     return Similarity(turn, scale, convert(middle[None])[0] - scale * turn @ middle)
 
 
-def _warn_of_bend(where: str, name: str, place: MapPlace, convert: Convert, centres: np.ndarray) -> None:
-    """Say how far the outermost camera is from its place on the map, if that is far."""
-    away = np.linalg.norm(centres - centres.mean(0), axis=1)
-    away[away > FAR_M] = 0
-    outermost = centres[[away.argmax()]]
-    off = float(np.linalg.norm(place.move.points(outermost) - convert(outermost))) * place.metres
-    if QUIET_M < off < np.inf:
+def warn_of_bend(where: str, name: str, move: Similarity, metres: float, convert: Convert, centres: np.ndarray) -> None:
+    """Say how far the camera that a similarity puts worst is from its place on the map, if that is far.
+
+    Args:
+        where: The cameras are from, for the message.
+        name: Of the map.
+        move: From the coordinates of the cameras to the map.
+        metres: Per unit of the map.
+        convert: The exact way to the map.
+        centres: (V, 3) of the cameras.
+    """
+    near = centres[np.linalg.norm(centres - np.median(centres, axis=0), axis=1) <= FAR_M]
+    away = np.linalg.norm(move.points(near) - convert(near), axis=1)
+    off = float(away[np.isfinite(away)].max(initial=0)) * metres
+    if off > QUIET_M:
         emit(
             Warned(
                 f"{where}: the Earth is round, {name!r} is flat: at the outermost camera, coordinates are {off:.2f} m "
-                "off; for less, export parts"
+                "off; for less, split the photographs into parts"
             )
         )
 
@@ -165,7 +187,10 @@ def _by_pyproj(where: str, text: str, code: str | None, onto: str | None) -> tup
         given = CRS(code or text)
         given = given.sub_crs_list[0] if given.is_compound else given
         target = (CRS(onto) if onto else given).to_2d()
-        known = Transformer.from_crs(given.geodetic_crs.to_2d(), target, always_xy=True)
+        degrees = given.geodetic_crs.to_2d()
+        if (known := exact(degrees, target)) is None:
+            emit(Warned(f"{where}: the shift from its datum to {onto} is not known; places may be some 100 m off"))
+            known = Transformer.from_crs(degrees, target, always_xy=True)
         unit = float(target.axis_info[0].unit_conversion_factor)
     except (CRSError, ProjError, AttributeError, IndexError) as error:
         said = " ".join(str(error).split())[:200]

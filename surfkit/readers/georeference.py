@@ -53,11 +53,13 @@ class Place:
         crs: Coordinate reference system of its coordinates, after `moved`.
         moved: From the coordinates of the file; None if they stay.
         shift: What files of these coordinates leave out.
+        local: Coordinate reference system before `moved`: metres east, north and up of a place.
     """
 
     crs: str
     moved: Similarity | None = None
     shift: tuple[float, float, float] | None = None
+    local: str | None = None
 
 
 def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: float) -> Place | None:
@@ -93,7 +95,7 @@ def place_on_earth(root: Path, folder: Path, model: Mapping[str, Any], height: f
             "run OpenDroneMap again, or delete coords.txt and proj.txt"
         )
     shift = _offset(root / FOLDER / "coords.txt", lines)
-    return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift)
+    return Place(f"EPSG:{(32700 if south else 32600) + number}", _onto_map(reference, zone, height), shift, local)
 
 
 def _onto_map(reference: tuple[float, float, float], zone: tuple[int, bool], height: float) -> Similarity:

@@ -17,6 +17,7 @@ from surfkit.readers.base import Reader
 from surfkit.readers.camera_files import MOST, read_lines, tracks_of
 from surfkit.readers.capture import Capture, Shot, Tracks, camera_of
 from surfkit.readers.data import Data
+from surfkit.readers.geocentric import topocentric_to_utm, warn_of_bend
 from surfkit.readers.georeference import place_on_earth
 from surfkit.scene.names import find_files
 
@@ -118,6 +119,9 @@ def _on_earth(capture: Capture, root: Path, folder: Path, model: Mapping[str, An
     capture = replace(capture, metres=1.0, crs=place.crs, shift=place.shift)
     if (move := place.moved) is None:
         return capture
+    if place.local is not None and capture.shots:
+        centres = np.stack([-shot.pose[:3, :3].T @ shot.pose[:3, 3] for shot in capture.shots])
+        warn_of_bend(str(folder), place.crs, move, 1.0, topocentric_to_utm(place.local, place.crs), centres)
     shots = [replace(shot, pose=move.pose(shot.pose)) for shot in capture.shots]
     return replace(capture, shots=shots, xyz=move.points(capture.xyz))
 

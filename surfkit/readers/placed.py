@@ -10,6 +10,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json
 from surfkit.readers.capture import Capture
+from surfkit.scene.crs import known_axes
 
 FILE = "georeference.json"
 
@@ -21,27 +22,40 @@ class Placed:
     Attributes:
         crs: Coordinate reference system, such as "EPSG:32633".
         offset: East, north and up, units of the map.
-        metres_per_unit: Of the map.
+        metres_per_unit: Of the map; None is what its system says.
     """
 
     crs: str
     offset: tuple[float, float, float]
-    metres_per_unit: float = 1.0
+    metres_per_unit: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.crs or not np.isfinite(self.offset).all() or not 0 < self.metres_per_unit < np.inf:
+        if (
+            not self.crs
+            or not np.isfinite(self.offset).all()
+            or not (self.metres_per_unit is None or 0 < self.metres_per_unit < np.inf)
+        ):
             raise BadInput("crs must name a system, offset and metres_per_unit must be finite numbers")
 
 
-def read_placed(folder: Path) -> Placed | None:
-    """Where the cameras in a folder lie; None if no file says so."""
-    path = folder / FILE
-    return read_json(path, Placed) if path.is_file() else None
+def read_placed(*folders: Path) -> Placed | None:
+    """Where the cameras lie by the file in one of some folders; None if no file says so.
+
+    Raises:
+        BadInput: A file is damaged, or two of them differ.
+    """
+    paths = [path for path in dict.fromkeys(folder / FILE for folder in folders) if path.is_file()]
+    found = [read_json(path, Placed) for path in paths]
+    if other := next((path for path, placed in zip(paths, found, strict=True) if placed != found[0]), None):
+        raise BadInput(f"{paths[0]} and {other} differ; delete the one that is wrong")
+    return found[0] if found else None
 
 
 def on_the_map(capture: Capture, placed: Placed) -> Capture:
     """A capture in the coordinates of the map."""
-    offset = np.array(placed.offset)
+    offset, metres = np.array(placed.offset), placed.metres_per_unit
+    if metres is None and (axes := known_axes(placed.crs)) is not None:
+        metres = axes.metres
     shots = []
     for shot in capture.shots:
         pose = shot.pose.copy()
@@ -51,7 +65,7 @@ def on_the_map(capture: Capture, placed: Placed) -> Capture:
         capture,
         shots=shots,
         xyz=capture.xyz + offset,
-        metres=placed.metres_per_unit,
+        metres=metres,
         crs=placed.crs,
         shift=placed.offset if any(placed.offset) else capture.shift,
     )

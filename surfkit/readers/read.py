@@ -23,8 +23,9 @@ from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, lens_of, pinhole_of, undistort
 from surfkit.scene.camera import Camera
+from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
-from surfkit.scene.names import PICTURES
+from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size
 from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
@@ -130,12 +131,27 @@ def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
                 f"the offset {text}, which their headers and run.json name"
             )
         )
-    return replace(frame, metres=given or capture.metres, crs=capture.crs, shift=shift)
+    return replace(frame, metres=_metres(given or capture.metres, capture.crs, frame), crs=capture.crs, shift=shift)
+
+
+def _metres(stated: float | None, crs: str | None, frame: Frame) -> float | None:
+    """Metres per unit as they were stated, or as the coordinate reference system has them; a line tells of both where
+    they contradict each other."""
+    axes = known_axes(crs) if crs else None
+    if axes is None:
+        return stated
+    try:
+        refuse_other_unit(crs, stated, frame.origin)
+    except BadInput as error:
+        emit(Warned(str(error)))
+    return axes.metres if stated is None else stated
 
 
 def reader_of(data: Data) -> Reader:
     """The reader for a data set: the one that `layout` names, or the one that recognises the folder."""
     root = data.path
+    if is_video(root):
+        raise BadInput(f"{root}: a video; {_finds_cameras(root)}")
     if not root.is_dir():
         raise BadInput(f"{root}: {'a file, not a folder' if root.exists() else 'no such folder'}; {_wanted()}")
     if not any(root.iterdir()):
@@ -150,18 +166,27 @@ def reader_of(data: Data) -> Reader:
     if not first and (photos := bare_photographs(root)):
         raise BadInput(
             f"{root}: no COLMAP model (cameras, images, points3D as .bin or .txt) in {', '.join(MODELS)}; "
-            f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, "
-            "as `surfkit train --prepare` does first"
+            f"{_finds_cameras(photos)}"
         )
     return next(iter(first.values()), COLMAP())  # which says what it lacks
 
 
+def _finds_cameras(photos: Path) -> str:
+    return (
+        f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, as `surfkit "
+        "train --prepare` does first"
+    )
+
+
 def bare_photographs(root: Path) -> Path | None:
-    """The folder of photographs, where no reader recognises `root` and it has some: its images/, or itself."""
+    """What cameras can be found of, where no reader recognises `root`: a folder that has photographs or videos, its
+    images/ or itself, or a video."""
+    if is_video(root):
+        return root
     if not root.is_dir() or _fitting(root):
         return None
     for folder in (root / "images", root):
-        if folder.is_dir() and any(path.suffix.lower() in PICTURES for path in folder.rglob("*")):
+        if folder.is_dir() and any(path.suffix.lower() in PICTURES | VIDEOS for path in folder.rglob("*")):
             return folder
     return None
 

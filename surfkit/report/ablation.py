@@ -114,6 +114,9 @@ def with_changes(table: Table, row: Row, base: Recipe) -> Recipe:
     """
     recipe = row.recipe or base
     for path, value in row.change.items():
+        if path == "test_every":
+            told = "rows of a table hold out the same photographs; leave it out, and give surfkit ablate --test-every"
+            raise BadInput(f"table:{table.name}, row {row.label!r}: test_every: {told}")
         try:
             recipe = evolve(recipe, path, value)
         except BadInput as error:

@@ -7,7 +7,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from surfkit.report.columns import COLUMNS
-from surfkit.report.table import Cell, caption, columns_of, data_name, data_sets, measured_cells, published_columns
+from surfkit.report.table import (
+    Cell,
+    blanks,
+    caption,
+    columns_of,
+    data_name,
+    data_sets,
+    measured_cells,
+    published_columns,
+)
 from surfkit.report.table import published_cells as published
 
 PACKAGES = r"% In the preamble: \usepackage{adjustbox,booktabs} and \usepackage[table]{xcolor}"
@@ -32,6 +41,8 @@ SPECIAL = {
 } | {letter: f"\\{letter}" for letter in "&%$#_{}"}
 """What LaTeX does not take as it stands, and what it takes instead."""
 SPECIAL |= {letter: rf"$\{name}$" for letter, name in zip("αβγδεηθκλμπρστφωΔΣΩ", GREEK.split(), strict=True)}
+DAGGER = r"$^\dagger$"
+"""Mark of rows that could not run as they are named."""
 ARROWS = {"higher": r"$\uparrow$", "lower": r"$\downarrow$"}
 
 
@@ -58,7 +69,8 @@ def latex(report: Mapping[str, Any]) -> str:
             ]
         cells = [_cell(cell) for _, _, group in groups for cell in group[at]]
         grey = r"\rowcolor{gray!20} " if row["given_up"] else ""
-        body.append(grey + " & ".join([escape(row["label"]), *cells]) + r" \\")
+        mark = DAGGER if any(entry["rows"][at].get("not_as_named") for entry in entries) else ""
+        body.append(grey + " & ".join([escape(row["label"]) + mark, *cells]) + r" \\")
     return "\n".join(
         [
             PACKAGES,
@@ -75,6 +87,7 @@ def latex(report: Mapping[str, Any]) -> str:
             r"\bottomrule",
             r"\end{tabular}",
             r"\end{adjustbox}",
+            *(rf"\par\smallskip {{\footnotesize {DAGGER} {escape(text)}.}}" for text in blanks(report)),
             r"\end{table}",
             "",
         ]

@@ -35,6 +35,11 @@ def _wants_maps(trial: Trial) -> bool:
     return trial.recipe.depth is None and Run(trial.folder, trial.recipe, trial.data).wants_priors
 
 
+def lacked_maps(trial: Trial) -> bool:
+    """Whether a run was to learn from depth maps, and had none, so that it is not what its row is named after."""
+    return _wants_maps(trial) and any(OFF in note for note in read_record(trial.folder).get("notes", []))
+
+
 def notes_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     """Plain data of each note in the records of some runs, stated once: its "text", and the "rows" with such a run.
 

@@ -10,7 +10,7 @@ from typing import Any
 from surfkit.report.columns import COLUMNS
 from surfkit.report.table import data_name, data_sets
 
-HEAD = ("table", "data", "number", "row", "built_on", "kept", "seed", "folder", *COLUMNS, "failed")
+HEAD = ("table", "data", "number", "row", "built_on", "kept", "seed", "folder", *COLUMNS, "failed", "not_as_named")
 
 
 def comma_separated(report: Mapping[str, Any]) -> str:
@@ -28,6 +28,7 @@ def comma_separated(report: Mapping[str, Any]) -> str:
                 "built_on": row["built_on"] or "",
                 "kept": str(row["kept"]).lower(),
                 "failed": row["failed"] or "",
+                "not_as_named": row.get("not_as_named") or "",
             }
             for run in row["runs"] or [{}]:
                 writer.writerow(facts | {name: run[name] for name in HEAD if name in run})

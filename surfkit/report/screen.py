@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,6 +14,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from surfkit.core.check import printable
+from surfkit.core.events import say
 from surfkit.report.columns import COLUMNS
 from surfkit.report.rows import Outcome, Trial
 from surfkit.report.table import drawing
@@ -54,13 +55,13 @@ class Screen:
         if self.live is None:
             say(f"{self.heading}, in {trial.folder}")
         else:
-            self.draw(Text(self.heading))
+            self.draw(Text(printable(self.heading)))
 
     def progress(self, stage: str, index: int, steps: int, line: str) -> None:
         """Show how far the run at hand is."""
         bar = Table.grid(padding=(0, 2, 0, 0))
         bar.add_row(stage, ProgressBar(steps, index, width=20), line)
-        self.draw(Group(Text(self.heading), bar))
+        self.draw(Group(Text(printable(self.heading)), bar))
 
     def end(self, trial: Trial, outcome: Outcome, report: Mapping[str, Any]) -> None:
         """See `Watch.end`."""
@@ -76,8 +77,3 @@ class Screen:
         """Show the table with something below it."""
         assert self.live is not None
         self.live.update(Group(drawing(self.report, self.label), Text(), below), refresh=True)
-
-
-def say(text: str) -> None:
-    """Tell the person who watches; above the live table, where there is one."""
-    print(text, file=sys.stderr)

@@ -26,7 +26,7 @@ from surfkit.report.ablation import Table, build, limit_points, pick, scaled
 from surfkit.report.columns import refuse_unknown_columns
 from surfkit.report.compare import compare
 from surfkit.report.latex import latex
-from surfkit.report.notes import notes_of
+from surfkit.report.notes import lacked_maps, notes_of
 from surfkit.report.perceptual import refuse_unmeasurable
 from surfkit.report.rows import Outcome, Trial, Work, attempt, finished, run_elsewhere
 from surfkit.report.runs_csv import comma_separated
@@ -41,6 +41,8 @@ from surfkit.run.store import StageStore
 
 FORMS = {"md": markdown, "tex": latex, "csv": comma_separated}
 """What a table is written as beside JSON, by the ending of the file."""
+NO_MAPS = "there was no depth map to learn from, so the run is that of a row without"
+"""Why a row has no figures although it was run."""
 STORE = "stages"
 """Folder of the stages that rows share, in that of the table."""
 
@@ -224,7 +226,7 @@ def trials(plan: Plan) -> list[Trial]:
         for data, truth in plan.sets:
             for label, recipe in recipes.items():
                 seeded = replace(recipe, seed=recipe.seed + at)
-                folder = plan.out / "runs" / fingerprint(seeded, data)
+                folder = run_folder(plan.out / "runs", seeded, data)
                 found.append(Trial(label, seeded.seed, seeded, folder, data, truth))
     return found
 
@@ -258,12 +260,24 @@ def unfinished(plan: Plan) -> list[Trial]:
     return list(first.values())
 
 
-def fingerprint(recipe: Recipe, data: Data) -> str:
-    """Twelve hex digits that two runs share if they are made from the same: recipe, data, and versions of the code."""
+def run_folder(runs: Path, recipe: Recipe, data: Data) -> Path:
+    """The folder of a run; if there is one that was named by all installed plugins, as runs were before, that one."""
+    now, before = (runs / fingerprint(recipe, data, code) for code in (versions(recipe), versions()))
+    return before if before.exists() and not now.exists() else now
+
+
+def fingerprint(recipe: Recipe, data: Data, code: Mapping[str, str]) -> str:
+    """Twelve hex digits that two runs share if they are made from the same.
+
+    Args:
+        recipe: What was done.
+        data: What it was done with.
+        code: Versions of the packages that did it: surfkit, and the plugins whose parts are in the recipe.
+    """
     parts = {
-        "recipe": dump(replace(recipe, about="")),
+        "recipe": {name: it for name, it in dump(replace(recipe, about="")).items() if name != "test_every"},
         "data": dump(replace(data, path=data.path.resolve())),
-        "versions": versions(),
+        "versions": dict(code),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]
 
@@ -339,14 +353,26 @@ def rows_of(plan: Plan, every: Sequence[Trial], outcomes: Mapping[Path, Outcome]
     known = [(trial, outcomes[trial.folder]) for trial in every if trial.folder in outcomes]
     measured: dict[str, dict[int, Mapping[str, float]]] = {}
     failed: dict[str, str] = {}
+    other: dict[str, str] = {}
     runs: dict[str, list[dict[str, Any]]] = {}
     for trial, outcome in known:
         if outcome.failed is not None:
             failed.setdefault(trial.label, f"seed {trial.seed}: {outcome.failed}")
         if outcome.figures is None:
             continue
-        measured.setdefault(trial.label, {})[trial.seed] = outcome.figures
+        found = outcome.figures
+        if lacked_maps(trial):
+            found, other[trial.label] = {}, NO_MAPS
+        else:
+            measured.setdefault(trial.label, {})[trial.seed] = found
         folder = trial.folder.relative_to(plan.out).as_posix()
-        runs.setdefault(trial.label, []).append({"seed": trial.seed, "folder": folder, **outcome.figures})
-    rows = compare(plan.table, measured)
-    return [row | {"runs": runs.get(row["label"], []), "failed": failed.get(row["label"])} for row in rows]
+        runs.setdefault(trial.label, []).append({"seed": trial.seed, "folder": folder, **found})
+    return [
+        row
+        | {
+            "runs": runs.get(row["label"], []),
+            "failed": failed.get(row["label"]),
+            "not_as_named": other.get(row["label"]),
+        }
+        for row in compare(plan.table, measured)
+    ]

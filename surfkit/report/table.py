@@ -12,6 +12,7 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
+from surfkit.core.check import printable
 from surfkit.report.columns import COLUMNS, shown_columns
 from surfkit.report.notes import row_numbers
 from surfkit.report.sharing import sharing_lines
@@ -143,6 +144,7 @@ def names_of_row(report: Mapping[str, Any], at: int) -> list[str]:
     row = rows[at]
     numbers = {other["label"]: str(other["number"]) for other in rows}
     states = ["failed" if e["rows"][at]["failed"] else f"{len(e['rows'][at]['runs'])}/{seeds}" for e in entries]
+    states = ["blank" if e["rows"][at].get("not_as_named") else s for e, s in zip(entries, states, strict=True)]
     label = f"({row['label']})" if row["given_up"] else row["label"]
     return [str(row["number"]), label, numbers.get(row["built_on"], ""), ", ".join(states)]
 
@@ -157,6 +159,16 @@ def failures(report: Mapping[str, Any]) -> list[str]:
         for row in entry["rows"]
         if row["failed"]
     ]
+
+
+def blanks(report: Mapping[str, Any]) -> list[str]:
+    """A line for each reason why rows that were run have no figures, with these rows."""
+    found: dict[str, list[str]] = {}
+    for entry in data_sets(report):
+        for row in entry["rows"]:
+            if row.get("not_as_named") and row["label"] not in found.setdefault(row["not_as_named"], []):
+                found[row["not_as_named"]].append(row["label"])
+    return [f"not run as named, and blank: {', '.join(labels)}: {reason}" for reason, labels in found.items()]
 
 
 def note_lines(report: Mapping[str, Any]) -> list[str]:
@@ -191,7 +203,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     for row, data in zip(rows, entries[0]["rows"], strict=True):
         body += [["", f"*{data['group']}*", *[""] * (len(head) - 2)]] * bool(data["group"]) + [row]
     table = ["| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in body]
-    told = [f"- {text}" for text in (*failures(report), *note_lines(report), *sharing_lines(report))]
+    told = [f"- {text}" for text in (*failures(report), *blanks(report), *note_lines(report), *sharing_lines(report))]
     page = [f"# table:{report['table']}", caption(report), "\n".join(table), LEGEND, "\n".join(told)]
     return "\n\n".join(part for part in page if part) + "\n"
 
@@ -212,18 +224,20 @@ def drawing(report: Mapping[str, Any], running: str | None = None) -> Table:
     below = published_cells(rows, names if len(entries) == 1 else beside)
     table = Table(box=None, header_style="bold", padding=(0, 2, 0, 0))
     for head in ("", "row", "on", "seeds", *_heads(entries, names), *(f"{COLUMNS[n].head}\npaper" for n in beside)):
-        table.add_column(head, justify="left" if head == "row" else "right", no_wrap=head != "row")
+        table.add_column(
+            Text(printable(head, lines=True)), justify="left" if head == "row" else "right", no_wrap=head != "row"
+        )
     for at, row in enumerate(rows):
         failed = any(entry["rows"][at]["failed"] for entry in entries)
         style = "red" if failed else "bold" if row["label"] == running else "dim" if row["given_up"] else ""
         if row["group"]:
-            table.add_row("", Text(row["group"], "italic"))
+            table.add_row("", Text(printable(row["group"]), "italic"))
         number, label, on, seeds = names_of_row(report, at)
         label = f"> {label}" if row["label"] == running else label
         stacked = below[at] if len(entries) == 1 else [Cell()] * len(names)
         cells = [_stacked(cell, *pair, style) for group in own for cell, *pair in zip(group[at], stacked, strict=True)]
         extra = [Text(_two_lines(cell), "dim") for cell in (below[at] if beside else ())]
-        table.add_row(number, Text(label, style), on, seeds, *cells, *extra)
+        table.add_row(number, Text(printable(label), style), on, seeds, *cells, *extra)
     return table
 
 

@@ -15,9 +15,9 @@ from surfkit.evaluate.geometry.measure import measure_geometry
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.pipeline import loaded, mesh, opened
 from surfkit.raster.select import Device
-from surfkit.readers.read import read
 from surfkit.run.folder import Run, note_metrics
 from surfkit.run.measure import note_compressed
+from surfkit.run.resume import read_unchanged
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Truth:
         shown = run if run.recipe.compress is None else mesh_of_compressed(run, device)
         if not shown.mesh_record.exists():
             raise BadInput(f"{shown.out}: no mesh that could be compared with {self.path}")
-        crop, scene = self.crop(out), read(run.data)
+        crop, scene = self.crop(out), read_unchanged(run)
         settings = replace(self.settings, crop=str(crop)) if crop.exists() else self.settings
         files = (shown.mesh, self.path)
         found = measure_geometry(files, settings, shown.out / "geometry", scene.train, scene.frame)

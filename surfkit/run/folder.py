@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few
 from surfkit.core.codec import load, read_json, write_json
 from surfkit.core.events import FileWritten, emit
+from surfkit.execute.base import LOG
 from surfkit.primitives.base import Primitive
 from surfkit.readers.data import Data
 from surfkit.recipe import Recipe
@@ -22,6 +26,8 @@ SHARED = "shared.json"
 FILES = ("recipe.json", "run.json", "inputs.json", "events.jsonl", "metrics.json", "point_cloud.ply", SHARED)
 """In a run folder."""
 FOLDERS = ("pretrain", "partition", "tune", "blocks", "pictures", "progress", "method", "result", "lod", "compressed")
+MESHES = ("mesh.ply", "mesh.obj", "mesh.glb")
+"""Files of meshes in a run folder; others begin with `mesh-lod`."""
 
 
 @dataclass(frozen=True)
@@ -242,6 +248,43 @@ def refuse_file(out: Path) -> None:
     for path in [*(out / name for name in FOLDERS), *out.glob("refine[0-9]")]:
         if path.is_file():
             raise BadInput(f"{path}: a file, where the run keeps a folder; delete it")
+    refuse_links(out)
+
+
+def refuse_foreign(out: Path) -> None:
+    """BadInput if a folder that holds no run has files of the names that a run would give to its own."""
+    if (out / "run.json").exists():  # the first that a run writes
+        return
+    names = (*FILES, "cameras.json", "mesh.json", *MESHES)
+    if foreign := [name for name in names if (out / name).exists()]:
+        raise BadInput(
+            f"--out {out}: no run folder (no run.json in it), but it has {few(foreign)}, which would be replaced; name "
+            "another folder"
+        )
+
+
+def refuse_links(out: Path) -> None:
+    """BadInput if a run would write or delete outside of its folder, as something in it is a link to elsewhere.
+
+    Of files, only those count that are written to in place; for others, a new file takes the place of a link.
+    """
+    for path in _links(out):
+        in_place = path.is_dir() or path.name in (journal.NAME, LOG) or path.is_relative_to(out / "method")
+        if in_place and not path.resolve().is_relative_to(out.resolve()):
+            raise BadInput(
+                f"{path}: a link out of the run folder, to {path.resolve()}, where nothing is written or deleted; "
+                "put a folder or file in its place, or keep the whole run folder elsewhere"
+            )
+
+
+def _links(folder: Path) -> Iterator[Path]:
+    """All links in a folder and in those inside; none is followed."""
+    with suppress(FileNotFoundError), os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                yield Path(entry.path)
+            elif entry.is_dir():
+                yield from _links(Path(entry.path))
 
 
 def refuse_no_run(out: Path) -> None:

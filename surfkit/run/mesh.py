@@ -38,6 +38,8 @@ SHOWN = 4
 """Training views that pictures are made of."""
 LONGEST = 800
 """Side of a picture, pixels."""
+SUFFIXES = (".ply", ".obj", ".mtl", ".glb", ".json")
+"""Of files that belong to a mesh."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +222,8 @@ def delete_meshes(run: Run) -> set[str]:
     """Delete the files of an earlier mesh, its record first, and what was measured of it; their names."""
     run.mesh_record.unlink(missing_ok=True)
     forget_geometry(run)
-    found = {*run.out.glob("mesh.*"), *run.out.glob("mesh-lod*")}
+    there = (*run.out.glob("mesh.*"), *run.out.glob("mesh-lod[0-9]*"))
+    found = {path for path in there if path.suffix in SUFFIXES}  # others are not ours
     for path in (*found, *run.mesh_pictures.rglob("*.png")):
         path.unlink(missing_ok=True)
     return {path.name for path in found}

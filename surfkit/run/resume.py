@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import platform
-from dataclasses import replace
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
@@ -20,10 +22,15 @@ from surfkit.core.version import own_version
 from surfkit.readers.depth_prior import prior_files
 from surfkit.readers.fingerprint import Fingerprint, changed, changed_file, fingerprint
 from surfkit.readers.made_maps import is_there, located, read_made
+from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run, read_data, read_record
 from surfkit.run.notes import Notes
 from surfkit.scene.scene import Frame, Scene
+
+PUT_BACK = "put them back"
+SAME_PLACE = 1e-6
+"""Cameras that have moved by less, in extents of the scene, have not: programs round the last digits."""
 
 
 def refuse_other_run(run: Run) -> None:
@@ -32,7 +39,7 @@ def refuse_other_run(run: Run) -> None:
     now = dump(run.recipe)
     other = [name for name in ("mesh", "lod", "compress") if isinstance(there, dict) and there.get(name) != now[name]]
     if isinstance(there, dict):
-        there |= {name: now[name] for name in ("mesh", "lod", "compress")}  # training is the same
+        there |= {name: now[name] for name in ("mesh", "lod", "compress", "test_every")}  # training is the same
         before = there.get("refine")
         prefix = isinstance(before, list) and first_difference(before, now["refine"][: len(before)]) is None
         if prefix and there.get("pretrain") == now["pretrain"]:
@@ -137,11 +144,94 @@ def compared_data(run: Run, scene: Scene, skipped: set[str]) -> tuple[Fingerprin
         return now, None
     if (path := changed_file(before, now)) is not None:
         return now, f"{path} has changed since the run began; put the old file back"
-    if found := [text for text in changed(before, now) if text.name not in skipped]:
-        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-        where = f"the data in {run.data.path} are not those that the run began with"
-        return now, f"{where}: {found[0].what}{more}; put them back"
+    if (what := _difference(run, scene, before, now, skipped)) is not None:
+        return now, f"the data in {run.data.path} are not those that the run began with: {what}; {PUT_BACK}"
     return now, None
+
+
+def read_unchanged(run: Run) -> Scene:
+    """The data set of a run, to make something of it and of what the run has come to.
+
+    Files that the recipe names are not looked at: the run has taken from them what it needs. Runs of versions that kept
+    no fingerprint are not compared.
+
+    Raises:
+        BadInput: The data set is gone, or not what the run was trained on: cameras and photographs of now would be put
+            beside results of before.
+    """
+    scene, what = _read_compared(run)
+    if what is not None:
+        raise BadInput(f"{what}; {PUT_BACK}, or train on the data of now in another folder")
+    return scene
+
+
+def read_noting_changes(run: Run) -> Scene:
+    """The data set of a run, to look at: a note says what is not as it was when the run was trained."""
+    scene, what = _read_compared(run)
+    if what is not None:
+        emit(Warned(f"{what}; what is shown of the data set need not fit the model"))
+    return scene
+
+
+def _read_compared(run: Run) -> tuple[Scene, str | None]:
+    """The data set of a run, and a sentence on what has changed in it since the run was trained; None if nothing has.
+
+    Raises:
+        BadInput: The data set is gone, or cannot be read.
+    """
+    if not run.data.path.exists():
+        raise BadInput(
+            f"{run.out}: its data set {run.data.path} is not there; put it back, or a link there to where it is now"
+        )
+    scene = read(run.data)
+    if not run.inputs.exists():
+        return scene, None
+    before = read_json(run.inputs, Fingerprint)
+    record = read_record(run.out)
+    is_own = run.needs_priors and run.data.priors is None  # it was trained on maps of the data set, not on made ones
+    now = fingerprint(scene, before, prior_files(run.data, scene) if is_own else None)
+    what = _difference(run, scene, before, now, record.get("skipped", ()))
+    if what is None:
+        return scene, None
+    text = f"{run.out}: the data in {run.data.path} have changed since the run was trained: {what}"
+    versions = record.get("versions")
+    trained_by = versions.get("surfkit") if isinstance(versions, dict) else None
+    if trained_by not in (None, own_version()):
+        text += f" (or surfkit {own_version()} reads them otherwise than {trained_by}, which trained the run)"
+    return scene, text
+
+
+def _difference(run: Run, scene: Scene, before: Fingerprint, now: Fingerprint, skipped: Collection[str]) -> str | None:
+    """The first difference between the data of a run and those of now in words, and how many more there are."""
+    found = [change.what for change in changed(before, now) if change.name not in skipped]
+    if not found and (moved := _moved(run, scene.frame)) is not None:
+        found = [moved]
+    if not found:
+        return None
+    return found[0] + (f" and {len(found) - 1} more" if len(found) > 1 else "")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the local frame of a run lies, as run.json has it; see `Frame`."""
+
+    origin: tuple[float, float, float]
+    scale: float
+
+
+def _moved(run: Run, frame: Frame) -> str | None:
+    """What has become of the coordinates of a data set: fingerprints are of the local frame, which moves with them."""
+    known = read_record(run.out).get("frame")
+    if not isinstance(known, dict):  # older runs
+        return None
+    place = load(Place, {name: known.get(name) for name in ("origin", "scale")}, f"{run.record}: frame")
+    moved = float(np.abs(np.subtract(place.origin, frame.origin)).max()) * frame.scale
+    if moved <= SAME_PLACE and abs(place.scale / frame.scale - 1) <= SAME_PLACE:
+        return None
+    then, here = (" ".join(f"{value:.9g}" for value in origin) for origin in (place.origin, frame.origin))
+    sizes = f"{1 / place.scale:.6g}", f"{1 / frame.scale:.6g}"
+    grown = f", and the extent of the scene {sizes[0]} and is {sizes[1]}" if sizes[0] != sizes[1] else ""
+    return f"the reconstruction has other coordinates: the middle of its cameras was {then} and is {here}{grown}"
 
 
 def write_run_files(run: Run, backend: str, prints: Fingerprint, notes: Notes, frame: Frame) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ SOURCES = (".py", ".cu", ".cpp", ".h", ".so")
 """Endings of files with code of a plugin."""
 PLAN, TUNE = ("partition", "assign", "min_views", "partition_pretrain"), ("tune", "context")
 """Fields of the recipe that belong to the plan of the blocks, and to tuning them."""
-OTHERS = ("about", "depth", "refine", "mesh", "lod", "compress")
+OTHERS = ("about", "test_every", "depth", "refine", "mesh", "lod", "compress")
 """Fields with parts of their own, and those that count only where depth maps are looked at, or never."""
 
 
@@ -119,14 +119,35 @@ def part_keys(recipe: Recipe, inputs: Callable[[bool], Any] = lambda needs_prior
     return found
 
 
-def versions() -> dict[str, str]:
-    """Of surfkit and of the installed plugins that offer parts of recipes.
+def versions(recipe: Recipe | None = None) -> dict[str, str]:
+    """Of surfkit and of the installed plugins: those whose classes a recipe is made of, or all that offer parts.
 
     Those of plugins end with a digest of their source files: whoever writes one changes the code more often than the
     version, and finished runs of the old code must not stand for the new.
     """
-    offering = [plugin for plugin in records() if plugin.distribution and "surfkit_components" in plugin.hooks]
-    return dict(sorted((each.distribution, f"{each.version}{_source_tag(each.name)}") for each in offering))
+    if recipe is None:
+        counted = [plugin for plugin in records() if plugin.distribution and "surfkit_components" in plugin.hooks]
+    else:
+        used = set(packages(recipe))
+        counted = [plugin for plugin in records() if plugin.distribution and _package(plugin.name) in used]
+    return dict(sorted((each.distribution, f"{each.version}{_source_tag(each.name)}") for each in counted))
+
+
+def packages(value: Any) -> Iterator[str]:
+    """Names of the packages that the classes of a value come from, and of its fields and elements at any depth."""
+    if is_dataclass(value) and not isinstance(value, type):
+        yield from (cls.__module__.partition(".")[0] for cls in type(value).__mro__)
+        inner: Iterable[Any] = (getattr(value, each.name) for each in fields(value))
+    else:
+        inner = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else ()
+    for each in inner:
+        yield from packages(each)
+
+
+def _package(name: str) -> str:
+    """The package that a plugin lies in."""
+    module = inspect.getmodule(plugins().get_plugin(name))
+    return "" if module is None else module.__name__.partition(".")[0]
 
 
 def _source_tag(name: str) -> str:
@@ -158,7 +179,7 @@ def inputs_of(run: Run, backend: str, prints: Fingerprint) -> Callable[[bool], A
             beside = {what: _content(known.beside[what]) for what in known.beside if what == "mask" or needs_prior}
             photographs[name] = [known.camera, known.size, known.content, known.held_out, beside]
         return {
-            "versions": versions() | {"torch": torch.__version__},
+            "versions": versions(run.recipe) | {"torch": torch.__version__},
             "rasterizer": backend,
             "data": dump(load(Data, dump(replace(run.data, priors=None)))),
             "maps": run.data.priors.name if needs_prior and run.data.priors is not None else None,

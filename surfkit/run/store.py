@@ -12,7 +12,7 @@ from pathlib import Path
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.files import DISK_FULL, sweep, sync_folder
+from surfkit.core.files import DISK_FULL, being_written, remove, sweep, sync_folder
 from surfkit.run import journal
 
 RECORD = "entry.json"
@@ -61,8 +61,8 @@ class StageStore:
         home = self.folder / key
         if home.exists():
             return
-        part = self.folder / f".{key}.{os.getpid()}.part"
-        shutil.rmtree(part, ignore_errors=True)
+        part = being_written(home)
+        remove(part)
         try:
             for name in names:
                 place(out, part, name)
@@ -73,7 +73,7 @@ class StageStore:
             if not home.exists():  # else another process was faster
                 raise
         finally:
-            shutil.rmtree(part, ignore_errors=True)
+            remove(part)
 
     def find(self, key: str) -> Entry | None:
         """The entry of a key, if it is whole; one that is damaged is deleted, with a warning."""
@@ -89,7 +89,7 @@ class StageStore:
         if why is None:
             return found
         emit(Warned(f"a stored stage is damaged and is computed again: {why}"))
-        shutil.rmtree(home, ignore_errors=True)
+        remove(home)
         return None
 
     def sweep(self) -> None:
@@ -108,7 +108,7 @@ def place(source: Path, target: Path, name: str) -> None:
     """
     path = target / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = being_written(path)
     part.unlink(missing_ok=True)
     try:
         if is_changed_in_place(name) or not linked(source / name, part):

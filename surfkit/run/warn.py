@@ -8,6 +8,11 @@ from surfkit.run.folder import Run
 from surfkit.scene.scene import Scene
 from surfkit.train.state import StageState
 
+NONE_HELD_OUT = (
+    "no photograph is held out (kept from training), so PSNR, SSIM and LPIPS cannot be measured; a run trained with "
+    "--test-every 8 keeps every 8th to measure with"
+)
+
 
 def warn_of_no_edits(run: Run, scene: Scene) -> None:
     """Say which stages cannot add a point, or never remove one by its worth, though they are to."""
@@ -31,4 +36,22 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
 def warn_of_gaps(scene: Scene, state: StageState | None) -> None:
     """Say what the data does not allow."""
     if state is None and not scene.held_out:
-        emit(Warned("no photograph is kept from training, so the quality cannot be measured; see --test-every"))
+        emit(Warned(NONE_HELD_OUT))
+
+
+def note_held_out(run: Run, scene: Scene) -> None:
+    """Say how many photographs what is made of a run is without, and how to use all."""
+    if not scene.held_out:
+        return
+    count, data = len(scene.held_out), run.data
+    given = {"--split": data.split, "--test-list": data.test_list, "--test-data": data.test_data}
+    rule = next((option for option, value in given.items() if value is not None), None)
+    names = sorted(view.name for view in (*scene.train, *scene.held_out))
+    if rule is not None:
+        how = f"{rule} names them"
+    elif {view.name for view in scene.held_out} == set(names[:: data.test_every or len(names)]):
+        how = "a run trained with --test-every 0 uses all"
+    else:
+        how = "the data set itself names them for tests"
+    text = f"{count} of {len(names)} photographs were held out: not trained on, but kept to measure with"
+    emit(Warned(f"{text}; places that only they show are missing or poor; {how}"))

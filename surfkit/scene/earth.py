@@ -1,18 +1,34 @@
 """Where on Earth the coordinates of a map lie, on WGS 84: what viewers of the globe need.
 
 UTM and topocentric frames, which the readers make, are computed here; any other coordinate reference system by pyproj.
+Heights are above what the vertical part of the system says; without one, above the ellipsoid of its datum.
 """
 
 from __future__ import annotations
 
 import math
-import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput
-from surfkit.core.optional import needed
+from surfkit.scene.crs import (
+    COARSE_M,
+    DEGREES,
+    TOPOCENTRIC,
+    UTM,
+    axes_of,
+    degrees_of,
+    exact,
+    is_plain,
+    missing,
+    not_installed,
+    parsed,
+    used_beyond,
+)  # fmt: skip
+from surfkit.scene.geoid import Geoid
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis, metres, and flattening."""
@@ -22,9 +38,10 @@ STEP_M = 100.0
 """Over which the directions of the axes are measured."""
 UNEVEN = 0.01
 """Most that the units of the axes differ by, as a share, in coordinates that are lengths."""
-NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
-TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+lon_0={NUMBER} \+h_0={NUMBER}")
-UTM = re.compile(r"EPSG:32([67])(\d\d)", re.IGNORECASE)
+EARTH, HEIGHTS = "EPSG:4978", "EPSG:4979"
+"""WGS 84: metres from the centre of the Earth; degrees and metres above the ellipsoid."""
+Convert = Callable[[np.ndarray], np.ndarray]
+"""(P, 3) metres from the centre of the Earth (EPSG:4978), of (P, 3) easting, northing and height."""
 
 
 @dataclass(frozen=True)
@@ -35,59 +52,105 @@ class Site:
         crs: The coordinate reference system.
         pose: (4, 4) float64, a rotation and a translation: from the site to ECEF, EPSG:4978.
         unit: Metres per unit of the coordinate reference system there.
+        convert: From coordinates to ECEF.
+        notes: What the user is to know of the place, a line each.
     """
 
     crs: str
     pose: np.ndarray
     unit: float
+    convert: Convert
+    notes: tuple[str, ...] = ()
 
     @classmethod
-    def at(cls, crs: str, origin: np.ndarray) -> Site:
+    def at(cls, crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> Site:
         """The site of a place.
 
         Args:
             crs: Coordinate reference system, such as "EPSG:32632".
             origin: (3,) easting, northing and height.
+            geoid: What heights are above; None leaves it to the system.
 
         Raises:
-            BadInput: Its coordinates are no lengths, or pyproj is needed and not installed, or does not know it.
+            BadInput: Its coordinates are no lengths of one unit, or the shift from its datum to WGS 84 is not known, or
+                pyproj is needed and not installed, or does not know it.
         """
-        steps = STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
-        around = to_ecef(crs, origin + steps)
-        axes = ((around[:3] - around[3:]) / (2 * STEP_M)).T
+        metres = axes_of(crs).metres
+        convert, notes = on_earth(crs, origin, geoid)
+        steps = STEP_M / metres * np.concatenate([np.eye(3), -np.eye(3)])
+        around = convert(origin + steps)
+        axes = ((around[:3] - around[3:]) / (2 * STEP_M / metres)).T
         units = np.linalg.norm(axes, axis=0)
-        if not (np.isfinite(units).all() and units.max() * (1 - UNEVEN) <= units.min() and np.linalg.det(axes) > 0):
-            shown = " ".join(f"{value:.15g}" for value in origin)
-            feet = "; name heights in feet too, such as EPSG:2263+6360" if 0.3 < units[0] < 0.31 else ""
-            raise BadInput(f"{crs} at {shown}: its axes are not east, north and up in one unit of length{feet}")
+        shown = " ".join(f"{value:.15g}" for value in origin)
+        if not (np.isfinite(units).all() and np.linalg.det(axes) > 0):
+            raise BadInput(f"{crs} at {shown}: its axes are not east, north and up there; name the system of the place")
+        if not units.max() * (1 - UNEVEN) <= units.min():
+            raise BadInput(
+                f"{crs} at {shown}: 1 m to the east or north is {metres / units[:2].min():.4g} to "
+                f"{metres / units[:2].max():.4g} m on the map, and 1 m of height is {metres / units[2]:.4g}; "
+                "convert the cameras to a system that keeps lengths there, such as UTM"
+            )
         up = axes[:, 2] / units[2]
         east = axes[:, 0] - up * (up @ axes[:, 0])
         east /= np.linalg.norm(east)
         pose = np.eye(4)
-        pose[:3] = np.stack([east, np.cross(up, east), up, to_ecef(crs, origin[None])[0]], axis=1)
-        return cls(crs, pose, float(np.prod(units) ** (1 / 3)))
+        pose[:3] = np.stack([east, np.cross(up, east), up, convert(origin[None])[0]], axis=1)
+        return cls(crs, pose, float(np.prod(units) ** (1 / 3)), convert, notes)
 
     def local(self, xyz: np.ndarray) -> np.ndarray:
         """(P, 3) float64 metres about the site, of coordinates: the Earth is as round there as it is."""
-        return (to_ecef(self.crs, xyz) - self.pose[:3, 3]) @ self.pose[:3, :3]
+        return (self.convert(xyz) - self.pose[:3, 3]) @ self.pose[:3, :3]
 
 
-def to_ecef(crs: str, xyz: np.ndarray) -> np.ndarray:
-    """(P, 3) float64 metres from the centre of the Earth (EPSG:4978), of easting, northing and height.
+def to_ecef(crs: str, xyz: np.ndarray, geoid: Geoid | None = None) -> np.ndarray:
+    """(P, 3) float64 metres from the centre of the Earth (EPSG:4978), of coordinates; see `on_earth`."""
+    xyz = np.asarray(xyz, np.float64)
+    return on_earth(crs, xyz.mean(0), geoid)[0](xyz)
 
-    Heights are taken as above the ellipsoid, unless the coordinate reference system says otherwise to pyproj.
+
+def on_earth(crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> tuple[Convert, tuple[str, ...]]:
+    """What converts coordinates to ECEF, and what the user is to know of it.
+
+    Args:
+        crs: Of easting and northing.
+        origin: (3,) a place near the coordinates: which transformation is best depends on it.
+        geoid: What heights are above, whatever the system says. None: what its vertical part says, and without one the
+            ellipsoid of its datum.
 
     Raises:
-        BadInput: pyproj is needed and not installed, or does not know the coordinate reference system.
+        BadInput: The shift from its datum to WGS 84 is not known there, or pyproj is needed and not installed, or does
+            not know the system.
     """
-    xyz = np.asarray(xyz, np.float64)
-    if (found := UTM.fullmatch(crs)) and 1 <= int(found[2]) <= 60:
-        latitude, longitude = from_utm(xyz[:, 0], xyz[:, 1], int(found[2]), found[1] == "7")
-        return geocentric(latitude, longitude, xyz[:, 2])
-    if found := TOPOCENTRIC.fullmatch(crs):
-        latitude, longitude, height = map(float, found.groups())
-        return geocentric(latitude, longitude, height) + xyz @ east_north_up(latitude, longitude).T
-    return _by_pyproj(crs, xyz)
+    untold = (
+        f"{crs} does not say what heights are above: they are taken as above the ellipsoid of its datum; where they "
+        "are above sea level, give the geoid with --geoid FILE or METRES",
+    )
+    if is_plain(crs):
+        return lambda xyz: _plainly(crs, np.asarray(xyz, np.float64), geoid), () if geoid else untold
+    axes, given = axes_of(crs), parsed(crs)
+    notes: tuple[str, ...] = ()
+    if geoid is None:
+        unit, whole = 1.0, given
+        if axes.height_metres is None:
+            unit, whole, notes = axes.metres, given.to_3d(), untold
+        known = exact(whole, EARTH)
+        if known is not None:
+            said = _refused_or_told(crs, known, whole, origin * [1, 1, unit])
+            return lambda xyz: _transformed(crs, known, np.asarray(xyz, np.float64) * [1, 1, unit]), (*notes, *said)
+    flat = given.to_2d()
+    plan = exact(flat, DEGREES)
+    said = _refused_or_told(crs, plan, flat, origin[:2])
+    if geoid is None:
+        notes = (_without_grid(crs, given, origin),)
+    metres = axes.height_metres or axes.metres
+
+    def convert(xyz: np.ndarray) -> np.ndarray:
+        xyz = np.asarray(xyz, np.float64)
+        longitude, latitude = _transformed(crs, plan, xyz[:, :2]).T
+        above = 0.0 if geoid is None else geoid(latitude, longitude)
+        return geocentric(latitude, longitude, xyz[:, 2] * metres + above)
+
+    return convert, (*notes, *said)
 
 
 def geocentric(latitude: np.ndarray | float, longitude: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
@@ -155,19 +218,53 @@ def _third_flattening() -> tuple[float, float]:
     return n, AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
 
 
-def _by_pyproj(crs: str, xyz: np.ndarray) -> np.ndarray:
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import ProjError
-    try:
-        given = CRS(crs)
-        if given.is_geographic:
-            raise BadInput(f"{crs}: it is in degrees, where lengths belong; name a projected one, such as EPSG:32633")
-        known = Transformer.from_crs(given.to_3d(), "EPSG:4978", always_xy=True)
-        found = np.stack(known.transform(*xyz.T), axis=1)
-    except ProjError as error:
-        said = " ".join(str(error).split())[:200]
-        raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place it on Earth: {said}") from error
+def _plainly(crs: str, xyz: np.ndarray, geoid: Geoid | None) -> np.ndarray:
+    """ECEF of coordinates of UTM on WGS 84, or of a topocentric frame."""
+    if found := UTM.fullmatch(crs):
+        latitude, longitude = from_utm(xyz[:, 0], xyz[:, 1], int(found[2]), found[1] == "7")
+        above = 0.0 if geoid is None else geoid(latitude, longitude)
+        return geocentric(latitude, longitude, xyz[:, 2] + above)
+    latitude, longitude, height = map(float, TOPOCENTRIC.fullmatch(crs).groups())
+    if geoid is not None:
+        height += geoid(np.array([latitude]), np.array([longitude]))[0]
+    return geocentric(latitude, longitude, height) + xyz @ east_north_up(latitude, longitude).T
+
+
+def _transformed(crs: str, known: Any, places: np.ndarray) -> np.ndarray:
+    """(P, n) what a transformer of pyproj makes of (P, n) coordinates."""
+    found = np.stack(known.transform(*places.T), axis=1)
     if not np.isfinite(found).all():
         raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place some of the coordinates on Earth")
     return found
+
+
+def _refused_or_told(crs: str, known: Any, source: Any, place: np.ndarray) -> tuple[str, ...]:
+    """What is to be told of a transformation; BadInput where there is none for (2,) or (3,) coordinates of a place."""
+    longitude, latitude = (float(at[0]) for at in degrees_of(crs, place[None]))
+    if not np.isfinite([longitude, latitude]).all():
+        raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place some of the coordinates on Earth")
+    grids, best = missing(source, HEIGHTS if len(place) == 3 else DEGREES, longitude, latitude)
+    here, remedy = f"latitude {latitude:.4f}, longitude {longitude:.4f}", not_installed(grids) or "name another system"
+    if known is None:
+        raise BadInput(
+            f"{crs}: the shift from its datum to WGS 84 is not known at {here}; without it, places are some 100 m off: "
+            f"{remedy}"
+        )
+    _transformed(crs, known, place[None])
+    if used_beyond(known, longitude, latitude):
+        return (f"{crs} is not meant for {here}, so places on Earth may be some 100 m off: {remedy}",)
+    accuracy = known.get_last_used_operation().accuracy
+    if accuracy >= COARSE_M and 0 <= best < accuracy and grids:
+        return (f"{crs} is placed on Earth within {accuracy:g} m; for {best:g} m {not_installed(grids)}",)
+    return ()
+
+
+def _without_grid(crs: str, given: Any, origin: np.ndarray) -> str:
+    """That heights above a geoid are taken as above the ellipsoid, and what is missing."""
+    longitude, latitude = (float(at[0]) for at in degrees_of(crs, origin[None]))
+    grids, _ = missing(given, HEIGHTS, longitude, latitude)
+    why = f"{not_installed(grids)}, or" if grids else "PROJ knows no geoid for them;"
+    return (
+        f"{crs}: its heights, above sea level, are taken as above the ellipsoid, up to 100 m off: {why} give the geoid "
+        "with --geoid FILE or METRES"
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from surfkit.core.check import BadInput
+from surfkit.scene.crs import known_axes
 from surfkit.scene.scene import Frame
 
 Length = float | Literal["auto"]
@@ -14,6 +15,13 @@ def check_length(name: str, value: Length) -> None:
     """BadInput for a length that is not one."""
     if value != "auto" and not 0 < value < float("inf"):
         raise BadInput(f"{name} is {value:g}; it must be more than 0 metres, or auto")
+
+
+def unit_of(frame: Frame) -> str:
+    """What lengths in the frame of the input are called behind numbers: m, ft, US ft, km; "units" if nobody knows."""
+    if frame.crs is not None and (axes := known_axes(frame.crs)) is not None:
+        return axes.symbol
+    return "m" if frame.metres == 1 else "units"
 
 
 def to_local(value: Length, frame: Frame, where: str = "") -> float | None:

@@ -11,7 +11,11 @@ from typing import TypeVar
 from surfkit.core.events import Warned, emit
 
 T = TypeVar("T")
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"})
+HEIF = frozenset({".heic", ".heif"})
+"""Photographs of telephones, that Pillow reads with pillow-heif only."""
+PICTURES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".exr"}) | HEIF
+VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm"})
+"""Videos that frames can be taken of."""
 SPELLINGS: tuple[Callable[[PurePosixPath], str], ...] = (
     lambda path: str(path).lower(),
     lambda path: str(path).removesuffix(path.suffix).lower(),
@@ -47,6 +51,11 @@ def safe_path(name: str) -> PurePosixPath:
     own = hashlib.blake2b(name.encode(errors="surrogateescape"), digest_size=8).hexdigest()
     last = next((part for part in reversed(parts) if part not in ("", ".", "..")), "photograph")
     return PurePosixPath(OUTSIDE, own, last.replace(":", "_"))
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is that of a video, by its ending."""
+    return path.suffix.lower() in VIDEOS and path.is_file()
 
 
 def find_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:

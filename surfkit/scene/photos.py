@@ -14,9 +14,11 @@ from PIL import Image
 from torch import Tensor
 
 from surfkit.core.check import BadInput
+from surfkit.core.optional import needed
 from surfkit.scene.cache import Cache
 from surfkit.scene.copies import Copies
 from surfkit.scene.gate import Gate
+from surfkit.scene.names import HEIF
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
@@ -126,6 +128,13 @@ def read_draft(path: Path, longest: int) -> np.ndarray:
     return open_picture(path, decode)
 
 
+def require_heif(what: str) -> None:
+    """Teach Pillow to read HEIC; BadInput, which begins with `what`, without pillow-heif."""
+    with needed("pillow_heif", what):
+        from pillow_heif import register_heif_opener
+    register_heif_opener()
+
+
 def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
     image = _as_stored(image)
     if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
@@ -161,6 +170,8 @@ def open_picture(path: Path, use: Callable[[Image.Image], T]) -> T:
 @contextmanager
 def _picture(path: Path) -> Iterator[Image.Image]:
     """The open picture, not yet decoded; within, what Pillow finds wrong becomes BadInput."""
+    if path.suffix.lower() in HEIF:
+        require_heif(str(path))
     try:
         with Image.open(path) as image:
             yield image

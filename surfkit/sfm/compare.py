@@ -16,6 +16,7 @@ from surfkit.sfm.matching import contents, match, refuse_other
 from surfkit.sfm.pairs import Pair, choose_pairs
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
+from surfkit.sfm.sources import Sources
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Compared:
 def compare(
     stages: Stages,
     photos: Sequence[Photo],
-    root: Path,
+    sources: Sources,
     work: Path,
     settings: Settings,
     cameras: Mapping[str, Any] | None = None,
@@ -49,14 +50,14 @@ def compare(
     Args:
         stages: What is complete.
         photos: Usable ones.
-        root: Folder of the photographs.
+        sources: Where photographs and masks are.
         work: Folder of what the stages keep.
         settings: How.
         cameras: As for `match`.
         poses: (4, 4) world_to_camera of each photograph, by its name, if they are known.
     """
     folder, database, listed = work / "features", work / "database.db", work / "pairs.json"
-    counts = stages.run("features", "", lambda: find_features(photos, root, folder, settings))
+    counts = stages.run("features", "", lambda: find_features(photos, sources, folder, settings))
     rich = [photo for photo in photos if counts[photo.name] >= FEWEST]
     made_of = contents(rich, folder, settings, cameras)
 

@@ -23,6 +23,7 @@ from surfkit.scene.names import safe_path
 from surfkit.scene.photos import read_photo
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.sources import Sources
 
 RECIPE = "1"
 """Changes when the same photograph would come out otherwise."""
@@ -47,14 +48,14 @@ class Sight:
 
 
 def deliver(
-    models: Sequence[tuple[Any, Placed | None]], photos: Mapping[str, Photo], root: Path, scene: Path, work: Path
+    models: Sequence[tuple[Any, Placed | None]], photos: Mapping[str, Photo], sources: Sources, scene: Path, work: Path
 ) -> None:
     """Write SCENE/images and SCENE/sparse/0, 1, ...; photographs that are there already are not written again.
 
     Args:
         models: pycolmap.Reconstruction, and where it lies on Earth; the largest first.
         photos: By name.
-        root: Folder of the photographs.
+        sources: Where the photographs are.
         scene: The data set.
         work: Folder for the record of what was written.
     """
@@ -80,7 +81,8 @@ def deliver(
             def undistort(image: Any, model: Any = model) -> Sight:
                 key = _key(photos[image.name], model.cameras[image.camera_id])
                 name = file_name(image.name)
-                made = _write(root / image.name, scene / "images" / name, model, image, before.get(name) == key)
+                source = sources.path(image.name)
+                made = _write(source, scene / "images" / name, model, image, before.get(name) == key)
                 kept[name] = key
                 return made
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from surfkit.core.check import BadInput
+from surfkit.core.signals import asking
 from surfkit.readers.capture import load_pycolmap
 
 T = TypeVar("T")
@@ -75,7 +76,7 @@ def _undisturbed() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # no other one gets any
         yield
         return
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in asking()}
     raising = {number: handler for number, handler in handlers.items() if callable(handler)}
     for number in raising:
         signal.signal(number, lambda *_: None)

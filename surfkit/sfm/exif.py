@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
+
+from surfkit.sfm import xmp as xmp_names
+from surfkit.sfm.xmp import read_xmp
 
 # What is damaged counts as not said.
 warnings.filterwarnings("ignore", message="Corrupt EXIF", category=UserWarning)
@@ -26,10 +28,13 @@ DIAGONAL35_MM = math.hypot(36, 24)
 """Equivalent focal lengths compare angles along the diagonal (CIPA DCG-001)."""
 LIKELY = (0.1, 10.0)
 """Focal lengths over the longer side that COLMAP's mapper accepts: beyond them a tag is wrong, as one of 72 dpi."""
-XMP = re.compile(r"(?:drone-dji|Camera):(\w+)(?:=[\"']|>)\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?=\s*[\"'<])")
-"""Numbers that DJI, and cameras by Pix4D's convention, write into XMP, as attributes or elements."""
 MOST_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
+ABOVE, BELOW = (0, 2), (1, 3)
+"""References of altitudes: sea level, and from EXIF 3.0 on the ellipsoid."""
+
+Position = tuple[float, float, float | None]
+"""Latitude and longitude, degrees on WGS 84, and altitude, metres; None where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,13 @@ class Exif:
         taken: Time, "2024:05:01 12:00:00.25", which sorts by time.
         orientation: 1 to 8, as EXIF numbers them; 1 is upright.
         focal_px: Focal length in pixels of the longer side's direction, at the size of the file.
-        position: Latitude and longitude in degrees on WGS 84, and altitude in metres as the file gives it.
+        position: Where it was taken, in EXIF; the altitude is as the file gives it.
+        unsigned: Which of latitude and longitude have no letter of the hemisphere, so that their sign is not known; the
+            position has them as positive.
+        no_reference: Whether nothing says if the altitude is above or below its zero; it is taken as above.
+        xmp_position: Where it was taken, in XMP.
+        xmp_altitude: Altitude in XMP, metres, also where XMP has no position.
+        above_start: Height above the place of the start in XMP, metres.
         accuracy_m: Standard deviations east, north and up, metres, of a receiver that states them (RTK).
     """
 
@@ -51,7 +62,12 @@ class Exif:
     serial: str | None = None
     orientation: int = 1
     focal_px: float | None = None
-    position: tuple[float, float, float] | None = None
+    position: Position | None = None
+    unsigned: tuple[str, ...] = ()
+    no_reference: bool = False
+    xmp_position: Position | None = None
+    xmp_altitude: float | None = None
+    above_start: float | None = None
     accuracy_m: tuple[float, float, float] | None = None
 
     @property
@@ -72,7 +88,7 @@ def read_exif(image: Image.Image, size: tuple[int, int]) -> Exif:
         basic, camera, gps = dict(tags), dict(tags.get_ifd(EXIF_IFD)), dict(tags.get_ifd(GPS_IFD))
     except Exception:  # Pillow raises whatever the bytes of a damaged block lead to
         basic, camera, gps = {}, {}, {}
-    return facts(basic, camera, gps, _xmp(image.info.get("xmp")), size)
+    return facts(basic, camera, gps, read_xmp(image.info.get("xmp")), size)
 
 
 def facts(
@@ -87,13 +103,19 @@ def facts(
     taken = _text(camera.get(TAKEN))
     part = _text(camera.get(SUBSECOND))
     turned = basic.get(ORIENTATION, 1)
+    position, unsigned = _position(gps)
     return Exif(
         camera=" ".join(filter(None, names)) or None,
         serial=_serial(camera, xmp),
         taken=f"{taken}.{part}" if taken and part else taken,
         orientation=int(turned) if turned in range(1, 9) else 1,
         focal_px=_focal_px(camera, size),
-        position=_position(gps),
+        position=position,
+        unsigned=unsigned,
+        no_reference=position is not None and position[2] is not None and _reference(gps) is None,
+        xmp_position=_xmp_position(xmp),
+        xmp_altitude=xmp.get(xmp_names.ALTITUDE),
+        above_start=xmp.get(xmp_names.ABOVE_START),
         accuracy_m=_accuracy(gps, xmp),
     )
 
@@ -120,25 +142,52 @@ def _is_likely(focal_px: float, size: tuple[int, int]) -> bool:
     return LIKELY[0] < focal_px / max(size) < LIKELY[1]
 
 
-def _position(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    latitude = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "S", 90)
-    longitude = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "W", 180)
+def _position(tags: Mapping[int, Any]) -> tuple[Position | None, tuple[str, ...]]:
+    """The position, and which of latitude and longitude have no sign."""
+    latitude, north = _degrees(tags.get(LATITUDE), tags.get(LATITUDE_REF), "N", "S", 90)
+    longitude, east = _degrees(tags.get(LONGITUDE), tags.get(LONGITUDE_REF), "E", "W", 180)
+    if latitude is None or longitude is None or (latitude, longitude) == (0, 0):  # a receiver without a fix
+        return None, ()
     altitude = _number(tags.get(ALTITUDE), negative=True)
-    if latitude is None or longitude is None or altitude is None or (latitude, longitude) == (0, 0):
-        return None
-    below = tags.get(ALTITUDE_REF) in (1, b"\x01", 3, b"\x03")  # sea level; the ellipsoid, from EXIF 3.0 on
-    return latitude, longitude, -altitude if below else altitude
+    if altitude is not None and _reference(tags) in BELOW:
+        altitude = -abs(altitude)
+    unsigned = tuple(name for name, known in (("latitude", north), ("longitude", east)) if not known)
+    return (latitude, longitude, altitude), unsigned
 
 
-def _degrees(value: Any, half: Any, negative: str, most: float) -> float | None:
+def _degrees(value: Any, letter: Any, positive: str, negative: str, most: float) -> tuple[float | None, bool]:
+    """Degrees, and whether their sign is known: by the letter, or as they are below 0. They are degrees, minutes and
+    seconds, or fewer of these."""
     try:
-        degrees, minutes, seconds = (float(part) for part in value)
+        parts = [float(part) for part in (value if isinstance(value, (tuple, list)) else (value,))]
     except (TypeError, ValueError, ZeroDivisionError):
+        return None, False
+    if not 1 <= len(parts) <= 3:
+        return None, False
+    found = sum(abs(part) / 60**at for at, part in enumerate(parts))
+    if not (math.isfinite(found) and found <= most):
+        return None, False
+    half, below = (_text(letter) or "")[:1].upper(), parts[0] < 0
+    if half == negative or (below and half != positive):
+        return -found, True
+    return found, half == positive and not below
+
+
+def _reference(tags: Mapping[int, Any]) -> int | None:
+    """What the altitude is counted from; None where that is not said."""
+    value = tags.get(ALTITUDE_REF)
+    try:
+        found = value[0] if isinstance(value, bytes) else int(value)
+    except (TypeError, ValueError, IndexError):
         return None
-    found = degrees + minutes / 60 + seconds / 3600
-    if not (math.isfinite(found) and abs(found) <= most):
+    return found if found in (*ABOVE, *BELOW) else None
+
+
+def _xmp_position(xmp: Mapping[str, float]) -> Position | None:
+    latitude, longitude = xmp.get(xmp_names.LATITUDE), xmp.get(xmp_names.LONGITUDE)
+    if latitude is None or longitude is None or (latitude, longitude) == (0, 0):
         return None
-    return -found if (_text(half) or "").upper().startswith(negative) else found
+    return latitude, longitude, xmp.get(xmp_names.ALTITUDE)
 
 
 def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
@@ -149,18 +198,6 @@ def _accuracy(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> tuple[float, 
         if all(0 < value < MOST_ERROR_M for value in found):
             return found  # type: ignore[return-value]
     return None
-
-
-def _xmp(packet: bytes | str | None) -> dict[str, float]:
-    """The numbers of an XMP packet that say something of a position, by name."""
-    if not packet:
-        return {}
-    text = packet if isinstance(packet, str) else packet.decode("utf-8", "replace")
-    found = {}
-    for name, value in XMP.findall(text):
-        if (number := _number(value, negative=True)) is not None:
-            found[name] = number
-    return found
 
 
 def _number(value: Any, negative: bool = False) -> float | None:

@@ -15,10 +15,12 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
+from surfkit.readers.masks import read_mask
 from surfkit.scene.photos import read_photo
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.settings import Settings
+from surfkit.sfm.sources import Sources
 
 RECIPE = "1"
 """Changes when the same photograph would give other features."""
@@ -45,7 +47,7 @@ class Features:
 
 def feature_file(folder: Path, photo: Photo, settings: Settings) -> Path:
     """Where the features of a photograph are kept."""
-    said = f"{RECIPE} {photo.digest} {settings.longest} {settings.features}"
+    said = f"{RECIPE} {photo.digest} {settings.longest} {settings.features}{photo.mask and f' {photo.mask}'}"
     return folder / f"{hashlib.sha256(said.encode()).hexdigest()[:24]}.npz"
 
 
@@ -55,12 +57,12 @@ def read_features(path: Path) -> Features:
         return Features(file["keypoints"], file["descriptors"])
 
 
-def find_features(photos: Sequence[Photo], root: Path, folder: Path, settings: Settings) -> dict[str, int]:
+def find_features(photos: Sequence[Photo], sources: Sources, folder: Path, settings: Settings) -> dict[str, int]:
     """Find and keep the features of photographs that have none yet; how many each has, by name.
 
     Args:
         photos: Usable ones.
-        root: Folder of the photographs.
+        sources: Where photographs and masks are.
         folder: Where features are kept.
         settings: How they are found.
     """
@@ -78,7 +80,7 @@ def find_features(photos: Sequence[Photo], root: Path, folder: Path, settings: S
         threads = max(1, min(os.cpu_count() or 1, MOST_BYTES // (BYTES_PER_PIXEL * pixels)))
         threads = 1 if engine.has_cuda else threads
         with ThreadPoolExecutor(threads) as pool:
-            waiting = {pool.submit(_keep, engine, photo, path, root, settings): photo for photo, path in todo}
+            waiting = {pool.submit(_keep, engine, photo, path, sources, settings): photo for photo, path in todo}
             try:
                 for at, future in enumerate(as_completed(waiting)):
                     counts[waiting[future].name] = future.result()
@@ -89,24 +91,29 @@ def find_features(photos: Sequence[Photo], root: Path, folder: Path, settings: S
     return {photo.name: counts[photo.name] for photo in photos}
 
 
-def _keep(engine: Any, photo: Photo, path: Path, root: Path, settings: Settings) -> int:
+def _keep(engine: Any, photo: Photo, path: Path, sources: Sources, settings: Settings) -> int:
     options = engine.FeatureExtractionOptions()
     options.use_gpu = engine.has_cuda
     options.num_threads = 1
     options.max_image_size = settings.longest
     options.sift.max_num_features = settings.features
     extractor = engine.FeatureExtractor.create(options, engine.Device.auto)
-    size = _reduced(photo.size, settings.longest)
+    size, file = _reduced(photo.size, settings.longest), sources.path(photo.name)
     try:
-        grey = read_photo(root / photo.name, size).float().mean(0).round().byte().numpy()
+        grey = read_photo(file, size).float().mean(0).round().byte().numpy()
     except FileNotFoundError as error:
-        raise BadInput(f"{root / photo.name}: was there a moment ago; give the command again") from error
+        raise BadInput(f"{file}: was there a moment ago; give the command again") from error
     found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
     keypoints = np.array(engine.keypoints_to_matrix(found), np.float32).reshape(-1, 4)
+    descriptors = np.array(descriptors.data, np.uint8).reshape(-1, 128)
+    if photo.mask:
+        column, row = np.minimum(keypoints[:, :2].astype(int), np.array(size) - 1).T
+        seen = read_mask(sources.masks[photo.name], size).numpy()[row, column]
+        keypoints, descriptors = keypoints[seen], descriptors[seen]
     keypoints[:, :2] *= np.array(photo.size, np.float32) / size
     keypoints[:, 2] *= photo.size[0] / size[0]
     with replacing(path) as file:
-        np.savez(file, keypoints=keypoints, descriptors=np.array(descriptors.data, np.uint8).reshape(-1, 128))
+        np.savez(file, keypoints=keypoints, descriptors=descriptors)
     return len(keypoints)
 
 

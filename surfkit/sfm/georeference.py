@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.core.optional import needed
 from surfkit.readers.georeference import BESIDE, POLAR, Similarity, zone_of
+from surfkit.scene.crs import DEGREES, axes_of, exact, parsed
 from surfkit.scene.earth import Site, utm
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.plausible import Hand
 from surfkit.sfm.similarity import FEWEST, Fit, fit_robustly
 
 GRAIN_M = 100.0
@@ -22,6 +23,10 @@ MOST_TURN = 0.05
 """Standard error of the turn and the scale, as a share: beyond it positions do not determine them."""
 LINE = 0.05
 """Positions lie along a line where they spread across it by less than this share of the spread along it."""
+LEAST_SIGMA_M = 0.01
+"""No position is trusted more."""
+ASSUMED_M = 3.0
+"""Standard deviation of each coordinate of a position that states none, beside others that do."""
 NEAR_M = 0.1
 """A residual below it is not held against a position, nor half of it against a control point."""
 METRIC = 0.01
@@ -57,9 +62,14 @@ class Placement:
     Attributes:
         chart: The map.
         similarity: From the coordinates of the reconstruction to those of the map less the offset.
-        names: Photographs with a position.
+        names: Photographs with a position that is used.
         onto: (P, 3) their positions less the offset.
         fit: How well they agree.
+        sigma: (P, 3) standard deviations of the positions, units of the map: what they state, else that of the
+            residuals of those that state none.
+        handed: Whether they are told from their mirror image: they are not all in a plane.
+        plan: Whether the positions had no altitudes: heights are then above the middle of the ground, and those in
+            `onto` are of the cameras.
     """
 
     chart: Chart
@@ -67,19 +77,37 @@ class Placement:
     names: tuple[str, ...]
     onto: np.ndarray
     fit: Fit
+    sigma: np.ndarray
+    handed: bool = False
+    plan: bool = False
+
+
+@dataclass(frozen=True)
+class Level:
+    """How a reconstruction stands level, for positions that have no altitudes.
+
+    Attributes:
+        turn: (3, 3) rotation that makes z up.
+        ground: z of the middle of the ground, after it.
+    """
+
+    turn: np.ndarray
+    ground: float
 
 
 def chart_of(positions: np.ndarray, crs: str) -> Chart:
     """The map for positions, its offset near them.
 
     Args:
-        positions: (P, 3) latitudes, longitudes, degrees, and altitudes, metres; a few may be wrong.
+        positions: (P, 3) latitudes, longitudes, degrees, and altitudes, metres, or nan; a few may be wrong.
         crs: Coordinate reference system, or "auto" for the zone of UTM.
 
     Raises:
         BadInput: The coordinate reference system is not known, or is none of east, north and up, or pyproj is missing.
     """
-    middle = np.median(np.column_stack([positions[:, 0], _unbroken(positions[:, 1]), positions[:, 2]]), axis=0)
+    heights = positions[np.isfinite(positions[:, 2]), 2]
+    plan = np.column_stack([positions[:, 0], _unbroken(positions[:, 1])])
+    middle = np.append(np.median(plan, axis=0), np.median(heights) if len(heights) else 0.0)
     if crs == "auto":
         if abs(middle[0]) > POLAR:
             raise BadInput(f"at latitude {middle[0]:.2f} there is no UTM; name a system with --crs, such as EPSG:3995")
@@ -97,14 +125,14 @@ def chart_of(positions: np.ndarray, crs: str) -> Chart:
 def chart_about(crs: str, placed: np.ndarray) -> Chart:
     """The map about (3,) a place on it, its offset near it; BadInput for one that is not of east, north and up."""
     unit = Site.at(crs, placed).unit
-    metres = 1.0 if abs(unit - 1) < METRIC else _unit_of_heights(crs)
+    metres = 1.0 if abs(unit - 1) < METRIC else axes_of(crs).metres
     east, north = (float(np.round(value / GRAIN_M) * GRAIN_M) for value in placed[:2])
     return Chart(crs, (east, north, 0.0), metres)
 
 
 def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
-    """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes; what is not finite
-    in a row says that the map does not reach it."""
+    """(P, 3) east, north and height less the offset, of (P, 3) latitudes, longitudes and altitudes. East and north that
+    are not finite say that the map does not reach them; a height is not finite where the altitude is not known."""
     zone = zone_of(chart.crs.upper())
     if zone is not None:
         away = np.abs((positions[:, 1] - (6 * zone[0] - 183) + 180) % 360 - 180)
@@ -117,42 +145,89 @@ def to_chart(chart: Chart, positions: np.ndarray) -> np.ndarray:
 
 
 def place(
-    centres: Mapping[str, np.ndarray], photos: Sequence[Photo], chart: Chart, seed: int = 0
+    centres: Mapping[str, np.ndarray], photos: Sequence[Photo], chart: Chart, seed: int = 0, level: Level | None = None
 ) -> Placement | Refused:
     """The similarity that brings camera centres to the positions of their photographs.
+
+    Positions without an altitude are left out. Where what is left determines no similarity, all positions give one in
+    plan, and `level` what is up.
 
     Args:
         centres: (3,) of each placed camera, by the name of its photograph.
         photos: With or without positions.
         chart: The map.
         seed: Of the draws.
+        level: How the reconstruction stands level; None does without a similarity in plan.
     """
     given = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
     onto = to_chart(chart, np.array([photo.exif.position for photo in given], np.float64).reshape(-1, 3))
-    reached = np.isfinite(onto).all(1)
+    reached = np.isfinite(onto[:, :2]).all(1)
     if far := [photo.name for photo, good in zip(given, reached, strict=True) if not good]:
         emit(Warned(f"{len(far)} positions are where {chart.crs} does not reach, and are left out: {few(far)}"))
     known, onto = [photo for photo, good in zip(given, reached, strict=True) if good], onto[reached]
     if len(known) < FEWEST:
         return Refused(f"{len(known)} of {len(centres)} placed photographs have a position, {FEWEST} are needed")
     xyz = np.stack([centres[photo.name] for photo in known])
-    stated = [photo.exif.accuracy_m for photo in known]
-    sigma = None if None in stated else np.linalg.norm(np.array(stated, np.float64), axis=1) / np.sqrt(3)
-    fit = fit_robustly(xyz, onto, sigma, seed, NEAR_M / chart.metres)
+    high = np.isfinite(onto[:, 2])
+    found: Placement | Refused = Refused(
+        f"{high.sum()} of {len(known)} positions have an altitude, {FEWEST} are needed"
+    )
+    if high.sum() >= FEWEST:
+        found = _fitted(
+            [photo for photo, good in zip(known, high, strict=True) if good], xyz[high], onto[high], chart, seed
+        )
+    if isinstance(found, Placement) or high.all() or level is None:
+        return found
+    return _in_plan(known, xyz, onto, chart, seed, level)
+
+
+def _fitted(
+    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: Chart, seed: int, axes: int = 3
+) -> Placement | Refused:
+    """The similarity of (P, 3) camera centres to (P, 3) places on the map, of which the first `axes` axes count."""
+    stated = np.array([photo.exif.accuracy_m or (np.nan,) * 3 for photo in known], np.float64)
+    stated = np.maximum(stated, LEAST_SIGMA_M) / chart.metres
+    silent = np.isnan(stated[:, 0])
+    assumed = np.where(silent, ASSUMED_M / chart.metres, np.linalg.norm(stated[:, :axes], axis=1) / np.sqrt(axes))
+    fit = fit_robustly(xyz, onto, None if silent.all() else assumed, seed, NEAR_M / chart.metres)
     if fit is None:
         return Refused(f"of {len(known)} positions fewer than {FEWEST} agree with the cameras")
     spread = np.linalg.svd(xyz[fit.inside] - xyz[fit.inside].mean(0), compute_uv=False)
     along, across = fit.similarity.scale * spread[:2] / np.sqrt(fit.inside.sum()) * chart.metres
-    rms = float(np.linalg.norm(fit.sigma)) * chart.metres
     if along < NEAR_M:
         return Refused(f"{int(fit.inside.sum())} of {len(known)} positions are one place")
     if across < LINE * along:
         return Refused(f"positions lie along a line: they spread by {along:.1f} m along it and {across:.2f} m across")
-    if rms / np.sqrt(3) > MOST_TURN * across * np.sqrt(fit.inside.sum()):
+    if not fit.turn_error(xyz) * np.sqrt(3 / axes) <= MOST_TURN:
+        rms = float(np.linalg.norm(fit.sigma)) * chart.metres
         return Refused(
             f"residuals of {rms:.1f} m are too large for positions that spread by {along:.1f} and {across:.1f} m"
         )
-    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit)
+    hand = Hand.of(xyz[fit.inside], onto[fit.inside], NEAR_M / chart.metres)
+    if hand.wrong:
+        mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
+        return Refused(
+            f"positions fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m: latitude and longitude are exchanged "
+            "or have a wrong sign, or heights count down"
+        )
+    own = np.maximum(fit.deviation(silent), LEAST_SIGMA_M / chart.metres)
+    sigma = np.where(silent[:, None], own, stated)
+    return Placement(chart, fit.similarity, tuple(photo.name for photo in known), onto, fit, sigma, hand.right)
+
+
+def _in_plan(
+    known: Sequence[Photo], xyz: np.ndarray, onto: np.ndarray, chart: Chart, seed: int, level: Level
+) -> Placement | Refused:
+    """The similarity in plan, by latitudes and longitudes alone, of a model that is made level."""
+    flat = np.array([1.0, 1.0, 0.0])
+    found = _fitted(known, xyz @ level.turn.T * flat, np.nan_to_num(onto) * flat, chart, seed, axes=2)
+    if isinstance(found, Refused):
+        return found
+    turned = found.similarity  # about z, or about a level axis where the positions are mirrored
+    sink = turned.scale * turned.turn @ (0.0, 0.0, level.ground)
+    similarity = Similarity(turned.turn @ level.turn, turned.scale, turned.move - sink)
+    heights = similarity.points(xyz)[:, 2:]
+    return replace(found, similarity=similarity, onto=np.hstack([onto[:, :2], heights]), plan=True)
 
 
 def centres_of(model: Any) -> dict[str, np.ndarray]:
@@ -163,23 +238,14 @@ def centres_of(model: Any) -> dict[str, np.ndarray]:
 
 
 def _by_pyproj(crs: str, positions: np.ndarray) -> np.ndarray:
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import ProjError
     try:
-        known = Transformer.from_crs("EPSG:4326", CRS(crs).to_2d(), always_xy=True)
-        flat = np.stack(known.transform(positions[:, 1], positions[:, 0]), axis=1)
-    except ProjError as error:
-        said = " ".join(str(error).split())[:200]
-        raise BadInput(f"--crs {crs}: pyproj does not know it: {said}; name one such as EPSG:2180") from error
-    return flat
-
-
-def _unit_of_heights(crs: str) -> float:
-    """Metres, without the scale that the map has at a place: that of its heights is 1."""
-    with needed("pyproj", f"the coordinate reference system {crs}"):
-        from pyproj import CRS
-    return float(CRS(crs).to_3d().axis_info[-1].unit_conversion_factor)
+        flat = parsed(crs).to_2d()
+    except BadInput as error:
+        raise BadInput(f"--crs {crs}: {error}; name one such as EPSG:2180") from error
+    known = exact(DEGREES, flat)
+    if known is None:
+        raise BadInput(f"--crs {crs}: the shift from WGS 84 to its datum is not known; name another, such as EPSG:2180")
+    return np.stack(known.transform(positions[:, 1], positions[:, 0]), axis=1)
 
 
 def _unbroken(longitudes: np.ndarray) -> np.ndarray:

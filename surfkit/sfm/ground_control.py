@@ -5,7 +5,6 @@ The similarity to the map is that of the points, triangulated in the model; poin
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,21 +14,15 @@ import numpy as np
 
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
-from surfkit.readers.georeference import Similarity, zone_of
+from surfkit.readers.georeference import Similarity
 from surfkit.sfm.georeference import LINE, MOST_TURN, NEAR_M, Chart, Refused, chart_about, chart_of, to_chart
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.plausible import FAR_M, HIGH_M, LOW_M, Hand
 from surfkit.sfm.similarity import FEWEST, PARAMETERS, fit_robustly, umeyama
+from surfkit.sfm.systems import system_of
 
 FEWEST_POINTS, FEWEST_VIEWS = 3, 2
 """Control points that determine a similarity; photographs that determine where a point is."""
-GEOGRAPHIC = ("EPSG:4326", "WGS84", "+PROJ=LONGLAT", "+PROJ=LATLONG")
-"""How a list says that its coordinates are longitude, latitude and height."""
-WGS84 = re.compile(
-    r"\+(proj=(utm|longlat|latlong)|zone=\d+|south|(datum|ellps)=WGS84|towgs84=0(,0)*|units=m|no_defs|type=crs)"
-)
-"""Words of PROJ that leave UTM and degrees on WGS 84, in metres; with any other they are left to pyproj."""
-FAR_M = 1000.0
-"""Receivers in cameras are not so wrong."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +67,7 @@ class Control:
         checkpoints: Names of those held back.
         wrong: Names of those that contradict the others.
         unseen: Names of those that too few placed photographs show.
+        handed: Whether they are told from their mirror image: they are not all in a plane.
     """
 
     chart: Chart
@@ -83,6 +77,7 @@ class Control:
     checkpoints: tuple[str, ...]
     wrong: tuple[str, ...]
     unseen: tuple[str, ...]
+    handed: bool
 
     def facts(self) -> dict[str, Any]:
         """For the report."""
@@ -164,22 +159,23 @@ def read_ground(path: Path, wanted: str, sizes: Mapping[str, tuple[int, int]], h
             f"the folder; {FEWEST_POINTS} are needed{also}"
         )
     xyz = np.array([point.xyz for point in points], np.float64)
-    plain = not crs.startswith("+") or all(map(WGS84.fullmatch, crs.split()))
-    zone = zone_of(crs) if plain else None
-    if plain and zone is None and crs.upper().replace(" ", "").startswith(GEOGRAPHIC):
-        positions = xyz[:, [1, 0, 2]]
+    try:
+        system = system_of(crs)
+    except BadInput as error:
+        raise BadInput(f"--gcp {path}: line 1: {error}") from error
+    if system.degrees:
         if wrong := [point.name for point, (x, y, _) in zip(points, xyz, strict=True) if abs(x) > 180 or abs(y) > 90]:
             raise BadInput(
                 f"--gcp {path}: {few(wrong)} is not in degrees, as line 1, {crs!r}, says; x is the longitude, y the "
                 "latitude, or line 1 names another system, such as EPSG:32633"
             )
+        positions = system.positions(xyz)
         chart = chart_of(positions, wanted)
         onto = to_chart(chart, positions)
         if not np.isfinite(onto).all():
             raise BadInput(f"--gcp {path}: some points are where {chart.crs} does not reach; x is the longitude")
         return Ground(points, chart, onto)
-    if zone is not None:
-        crs = f"EPSG:{(32700 if zone[1] else 32600) + zone[0]}"
+    crs = system.crs
     if wanted not in ("auto", crs):
         raise BadInput(f"--crs {wanted}: the list of --gcp is in {crs}, and the scene will be; leave --crs out")
     try:
@@ -256,6 +252,13 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
     left = (onto[seen] - given.points(np.stack([placed[at] for at in seen]))) * chart.metres
     if not sizes[1] > LINE * sizes[0]:
         return Refused("ground control points lie along a line")
+    hand = Hand.of(xyz[inside], onto[control][inside], NEAR_M / chart.metres)
+    if hand.wrong:
+        mirrored, plain = hand.mirrored * chart.metres, hand.plain * chart.metres
+        return Refused(
+            f"ground control points fit mirrored only, to {mirrored:.2f} m for {plain:.1f} m; x must be east and y "
+            "north, and heights count up"
+        )
     residuals = left[[seen.index(at) for at, good in zip(control, inside, strict=True) if good]]
     rms = float(np.sqrt((residuals**2).sum() / max(len(residuals) - PARAMETERS, 1)))
     across = given.scale * sizes[1] * chart.metres
@@ -272,36 +275,45 @@ def place_by_points(model: Any, ground: Ground, held_back: int) -> Control | Ref
         tuple(points[at].name for at in sorted(back)),
         tuple(points[at].name for at, good in zip(control, inside, strict=True) if not good),
         unseen,
+        hand.right,
     )
 
 
-def doubts(control: Control, centres: Mapping[str, np.ndarray], up: np.ndarray, photos: Sequence[Photo]) -> list[str]:
+def doubts(control: Control, centres: Mapping[str, np.ndarray], photos: Sequence[Photo]) -> list[str]:
     """What else is known of the photographs and contradicts the control points, a line for each.
 
     Args:
         control: Where the points put the model.
         centres: (3,) of each placed camera in the model, by the name of its photograph.
-        up: (3,) unit vector of the model, by how cameras are held.
         photos: With or without positions.
     """
-    crs, found = control.chart.crs, []
-    if (control.similarity.turn @ up)[2] < -0.5:
+    found, metres = [], control.chart.metres
+    low = float(np.median(control.similarity.points(np.stack(list(centres.values())))[:, 2])) * metres
+    if low < LOW_M:
         found.append(
-            "the ground control points turn the photographs upside down, as an exchange of x and y does: is x east and "
-            f"y north in the list, in {crs}?"
+            f"the ground control points put the photographs {-low:.0f} m below zero, where little land is: do the "
+            "heights of the list count up?"
         )
-    known = [photo for photo in photos if photo.name in centres and photo.exif.position is not None]
-    if known:
-        ours = control.similarity.points(np.stack([centres[photo.name] for photo in known]))
-        theirs = to_chart(control.chart, np.array([photo.exif.position for photo in known], np.float64))
-        away = np.linalg.norm((ours - theirs)[:, :2], axis=1) * control.chart.metres
-        away = float(np.median(np.where(np.isfinite(away), away, np.inf)))
-        if away > FAR_M:
-            far = f"{away / 1000:.0f} km" if np.isfinite(away) else "out of reach"
-            found.append(
-                f"the ground control points put the photographs {far} from their positions in EXIF: is {crs} the "
-                "system of the list, with x east and y north?"
-            )
+    exif = {photo.name: photo.exif for photo in photos if photo.exif.position is not None and not photo.exif.unsigned}
+    known = [name for name in centres if name in exif]
+    if not known:
+        return found
+    ours = control.similarity.points(np.stack([centres[name] for name in known]))
+    away = (ours - to_chart(control.chart, np.array([exif[name].position for name in known], np.float64))) * metres
+    across = np.linalg.norm(away[:, :2], axis=1)
+    across = float(np.median(np.where(np.isfinite(across), across, np.inf)))
+    rise = float(np.median(away[np.isfinite(away[:, 2]), 2])) if np.isfinite(away[:, 2]).any() else 0.0
+    if across > FAR_M:
+        far = f"{across / 1000:.0f} km" if np.isfinite(across) else "out of reach"
+        found.append(
+            f"the ground control points put the photographs {far} from their positions in EXIF: is {control.chart.crs} "
+            "the system of the list, with x east and y north?"
+        )
+    elif abs(rise) > HIGH_M:
+        found.append(
+            f"the ground control points put the photographs {abs(rise):.0f} m {'above' if rise > 0 else 'below'} their "
+            "altitudes in EXIF: do the heights of the list count up, in the unit of its system?"
+        )
     return found
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+
+from surfkit.sfm.photographs import Photo
 
 RIGHT = {1: (1, 0), 2: (-1, 0), 3: (-1, 0), 4: (1, 0), 5: (0, 1), 6: (0, -1), 7: (0, -1), 8: (0, 1)}
 """By orientation in EXIF: where the right of the upright picture is, along x and y of the stored pixels."""
@@ -49,3 +52,20 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
         return np.diag([1.0, -1.0, -1.0])
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def up_of(model: Any, photos: Mapping[str, Photo]) -> np.ndarray:
+    """(3,) unit vector of a pycolmap reconstruction, by how its cameras are held."""
+    images = [model.image(number) for number in model.reg_image_ids()]
+    return up_direction(poses_of(model), [photos[image.name].exif.orientation for image in images], points_of(model))
+
+
+def poses_of(model: Any) -> np.ndarray:
+    """(V, 4, 4) world_to_camera of the placed photographs of a pycolmap reconstruction."""
+    images = [model.image(number) for number in model.reg_image_ids()]
+    return np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
+
+
+def points_of(model: Any) -> np.ndarray:
+    """(P, 3) points of a pycolmap reconstruction."""
+    return np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)

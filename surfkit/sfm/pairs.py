@@ -100,7 +100,9 @@ def near(photos: Sequence[Photo], count: int) -> set[Pair]:
     if len(placed) < 2:
         return set()
     known = np.array([photos[at].exif.position for at in placed], np.float64)
-    xyz = geocentric(known[:, 0], known[:, 1], known[:, 2])
+    high = np.isfinite(known[:, 2])
+    level = np.median(known[high, 2]) if high.any() else 0.0  # for those of no known altitude
+    xyz = geocentric(known[:, 0], known[:, 1], np.where(high, known[:, 2], level))
     _, found = cKDTree(xyz).query(xyz, min(count + 1, len(placed)))
     return {
         (min(at, placed[other]), max(at, placed[other]))

@@ -15,13 +15,13 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json
 from surfkit.core.events import Progress, Warned, emit
-from surfkit.scene.names import PICTURES
-from surfkit.scene.photos import open_picture, photo_size, read_draft
+from surfkit.scene.names import HEIF, PICTURES
+from surfkit.scene.photos import open_picture, photo_size, read_draft, require_heif
 from surfkit.sfm.exif import Exif, read_exif
 
 PHOTOGRAPHS = "photographs.json"
 """File of what was found."""
-OTHER = frozenset({".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
+OTHER = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf"})
 """Photographs that Pillow does not decode."""
 HIDDEN = (".", "@eaDir")
 """What names begin with that programs, and Synology's disks, keep for themselves."""
@@ -29,6 +29,8 @@ DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MOST_THREADS = 8
 """Photographs that are read at once."""
+EDITION = 1
+"""Changes when more is found in a photograph: it is looked at again then."""
 DARK, FLAT = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
 
@@ -48,6 +50,8 @@ class Photo:
         contrast: Standard deviation of grey levels.
         sharpness: Standard deviation of the Laplacian over the contrast, of the draft.
         problem: Why it cannot be used; None if it can.
+        mask: Digest of its mask; empty without one.
+        edition: `EDITION` of the code that looked at it.
     """
 
     name: str
@@ -60,6 +64,8 @@ class Photo:
     contrast: float = 0.0
     sharpness: float = 0.0
     problem: str | None = None
+    mask: str = ""
+    edition: int = 0
 
     @property
     def usable(self) -> bool:
@@ -67,23 +73,33 @@ class Photo:
         return self.problem is None
 
 
-def look(folder: Path, known: Sequence[Photo] = ()) -> list[Photo]:
+def look(folder: Path, known: Sequence[Photo] = (), without: Path | None = None, others: bool = False) -> list[Photo]:
     """All photographs below a folder, in the order of their names.
 
     Args:
         folder: Photographs, in folders or not.
         known: What an earlier call found; photographs that have not changed are taken from it.
+        without: A folder in which no photographs are, as that of the masks.
+        others: Whether there are photographs elsewhere, so that there may be none here.
 
     Raises:
         BadInput: There is no such folder, or no photograph that can be used.
     """
     if not folder.is_dir():
         raise BadInput(f"{folder}: {'a file' if folder.exists() else 'no such folder'}; name a folder of photographs")
-    files = _files(folder)
+    files = files_of(folder, without)
     paths = [path for path in files if path.suffix.lower() in PICTURES]
     if other := [path.name for path in files if path.suffix.lower() in OTHER]:
         emit(Warned(f"{folder}: {len(other)} files cannot be read: {few(other)}; convert them to JPEG"))
-    if not paths:
+    if heic := [path for path in paths if path.suffix.lower() in HEIF]:
+        try:
+            require_heif(f"{folder}: reading {len(heic)} HEIC photographs")
+        except BadInput as error:
+            if len(heic) == len(paths) and not others:
+                raise
+            emit(Warned(f"{error}; they are left out"))
+            paths = [path for path in paths if path.suffix.lower() not in HEIF]
+    if not paths and not others:
         raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
     return look_at(folder, paths, known)
 
@@ -130,10 +146,11 @@ def lens_groups(photos: Sequence[Photo]) -> list[int]:
     return [numbers[key] for key in keys]
 
 
-def _files(folder: Path) -> list[Path]:
-    """All files below a folder, but for those that programs keep for themselves, as thumbnails. Folders that links lead
-    to come after all others, so that each folder is looked into once, by its own name if it is inside."""
-    found, seen, starts = [], set(), [folder]
+def files_of(folder: Path, without: Path | None = None) -> list[Path]:
+    """All files below a folder, but for those in one of these folders, and those that programs keep for themselves, as
+    thumbnails. Folders that links lead to come after all others, so that each folder is looked into once, by its own
+    name if it is inside."""
+    found, seen, starts = [], set() if without is None else {os.path.realpath(without)}, [folder]
     for start in starts:
         for here, folders, names in os.walk(start):
             if (place := os.path.realpath(here)) in seen:
@@ -156,13 +173,13 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     if not _is_text(name):
         return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
-    if before is not None and before.stamp == stamp:
+    if before is not None and before.stamp == stamp and before.edition == EDITION:
         copy = (before.problem or "").startswith("a copy of")
         return replace(before, problem=None) if copy else before
     try:
-        return _look(path, Photo(name, stamp))
+        return _look(path, Photo(name, stamp, edition=EDITION))
     except BadInput as error:
-        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "))
+        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "), edition=EDITION)
 
 
 def _is_text(name: str) -> bool:

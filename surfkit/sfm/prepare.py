@@ -18,15 +18,21 @@ from surfkit.readers.placed import Placed
 from surfkit.sfm.adjust import adjust_once
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
+from surfkit.sfm.deliver_masks import deliver_masks
 from surfkit.sfm.engine import load_engine
-from surfkit.sfm.georeference import Chart, Placement, Refused, centres_of, chart_of, place
+from surfkit.sfm.focal import Weighed, exif_focals, height_above_ground, height_stretch, weighed
+from surfkit.sfm.georeference import Placement, Refused, centres_of
 from surfkit.sfm.ground_control import Control, Ground, doubts, place_by_points, read_ground
-from surfkit.sfm.level import turn_upright, up_direction
+from surfkit.sfm.level import points_of, turn_upright, up_of
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import matched
-from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look
+from surfkit.sfm.photographs import PHOTOGRAPHS, Photo
+from surfkit.sfm.plausible import upside_down
+from surfkit.sfm.positions import Positions, settle
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import REPORT, WORK, Settings
+from surfkit.sfm.site import Reading, decide, locate, readings
+from surfkit.sfm.sources import Sources, look_at_all
 
 PICTURE = "cameras.png"
 
@@ -36,7 +42,7 @@ class Preparation:
     """A folder of photographs on its way to a data set.
 
     Attributes:
-        root: Folder of the photographs; nothing is written there.
+        root: Folder of the photographs, or a video; nothing is written there.
         scene: The data set.
         settings: How cameras are found.
         refuse: Raises BadInput if the usable photographs do not fit what comes after the cameras.
@@ -60,29 +66,35 @@ class Preparation:
         """
         load_engine()
         stages = Stages(self.work)
-        photos = stages.run("photographs", "", self._look)
+        sources, photos = stages.run("photographs", "", self._look)
         usable = [photo for photo in photos if photo.usable]
         self._refuse_few(photos, usable)
         self.refuse(usable)
-        site = self._site(usable)
-        found = compare(stages, usable, self.root, self.work, self.settings)
+        positions = settle(usable, sources.root, self.settings) if self.settings.gps else Positions(usable)
+        usable, site = positions.photos, self._site(positions)
+        found = compare(stages, usable, sources, self.work, self.settings)
         key = key_of(found.key, self.settings.mapper, self.settings.seed)
         models = stages.run("cameras", key, lambda: self._map(found.database, len(found.rich)), self._load_models)
         matches = matched(found.database)
         if not models:
             raise BadInput(self._no_model(photos, reasons(photos, found.counts, matches, [])))
-        placed = stages.run("georeference", "", lambda: self._place(models, photos, site))
-        by_name = {photo.name: photo for photo in photos}
-        done = [(model, None if where is None else _placed(where)) for model, where in placed]
-        stages.run("undistortion", "", lambda: deliver(done, by_name, self.root, self.scene, self.work))
-        names = [set(centres_of(model)) for model, _ in placed]
+        placed = stages.run("georeference", "", lambda: self._place(models, positions, site))
+        by_name = {photo.name: photo for photo in usable}
+        done = [(model, None if where is None else _placed(where)) for model, where, _ in placed]
+        stages.run("undistortion", "", lambda: self._deliver(done, by_name, sources))
+        names = [set(centres_of(model)) for model, _, _ in placed]
         return self._report(stages, photos, placed, reasons(photos, found.counts, matches, names))
 
-    def _look(self) -> list[Photo]:
+    def _look(self) -> tuple[Sources, list[Photo]]:
         path = self.work / PHOTOGRAPHS
-        photos = look(self.root, known_photographs(path))
+        sources, photos = look_at_all(self.root, self.work, path, self.settings)
         write_json(path, photos)
-        return photos
+        return sources, photos
+
+    def _deliver(self, models: Sequence[tuple[Any, Placed | None]], photos: dict[str, Photo], sources: Sources) -> None:
+        """Write photographs, masks and models of the data set."""
+        deliver_masks([model for model, _ in models], photos, sources, self.scene, self.work)
+        deliver(models, photos, sources, self.scene, self.work)
 
     def _refuse_few(self, photos: Sequence[Photo], usable: Sequence[Photo]) -> None:
         if len(usable) >= SMALLEST:
@@ -114,60 +126,103 @@ class Preparation:
             "views of each place, from positions that differ"
         )
 
-    def _site(self, photos: Sequence[Photo]) -> Chart | Ground | None:
-        """The map that the models come to, with control points if there are some; None without either."""
+    def _site(self, positions: Positions) -> Ground | list[Reading]:
+        """Ground control points on their map; else what the positions may mean, nothing where there are none."""
         if self.settings.gcp is not None:
-            sizes = {photo.name: photo.size for photo in photos}
+            sizes = {photo.name: photo.size for photo in positions.photos}
             return read_ground(self.settings.gcp, self.settings.crs, sizes, self.settings.checkpoints)
-        known = np.array([photo.exif.position for photo in photos if photo.exif.position is not None], np.float64)
-        if not len(known) and self.settings.crs != "auto":
-            raise BadInput(f"--crs {self.settings.crs} needs positions, and no photograph has one; leave it out")
-        return chart_of(known, self.settings.crs) if self.settings.gps and len(known) else None
+        return readings(positions, self.settings.crs) if self.settings.gps else []
 
     def _place(
-        self, models: Sequence[Path], photos: Sequence[Photo], site: Chart | Ground | None
-    ) -> list[tuple[Any, Placement | Control | None]]:
-        """The models, each on the map or level."""
-        return [self._place_one(number, read_model(path), site, photos) for number, path in enumerate(models)]
+        self, models: Sequence[Path], positions: Positions, site: Ground | list[Reading]
+    ) -> list[tuple[Any, Placement | Control | None, Weighed]]:
+        """The models, each on the map or level, and what became of their focal lengths and heights."""
+        photos = {photo.name: photo for photo in positions.photos}
+        alone = [read_model(path) for path in models]
+        loaded = [self._with_exif(number, model, photos) for number, model in enumerate(alone)]
+        chosen: Ground | Reading | Refused
+        if isinstance(site, Ground):
+            chosen = site
+        elif site:
+            chosen = decide(loaded[0], site, positions, self.settings.seed)
+        else:
+            chosen = Refused("no photograph has a position in EXIF or XMP" if self.settings.gps else "--no-gps")
+        placed = []
+        for number, (before, model) in enumerate(zip(alone, loaded, strict=True)):
+            final, where, stretch = self._place_one(number, model, chosen, photos)
+            placed.append((final, where, weighed(before, final, photos, stretch)))
+        for doubt in placed[0][2].doubts():  # of the others, which have the same lenses mostly, the report says it
+            emit(Warned(f"sparse/0: {doubt}"))
+        return placed
 
     def _place_one(
-        self, number: int, model: Any, site: Chart | Ground | None, photos: Sequence[Photo]
-    ) -> tuple[Any, Placement | Control | None]:
-        by_name = {photo.name: photo for photo in photos}
+        self, number: int, model: Any, site: Ground | Reading | Refused, photos: dict[str, Photo]
+    ) -> tuple[Any, Placement | Control | None, tuple[float, float] | None]:
+        """A model on the map or level, and how heights by GPS differ from those of its cameras (`height_stretch`)."""
         where: Placement | Control | Refused
         if isinstance(site, Ground):
-            where = place_by_points(model, site, self.settings.checkpoints)
-        elif isinstance(site, Chart):
-            where = place(centres_of(model), photos, site, self.settings.seed)
+            where = self._by_points(number, model, site, photos)
+        elif isinstance(site, Reading):
+            photos = {photo.name: photo for photo in site.photos}
+            where = locate(model, site, self.settings.seed)
         else:
-            where = Refused("no photograph has a position in EXIF" if self.settings.gps else "--no-gps")
+            where = site
         if isinstance(where, Refused):
             emit(Warned(f"sparse/{number} is level but not on the map and of no known scale: {where.reason}"))
-            return _levelled(model, by_name), None
-        if isinstance(where, Control):
-            for doubt in doubts(where, centres_of(model), _up(model, by_name), photos):
-                emit(Warned(f"sparse/{number}: {doubt}"))
+            return _levelled(model, photos), None, None
         model.transform(_sim3d(where.similarity))
         _name_wrong(where)
         if isinstance(where, Control):
-            return model, where
-        adjusted = adjust_once(model, where, by_name, self.settings, self.work / "adjusted" / str(number))
+            return model, where, None
+        if where.plan:
+            emit(
+                Warned(
+                    f"sparse/{number} is placed in plan, by latitudes and longitudes: its heights are not absolute, 0 "
+                    "is the middle of the ground, and up is as cameras are held"
+                )
+            )
+            return model, where, None
+        inside, ground = where.fit.inside, height_above_ground(model)
+        cameras, onto = (where.onto - where.fit.residuals)[inside], where.onto[inside]
+        stretch = height_stretch(cameras, onto, where.sigma[inside, 2], ground)
+        adjusted = adjust_once(model, where, photos, self.settings, self.work / "adjusted" / str(number))
         if adjusted is None:
             emit(Warned(f"sparse/{number}: an adjustment to the positions did not fit the photographs and is left out"))
-        return adjusted or model, where
+        return adjusted or model, where, stretch
+
+    def _with_exif(self, number: int, alone: Any, photos: dict[str, Photo]) -> Any:
+        """A copy of the model, adjusted to the focal lengths of EXIF if there are some."""
+        copy = load_engine().Reconstruction(alone)
+        if not exif_focals(alone, photos):
+            return copy
+        found = adjust_once(copy, None, photos, self.settings, self.work / "weighed" / str(number))
+        if found is None:
+            emit(Warned(f"sparse/{number}: the focal lengths of EXIF do not fit the photographs and are left out"))
+        return found or copy
+
+    def _by_points(self, number: int, model: Any, ground: Ground, photos: dict[str, Photo]) -> Control | Refused:
+        """The model by control points, unless these put it where no survey can be; says what is doubtful."""
+        where = place_by_points(model, ground, self.settings.checkpoints)
+        if isinstance(where, Refused):
+            return where
+        if why := upside_down(model, where.similarity, up_of(model, photos), where.chart.metres, where.handed):
+            return Refused(f"by the ground control points {why}; x must be east and y north, and heights count up")
+        for doubt in doubts(where, centres_of(model), list(photos.values())):
+            emit(Warned(f"sparse/{number}: {doubt}"))
+        return where
 
     def _report(
         self,
         stages: Stages,
         photos: Sequence[Photo],
-        placed: Sequence[tuple[Any, Placement | Control | None]],
+        placed: Sequence[tuple[Any, Placement | Control | None, Weighed]],
         why: dict[str, str],
     ) -> dict[str, Any]:
         report = {
             "photographs": len(photos),
             "registered": placed[0][0].num_reg_images(),
             "not_registered": why,
-            "models": [model_facts(model, where) for model, where in placed],
+            "models": [model_facts(model, where) | {"weighed": moved.facts()} for model, where, moved in placed],
             "seconds": stages.seconds(),
             "settings": self.settings,
         }
@@ -209,18 +264,7 @@ def _placed(where: Placement | Control) -> Placed:
 def _levelled(model: Any, photos: dict[str, Photo]) -> Any:
     """The model turned so that z is up, its points about 0."""
     engine = load_engine()
-    turn = turn_upright(_up(model, photos))
-    middle = turn @ np.median(_points(model), axis=0)
+    turn = turn_upright(up_of(model, photos))
+    middle = turn @ np.median(points_of(model), axis=0)
     model.transform(engine.Sim3d(1.0, engine.Rotation3d(turn), -middle))
     return model
-
-
-def _up(model: Any, photos: dict[str, Photo]) -> np.ndarray:
-    """(3,) unit vector of the model, by how cameras are held."""
-    images = [model.image(number) for number in model.reg_image_ids()]
-    poses = np.stack([np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images])
-    return up_direction(poses, [photos[image.name].exif.orientation for image in images], _points(model))
-
-
-def _points(model: Any) -> np.ndarray:
-    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)

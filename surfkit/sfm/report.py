@@ -75,16 +75,19 @@ def model_facts(model: Any, placement: Placement | Control | None) -> dict[str, 
 
 
 def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
-    """Residuals of the positions of a model on the map, metres: position in EXIF less camera."""
+    """Residuals of the positions of a model on the map, metres: position less camera. Heights have none where the
+    positions have no altitudes."""
     centres, metres = centres_of(model), placement.chart.metres
     left = np.stack([(xyz - centres[name]) * metres for name, xyz in zip(placement.names, placement.onto, strict=True)])
     inside = placement.fit.inside
     lengths = np.linalg.norm(left, axis=1)
+    rms = dict(zip("enu", np.sqrt((left[inside] ** 2).mean(0)).round(3).tolist(), strict=True))
     return {
         "crs": placement.chart.crs,
         "offset": list(placement.chart.offset),
         "positions": int(inside.sum()),
-        "rms_m": dict(zip("enu", np.sqrt((left[inside] ** 2).mean(0)).round(3).tolist(), strict=True)),
+        "heights": "above the middle of the ground" if placement.plan else "of the positions",
+        "rms_m": rms | {"u": None} if placement.plan else rms,
         "median_m": round(float(np.median(lengths[inside])), 3),
         "left_out": {
             name: round(float(length), 1)
@@ -96,7 +99,7 @@ def georeference_facts(model: Any, placement: Placement) -> dict[str, Any]:
 
 
 def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
-    """A picture of cameras and points from above; of positions in EXIF too, with a line to the camera of each."""
+    """A picture of cameras and points from above; of positions too, with a line to the camera of each."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
@@ -115,7 +118,7 @@ def draw(path: Path, model: Any, placement: Placement | Control | None) -> None:
         lines = [(centres[name][:2], to[:2]) for name, to in zip(placement.names, onto, strict=True)]
         colours = ["tab:orange" if good else "red" for good in placement.fit.inside]
         axes.add_collection(LineCollection(lines, colors=colours, linewidths=0.8))
-        axes.plot([], [], color="tab:orange", linewidth=0.8, label="to its position in EXIF")
+        axes.plot([], [], color="tab:orange", linewidth=0.8, label="to its position")
         if not placement.fit.inside.all():
             axes.plot([], [], color="red", linewidth=0.8, label="position left out")
     axes.scatter(*cameras[:, :2].T, marker="^", c="tab:blue", s=24, label=f"{len(cameras)} cameras")

@@ -39,10 +39,19 @@ class Settings:
     less robust."""
 
     gps: bool = True
-    """Place the scene on Earth by the positions in EXIF. Without it, or without such positions, it is only levelled."""
+    """Place the scene on Earth by the positions of the photographs. Without it, or without positions, it is only
+    levelled."""
+
+    positions: Path | None = None
+    """Positions of the photographs in a file, instead of those in EXIF: OpenDroneMap's geo.txt, or a table (CSV) of
+    name, x, y, z. A geo.txt beside the photographs, or in the folder above, is found without it."""
+
+    positions_crs: str | None = None
+    """Coordinate reference system of --positions, where the file names none."""
 
     crs: str = "auto"
-    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is the zone of UTM."""
+    """Coordinate reference system of the scene, such as EPSG:2180 (needs pyproj); auto is that of --positions or
+    geo.txt if it is a map, else the zone of UTM."""
 
     gcp: Path | None = None
     """Ground control points in the format of OpenDroneMap's gcp_list.txt, which then place the scene instead of GPS."""
@@ -50,15 +59,30 @@ class Settings:
     checkpoints: int = 0
     """How many of them are held back, to report how far they are off."""
 
+    frames: int = 300
+    """Frames that are taken of a video at most: sharp ones, one for each step that the picture moves."""
+
+    frame_step: float = 0.06
+    """That step, as a share of the width of the picture. It becomes larger where there would be too many frames."""
+
+    masks: Path | None = None
+    """Folder of masks: pictures called as the photographs, such as NAME.jpg.png or NAME.png. Where they are black,
+    features are not taken, and training looks away."""
+
     seed: int = 0
     """Of all that is drawn at random."""
 
     def __post_init__(self) -> None:
-        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "neighbours": (1, 1000)}
+        ranges = {"longest": (100, 20_000), "features": (100, 100_000), "frames": (3, 10_000), "neighbours": (1, 1000)}
+        require_within({"frame_step": (0.005, 0.5)}, self)
         require_within({**ranges, "checkpoints": (0, 1000), "seed": (0, 2**31 - 1)}, self)
         if self.checkpoints and self.gcp is None:
             raise BadInput("--checkpoints holds back some points of --gcp FILE, which is not given")
         if self.crs != "auto" and not self.gps and self.gcp is None:
             raise BadInput(f"--crs {self.crs} needs positions, which --no-gps leaves out; leave out one of the two")
+        if self.positions is not None and not self.gps:
+            raise BadInput("--positions gives positions, which --no-gps leaves out; leave out one of the two")
+        if self.positions_crs is not None and self.positions is None:
+            raise BadInput("--positions-crs is that of --positions FILE, which is not given")
         if not self.crs.strip():
             raise BadInput("crs is empty; name one, such as EPSG:32633, or auto")

@@ -35,6 +35,7 @@ from surfkit.sfm.mapping import SMALLEST, read_model
 from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look_at
 from surfkit.sfm.report import model_facts
 from surfkit.sfm.settings import REPORT, WORK, Settings
+from surfkit.sfm.sources import Sources
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class TiePoints:
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
-        found = compare(stages, photos, root, self.work, self.settings, cameras, poses)
+        found = compare(stages, photos, Sources(root), self.work, self.settings, cameras, poses)
         if poor := [name for name, count in found.counts.items() if count < FEWEST]:
             emit(Warned(f"{len(poor)} of {len(photos)} photographs have hardly any features: {few(poor)} are left out"))
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])
@@ -84,11 +85,13 @@ class TiePoints:
                 f"{self.data.path}: not one point could be triangulated: the photographs share no features that fit "
                 "their cameras; are these the cameras of these photographs?"
             )
-        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres or 1.0)
+        placed = None if capture.crs is None else Placed(capture.crs, tuple(offset.tolist()), capture.metres)
         if placed is None:  # no file to keep an offset in
             model.transform(load_engine().Sim3d(1.0, load_engine().Rotation3d(), offset))
         by_name = {photo.name: photo for photo in photos}
-        stages.run("undistortion", "", lambda: deliver([(model, placed)], by_name, root, self.scene, self.work))
+        stages.run(
+            "undistortion", "", lambda: deliver([(model, placed)], by_name, Sources(root), self.scene, self.work)
+        )
         report = {
             "photographs": len(capture.shots),
             "registered": model.num_reg_images(),

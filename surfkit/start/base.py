@@ -55,6 +55,20 @@ class Start(Component):
     """A way to find the points that the optimisation starts from."""
 
     @property
+    def is_dense(self) -> bool:
+        """Whether points lie on most of the surface from the start, so that densification adds few; for a forecast."""
+        return False
+
+    def usual_steps(self, photographs: int, on_gpu: bool) -> int | None:
+        """Optimisation steps after which a run that begins so gains little; None: as many as the recipe says.
+
+        Args:
+            photographs: To train on.
+            on_gpu: Whether steps are cheap.
+        """
+        return None
+
+    @property
     def needs_prior(self) -> bool:
         """Whether it looks at depth priors. Only then are they read and, where the data set has none, made."""
         return False

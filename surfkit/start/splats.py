@@ -69,6 +69,11 @@ class SplatStart(Start):
         """See `Start.cloud`; only positions, colours, opacities and mean sizes."""
         return cloud_of(self._table(known.scene))
 
+    @property
+    def is_dense(self) -> bool:
+        """See `Start.is_dense`."""
+        return True
+
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
         return len(read_splat_file(existing_model(self.file, "start.file")))

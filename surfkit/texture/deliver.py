@@ -38,6 +38,7 @@ class Delivery:
         pictures: Of the pages.
         up: Axis that points up; None to find out.
         work: Folder where painted pages are kept.
+        geoid: What heights are above, for 3D Tiles, see `ground_of`.
     """
 
     frame: Frame
@@ -46,6 +47,7 @@ class Delivery:
     pictures: Pictures
     up: Axis | None
     work: Path
+    geoid: str | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def deliver(fine: Textured, coarser: Iterable[Textured], how: Delivery, folder: 
                 raise
             emit(Warned(f"{NAME}.glb is left out: {error}".replace(f"{folder / name}: ", "")))
     if "tiles3d" in how.kinds:
-        tiles = Tiles(folder / TILES, frame, level, how.pictures)
+        tiles = Tiles(folder / TILES, frame, level, how.pictures, how.geoid)
         tiles.write(fine.region.at(fine.region.depth), what, parts, pages, 0.0)
         for level, made in enumerate(coarser, 1):
             drawn = painted(made.paint, how.pictures, how.work / f"level-{level}")

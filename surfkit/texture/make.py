@@ -19,11 +19,12 @@ from surfkit.core.lock import locked
 from surfkit.core.stages import kept_parts, key_of
 from surfkit.core.version import own_version
 from surfkit.evaluate.geometry.surface import Surface
+from surfkit.export.tileset import site_of
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.holes import areas_of
 from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
-from surfkit.scene.lengths import Length
+from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.scene import Frame, View
 from surfkit.texture.candidates import NONE, Candidates, exposure_gains
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
@@ -82,9 +83,16 @@ class TextureSettings:
     """Axis of the data set that points up, for GLB and 3D Tiles. Default: z if it is georeferenced, else what the
     cameras tell."""
 
+    geoid: str | None = None
+    """The geoid, where heights are above sea level: a grid of it (GTX, GeoTIFF), or the metres by which it lies above
+    the ellipsoid; for tiles3d. Default: what the coordinate reference system says, and without a vertical part the
+    ellipsoid."""
+
     def __post_init__(self) -> None:
         if not self.formats:
             raise BadInput("--formats: name at least one of obj, glb, tiles3d")
+        if self.geoid is not None and "tiles3d" not in self.formats:
+            raise BadInput("--geoid: only 3D Tiles need it; add tiles3d to --formats, or leave --geoid out")
         if self.triangles != "auto" and not 4 <= self.triangles <= 10**9:
             raise BadInput(f"--triangles {self.triangles}: give 4 to 1e9, or auto")
         if self.texel != "auto" and not 0 < self.texel < float("inf"):
@@ -125,6 +133,8 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     began = time.perf_counter()
     refuse_foreign(out)
     work, frame = out.with_name(f"{out.name}{WORK}"), subject.frame
+    if "tiles3d" in settings.formats:
+        refuse_unplaced(frame, settings.geoid)
     key = key_of(
         settings, own_version(), identity(subject.surface), seen(subject.views), frame.crs, frame.metres, frame.scale,
         list(frame.shift), frame.to_input(np.eye(3)).tolist(),
@@ -134,7 +144,9 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
         made = textured(subject, settings, budget_bytes, kept)
         record = facts_of(made, subject)
         with replacing_folder(out) as folder:
-            how = Delivery(frame, subject.views, set(settings.formats), settings.pictures, settings.up, work)
+            how = Delivery(
+                frame, subject.views, set(settings.formats), settings.pictures, settings.up, work, settings.geoid
+            )
             more = coarser(subject, settings, budget_bytes, made, kept) if "tiles3d" in settings.formats else ()
             record["files"] = deliver(made, more, how, folder)
             record["seconds"] = round(time.perf_counter() - began, 1)
@@ -142,6 +154,14 @@ def make_texture(subject: Subject, settings: TextureSettings, out: Path, budget_
     for name in (*record["files"], RECORD):
         emit(FileWritten(out / name, "textured mesh"))
     return record
+
+
+def refuse_unplaced(frame: Frame, geoid: str | None) -> None:
+    """BadInput, before anything is done, where 3D Tiles of a data set would have no place on Earth."""
+    try:
+        site_of(frame, geoid)
+    except BadInput as error:
+        raise BadInput(f"{error}; or leave tiles3d out of --formats") from error
 
 
 def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
@@ -153,6 +173,7 @@ def facts_of(made: Textured, subject: Subject) -> dict[str, Any]:
         "crs": subject.frame.crs,
         "offset": list(subject.frame.shift),
         "metres_per_unit": subject.frame.metres,
+        "unit": unit_of(subject.frame),
         "texel": float(f"{made.texel:.3g}"),
         "triangles": len(mesh.faces),
         "seen": round(float(areas[seen].sum() / areas.sum()), 6),

@@ -31,11 +31,14 @@ class Tiles:
         frame: Of the data set.
         up: (3, 3) from the frame of the input to z up, where it is not placed on Earth.
         pictures: Of the pages.
+        geoid: What heights are above, see `ground_of`.
     """
 
-    def __init__(self, folder: Path, frame: Frame, up: np.ndarray, pictures: Pictures) -> None:
+    def __init__(
+        self, folder: Path, frame: Frame, up: np.ndarray, pictures: Pictures, geoid: str | None = None
+    ) -> None:
         self.folder, self.frame, self.pictures = folder, frame, pictures
-        self.ground = ground_of(Path(folder.name), frame, up)  # not the name that it has until it is whole
+        self.ground = ground_of(Path(folder.name), frame, up, geoid=geoid)  # not the name that it has until it is whole
         self.written: dict[int, tuple[dict[str, Any], np.ndarray]] = {}  # by identity of the region
         self.count = 0
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Live
 
+from surfkit.core.check import printable
 from surfkit.core.events import Progress
 from surfkit.core.registry import hookimpl, plugins
 from surfkit.train.progress import PLAIN_EVERY_S, larger
@@ -34,16 +35,23 @@ class Bars:
             self.draw(event)
         elif event.done == event.total or time.perf_counter() - self.told > PLAIN_EVERY_S:
             self.told = time.perf_counter()
-            self.console.print(f"{event.what}  {event.done}/{event.total}", highlight=False, soft_wrap=True)
+            self.console.print(
+                printable(f"{event.what}  {event.done}/{event.total}"), highlight=False, soft_wrap=True, markup=False
+            )
 
     def draw(self, event: Progress) -> None:
         """Move the bar of the event's work; the last one to end takes the display with it."""
         if self.live is None:
-            columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+            )
             self.live = Live(*columns, console=self.console)
             self.live.start()
         if event.what not in self.tasks:
-            self.tasks[event.what] = self.live.add_task(event.what)
+            self.tasks[event.what] = self.live.add_task(printable(event.what))
         self.live.update(self.tasks[event.what], completed=event.done, total=event.total)
         if self.live.finished:
             self.close()

@@ -22,7 +22,7 @@ from torch import Tensor
 from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json
 from surfkit.core.codec import load as load_value
-from surfkit.core.files import sync_folder
+from surfkit.core.files import being_written, remove, sync_folder
 from surfkit.primitives.points import Points
 from surfkit.train.state import StageState
 from surfkit.train.views import Order
@@ -88,14 +88,17 @@ def taking_the_place(path: Path) -> Iterator[Path]:
     What is written must be on the disk at the end.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
+    room = being_written(path)  # a folder, as safetensors begins a file of its own beside the one that it writes
     try:
+        remove(room)
+        room.mkdir()
+        part = room / path.name
         yield part
         if path.exists():
             os.replace(path, before(path))
         os.replace(part, path)
     finally:
-        part.unlink(missing_ok=True)
+        remove(room)
     sync_folder(path.parent)
 
 

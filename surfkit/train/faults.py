@@ -20,6 +20,10 @@ MOST_HALVINGS = 2
 """Times that a run goes back to its last checkpoint with half the learning rates, before it gives up."""
 
 
+CHECKPOINT = "checkpoint*.safetensors"
+"""In the folder of a stage, the last one and the one before."""
+
+
 class Diverged(RuntimeError):
     """A step made a number that is not finite.
 
@@ -63,10 +67,16 @@ class DiskFull(Fault):
     kind = "disk"
 
     def __init__(self, out: Path, what: str) -> None:
-        super().__init__(
-            f"{what}; the last checkpoint in {out} is whole: free some space, and the same command goes on from there"
-        )
+        kept = f"; the last checkpoint in {out} is whole" if has_checkpoint(out) else ""
+        how = "the same command goes on from there" if kept else "give the same command again"
+        super().__init__(f"{what}{kept}: free some space, and {how}")
         self.what = what
+
+
+def has_checkpoint(out: Path) -> bool:
+    """Whether something is saved, in a run folder or that of a block, that training could go on from."""
+    patterns = (f"*/{CHECKPOINT}", f"partition/*/{CHECKPOINT}", f"blocks/*/*/{CHECKPOINT}", "method/**/*")
+    return any(path.is_file() for pattern in patterns for path in out.glob(pattern))
 
 
 def require_finite_losses(index: int, view: str, losses: Mapping[str, float]) -> None:
@@ -123,9 +133,11 @@ def out_of_memory(out: Path, also: str = "", error: BaseException | None = None)
     """
     what = f"{say_out_of_memory(error)}{also}"
     more = "where there is more memory" if error is None else "on a GPU with more memory, or with --device cpu,"
+    kept = f"the last checkpoint is whole, and {more} the same command goes on from there"
+    none = f"no checkpoint is written yet, and {more} the same command may do"
     return OutOfMemory(
         f"{out}: {what}; smaller photographs (--longest, --scale) or fewer points (a higher "
-        "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; the "
-        f"last checkpoint is whole, and {more} the same command goes on from there",
+        "--pretrain.densify.threshold, a lower --primitive.sh-degree) need less, in a folder of their own; "
+        f"{kept if has_checkpoint(out) else none}",
         what,
     )

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from surfkit.core.signals import asking
+
 
 @dataclass
 class StopRequest:
@@ -18,16 +20,18 @@ class StopRequest:
 
 @contextmanager
 def graceful() -> Iterator[StopRequest]:
-    """Within, the first SIGINT or SIGTERM only sets `asked`; a second one acts as ever."""
+    """Within, the first SIGINT, SIGTERM or SIGHUP only sets `asked`; a second one acts as ever, but for SIGHUP, which
+    comes several times when a terminal is closed."""
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield request
         return
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.getsignal(number) for number in asking()}
 
     def ask(number: int, frame: object) -> None:
         request.asked = True
-        signal.signal(number, previous[number])
+        if number != signal.SIGHUP:
+            signal.signal(number, previous[number])
 
     for number in previous:
         signal.signal(number, ask)

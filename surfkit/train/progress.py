@@ -66,7 +66,11 @@ class Display:
 
     def __enter__(self) -> Display:
         if self.outer is None and self.console.is_terminal:
-            columns = TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[line]}")
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(bar_width=20),
+                TextColumn("{task.fields[line]}", markup=False),
+            )
             self.bar = Progress(*columns, console=self.console, auto_refresh=False)
             self.task = self.bar.add_task(self.stage, total=self.steps, line="")
             self.bar.start()
@@ -92,7 +96,7 @@ class Display:
         if self.outer is not None:
             self.outer(self.stage, done.index, self.steps, line)
         elif self.bar is None:
-            self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True)
+            self.console.print(f"{self.stage}  {line}", highlight=False, soft_wrap=True, markup=False)
         else:
             self.bar.update(self.task, completed=done.index, line=line)
             self.bar.refresh()

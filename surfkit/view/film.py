@@ -17,6 +17,7 @@ from surfkit.render.frames import Show, identity
 from surfkit.render.path import from_file
 from surfkit.render.video import Film, frames_of, make_video, require_video
 from surfkit.scene.camera import Camera
+from surfkit.view.plain import as_code, as_text
 from surfkit.view.screen import telling
 from surfkit.view.shelf import Shelf
 
@@ -82,18 +83,19 @@ class FilmTool:
         video, said = path.with_name(f"{path.stem}-{show}-{size}.mp4"), ""
         try:
             self._make(path, video, size, show)
-            said = f"`{video}` is written."
+            said = f"{as_code(video)} is written."
             say(f"{video} is written")  # its browser may have gone
         except Stopped:
             kept = f"the pictures so far are kept in {frames_of(video)}"
             command = self._command(path, video, size, show)
-            said = f"Stopped; {kept}. *make the video* goes on" + (f", and so does\n\n`{command}`" if command else ".")
+            said = f"Stopped; {as_text(kept)}. *make the video* goes on"
+            said += f", and so does\n\n{as_code(command)}" if command else "."
             if self.closing.is_set():
                 say(f"{video} is not finished; {kept}" + (f"; it goes on with {command}" if command else ""))
         except BadInput as error:
-            said = str(error)
+            said = as_text(error)
         except Exception as error:
-            said = " ".join(f"{type(error).__name__}: {error}".split())
+            said = as_text(" ".join(f"{type(error).__name__}: {error}".split()))
         self.running = False
         if not self.closing.is_set():
             self.button.label, self.bar.visible, self.told.content = "make the video", False, said

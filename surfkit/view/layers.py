@@ -11,6 +11,7 @@ from surfkit.view.mesh_layer import MeshLayer
 from surfkit.view.outlines import block_outlines
 from surfkit.view.pace import Pace
 from surfkit.view.picking import corners_of
+from surfkit.view.plain import as_text
 from surfkit.view.point_layer import PointLayer
 from surfkit.view.screen import WORLD, Following, Latest, telling
 from surfkit.view.shelf import Shelf
@@ -75,7 +76,7 @@ class Layers:
             try:
                 layer.follow()
             except Exception as error:
-                layer.note.content = f"not updated: {' '.join(f'{type(error).__name__}: {error}'.split())}"
+                layer.note.content = f"not updated: {as_text(' '.join(f'{type(error).__name__}: {error}'.split()))}"
 
     def _camera_switches(self, gui: viser.GuiApi) -> None:
         shown = gui.add_checkbox("cameras", True, hint="Click on one to see its photograph. Orange ones were held out.")

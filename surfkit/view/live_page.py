@@ -25,6 +25,7 @@ from surfkit.view.on_page import OnPage, framed, window_of
 from surfkit.view.photographs import TURNING
 from surfkit.view.picking import corners_of, hit_camera, surface_depth
 from surfkit.view.pictures import picture
+from surfkit.view.plain import as_text
 from surfkit.view.screen import WORLD, pose_of, ray_of, stand_at, telling, whole_view
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ class LivePage:
     def tell_failed(self, said: str) -> None:
         """Show why there is no picture; nothing when there is one."""
         if said:
-            self.told.content = f"no picture: {said}"
+            self.told.content = f"no picture: {as_text(said)}"
 
     def _draw(self) -> None:
         around, kind = self.around, self.kind.value

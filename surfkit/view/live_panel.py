@@ -14,6 +14,7 @@ from surfkit.execute.state import BlockState
 from surfkit.train.watch import Watched
 from surfkit.view.control import Control
 from surfkit.view.follow import Follower, History, journals, newest_pictures, running_blocks
+from surfkit.view.plain import as_text
 
 if TYPE_CHECKING:
     import viser
@@ -78,7 +79,7 @@ class LivePanel:
 
     def tell_failed(self, what: str, said: str) -> None:
         """Show why a part of the page fails; nothing when it does not any more."""
-        self.failed[what] = f"{what}: {said}" if said else ""
+        self.failed[what] = f"{what}: {as_text(said)}" if said else ""
         text = "\n\n".join(filter(None, list(self.failed.values())))
         set_if_other(self.failures, "content", text)
         set_if_other(self.failures, "visible", bool(text))
@@ -127,7 +128,7 @@ class LivePanel:
             image.thumbnail((PICTURE_PX, PICTURE_PX))
             self.image.image = np.asarray(image.convert("RGB"))
         self.picture_path = found[0]
-        self.caption.content = f"{found[0].relative_to(out)}: photograph, render, depth, normals"
+        self.caption.content = f"{as_text(found[0].relative_to(out))}: photograph, render, depth, normals"
         self.written.visible = True
 
     def _toggle(self) -> None:
@@ -138,13 +139,13 @@ class LivePanel:
 def in_words(history: History, stage: Watched | None, running: dict[int, BlockState], control: Control) -> str:
     """How far a run is, in Markdown."""
     if stage is not None:
-        return f"**{stage.title}** {numbers(history)}{PAUSED if control.paused else ''}"
+        return f"**{as_text(stage.title)}** {numbers(history)}{PAUSED if control.paused else ''}"
     if running:
         rows = [f"- block {at}: step {state.step:,} of {state.steps:,}" for at, state in running.items()]
         return "\n".join([f"{ELSEWHERE}\n", *rows])
     if history.times and history.index < history.steps and time.time() - history.times[-1] < FRESH_S:
-        return f"**{history.title}** {numbers(history)}\n\n{ALONE}"
-    last = f"\n\n**{history.title}** {numbers(history)}" if history.rows else ""
+        return f"**{as_text(history.title)}** {numbers(history)}\n\n{ALONE}"
+    last = f"\n\n**{as_text(history.title)}** {numbers(history)}" if history.rows else ""
     return NOTHING + last
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.place import Place, place_of, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
@@ -24,8 +26,26 @@ class Textured:
 
 
 def textured(path: Path, root: dict[str, Any]) -> Textured | None:
-    """A GLB file if its triangles have pictures, else None."""
-    return Textured(path, place_of(path, root)) if root.get("textures") else None
+    """A GLB file if its triangles have pictures, else None.
+
+    A browser is sent such a file as it is, and would fetch whatever it names: one that names anything outside itself is
+    not sent.
+    """
+    if not root.get("textures"):
+        return None
+    if outside := next(addresses(root), None):
+        emit(Warned(f"{path}: the mesh is shown without pictures: it names {outside[:200]!r}, outside of the file"))
+        return None
+    return Textured(path, place_of(path, root))
+
+
+def addresses(value: Any) -> Iterator[str]:
+    """Every address at any depth of the JSON of a GLB file that is not data in itself."""
+    items = value.items() if isinstance(value, dict) else enumerate(value if isinstance(value, list) else ())
+    for name, item in items:
+        if name in ("uri", "url") and isinstance(item, str) and not item.startswith("data:"):
+            yield item
+        yield from addresses(item)
 
 
 def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, Place, Textured | None]:
@@ -49,6 +69,9 @@ def vertex_colors(path: Path) -> np.ndarray | None:
     visual = getattr(found, "visual", None)
     if visual is None or not visual.defined:
         return None
+    if missing := missing_pictures(path):
+        emit(Warned(f"{path}: the mesh is shown without its picture: {missing[0]!r} is not beside it"))
+        return None
     if visual.kind == "vertex":
         return np.asarray(visual.vertex_colors)[:, :3]
     if visual.kind != "texture":
@@ -57,4 +80,24 @@ def vertex_colors(path: Path) -> np.ndarray | None:
         colors = np.asarray(visual.vertex_attributes["color"])[:, :3]
         whole = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
         return np.round(colors / whole * 255).astype(np.uint8)
-    return None if visual.uv is None else np.asarray(visual.to_color().vertex_colors)[:, :3]
+    if visual.uv is None:
+        return None
+    picture = getattr(visual.material, "image", getattr(visual.material, "baseColorTexture", None))
+    return None if picture is None else np.asarray(visual.to_color().vertex_colors)[:, :3]
+
+
+def missing_pictures(path: Path) -> list[str]:
+    """Names of the files that an OBJ file takes its pictures from, or describes them in, and that are not there."""
+    named: list[str] = []
+    if path.suffix.lower() == ".obj":
+        named = _words(path, "mtllib")
+        for materials in [path.parent / name for name in named if (path.parent / name).is_file()]:
+            named += _words(materials, "map_Kd")
+    return [name for name in named if not (path.parent / name).is_file()]
+
+
+def _words(path: Path, key: str) -> list[str]:
+    """What follows a word at the beginning of a line, of all lines of a text file."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        words = (line.strip().partition(" ") for line in lines if line.lstrip().startswith(key))
+        return [value.strip() for found, _, value in words if found == key]

@@ -9,6 +9,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.view.glb import unlit_glb
 from surfkit.view.mesh_files import Textured
 from surfkit.view.pace import Pace
+from surfkit.view.plain import as_text
 from surfkit.view.screen import WORLD, Latest, quaternion_of, telling
 from surfkit.view.shelf import Shelf
 from surfkit.view.splat_layer import add_budget
@@ -102,4 +103,4 @@ class MeshLayer:
             cast_shadow=False,
             receive_shadow=False,
         )
-        return f"{textured.path.name} is shown, {len(data) / 1e6:.1f} MB"
+        return f"{as_text(textured.path.name)} is shown, {len(data) / 1e6:.1f} MB"

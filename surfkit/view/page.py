@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from surfkit.core.memory import give_back
 from surfkit.render.path import beside
 from surfkit.view.cursor import Cursor, serve_cursors
 from surfkit.view.layers import Layers
@@ -80,6 +81,9 @@ def show(subject: Subject, served: Served, folder: Path, most: int = MOST, form:
         if (page := pages.pop(client.client_id, None)) is not None:
             page.path.stop()
             page.layers.stop()
+        if not pages:
+            shelf.forget_choices()
+        give_back()
 
 
 class Page:

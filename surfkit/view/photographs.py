@@ -11,6 +11,7 @@ from surfkit.core.check import BadInput
 from surfkit.view.layers import Layers
 from surfkit.view.picking import corners_of, hit_camera
 from surfkit.view.pictures import KINDS, Kind, picture, thumbnail
+from surfkit.view.plain import as_text
 from surfkit.view.screen import REST_S, WORLD, quaternion_of, stand_at, telling, whole_view
 from surfkit.view.shelf import Shelf
 
@@ -90,17 +91,18 @@ class Photographs:
             return
         kind: Kind = self.kind.value
         view, subject = self.views[self.chosen], self.shelf.subject
+        name = as_text(view.name)
         held = " (held out)" if self.chosen >= len(subject.scene.train) else ""  # type: ignore[union-attr]
-        self.told.content = f"**{view.name}**{held}: {kind} ..."
+        self.told.content = f"**{name}**{held}: {kind} ..."
         draw = self.shelf.draw if subject.draw is not None else None
         try:
             self.image, told = picture(view, kind, draw, subject.frame)
         except BadInput as error:
-            self.told.content = f"**{view.name}**{held}: {error}"
+            self.told.content = f"**{name}**{held}: {as_text(error)}"
             self.panel.visible = False
             self.client.scene.remove_by_name("/chosen")
             raise
-        self.told.content = f"**{view.name}**{held}. {told}"
+        self.told.content = f"**{name}**{held}. {told}"
         self.panel.image, self.panel.visible = self.image, True
         self._place()
 

@@ -31,6 +31,7 @@ from surfkit.view.display import (
     unit_of,
 )
 from surfkit.view.picking import Places, Triangles, hit_splats
+from surfkit.view.plain import as_code
 from surfkit.view.subject import Subject
 
 Form = Literal["splats", "points", "points-while-moving"]
@@ -119,6 +120,12 @@ class Shelf:
         elif self.subject.draw is None:
             _ = self.places
 
+    def forget_choices(self) -> None:
+        """Let go of what was chosen for browsers; it is chosen again when one comes."""
+        with self.making:
+            self._splats.cache_clear()
+            self._mesh.cache_clear()
+
     def draw(self, view: View) -> Maps:
         """Maps of a view."""
         assert self.subject.draw is not None
@@ -195,7 +202,8 @@ class Shelf:
         """How to get levels of detail, for a run that has none."""
         if self.subject.levels is not None or self.subject.scene is None:
             return ""
-        return f". `surfkit lod {shlex.quote(str(self.subject.path))}` makes levels of detail, which look better"
+        command = as_code(f"surfkit lod {shlex.quote(str(self.subject.path))}")
+        return f". {command} makes levels of detail, which look better"
 
     @cached_property
     def levels(self) -> Levels | None:

@@ -13,6 +13,7 @@ import torch
 from surfkit.blocks.block import plan_file, read_plan
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.evaluate.geometry.las import CLOUDS, read_las
 from surfkit.evaluate.geometry.place import Y_UP, Z_UP, notes_in, own_notes, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
 from surfkit.export.files import read_splat_file
@@ -33,14 +34,17 @@ from surfkit.render.path import up_of
 from surfkit.run.context import RunContext
 from surfkit.run.lod import load_levels
 from surfkit.run.method import with_drawing
+from surfkit.run.resume import read_noting_changes
 from surfkit.scene.scene import Frame, Scene, View
 from surfkit.texture.deliver import NAME
 from surfkit.texture.make import RECORD
-from surfkit.view.las import CLOUDS, read_las
+from surfkit.view.display import by_height, height_bounds
 from surfkit.view.mesh_files import MESHES, Textured, other_mesh, textured
 
 EXTENT = 0.9
 """Share of the positions in a file that lies within the extent of its local frame."""
+MOST_POINTS = 10_000_000
+"""Points of a cloud that are kept; a click looks among these."""
 SPLATS_IN_GLTF = b"KHR_gaussian_splatting"
 
 
@@ -106,7 +110,7 @@ def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
         BadInput: It is neither, damaged, or there is nothing in it to look at.
     """
     if path.is_dir() and not (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
-        with loaded(path, device) as (ctx, made):
+        with loaded(path, device, read_data=read_noting_changes) as (ctx, made):
             yield of_run(ctx, made)
         return
     if not path.exists():
@@ -159,7 +163,8 @@ def textured_mesh(out: Path) -> Textured | None:
 def of_file(path: Path, device: Device) -> Subject:
     """What a file holds."""
     if path.suffix.lower() in CLOUDS:
-        xyz, rgb, notes = read_las(path)
+        xyz, rgb, notes = read_las(path, MOST_POINTS)
+        rgb = by_height(xyz[:, 2], height_bounds(xyz[:, 2])) if rgb is None else rgb
         frame = frame_of(xyz, notes)
         return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):

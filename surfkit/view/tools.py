@@ -19,6 +19,7 @@ from surfkit.view.keyframes import KeyPath, write_path
 from surfkit.view.layers import frustum_lines
 from surfkit.view.measure import coordinates, in_words, measured, path_lines, shown
 from surfkit.view.picking import corners_of
+from surfkit.view.plain import as_code, as_text
 from surfkit.view.screen import WORLD, pose_of, stand_at, telling
 from surfkit.view.shelf import Shelf
 
@@ -62,7 +63,7 @@ class Measure:
             self.client.scene.remove_by_name("/clicked")
             return
         subject = self.shelf.subject
-        self.place.content = coordinates(place, subject.frame, subject.up)
+        self.place.content = as_text(coordinates(place, subject.frame, subject.up))
         self._mark("/clicked", place, MARK)
         if self.on.value:
             self.points.append(place)
@@ -162,7 +163,9 @@ class CropTool:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_crop(path, self.crop)
         run = shlex.quote(str(source)) if source.is_dir() else "RUN"
-        self.written.content = f"Written. Use it with\n\n`surfkit mesh {run} --crop {shlex.quote(str(path))}`"
+        self.written.content = (
+            f"Written. Use it with\n\n{as_code(f'surfkit mesh {run} --crop {shlex.quote(str(path))}')}"
+        )
 
 
 class PathTool:
@@ -257,7 +260,7 @@ class PathTool:
         run = shlex.quote(str(subject.path)) if subject.path.is_dir() else "RUN"
         video = shlex.quote(str(path.with_suffix(".mp4")))
         command = f"surfkit render {run} --path {shlex.quote(str(path))} --size 1920x1080 --out {video}"
-        self.told.content = f"{frames} frames written. The video is made by\n\n`{command}`"
+        self.told.content = f"{frames} frames written. The video is made by\n\n{as_code(command)}"
 
 
 def free_name(folder: Path, stem: str) -> Path:

@@ -315,7 +315,7 @@ def test_a_disk_that_fills_while_blocks_are_tuned(undisturbed, data, recipe, tmp
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     last, damage = checkpoint.load_last(out / "blocks" / "000" / "tune" / "checkpoint.safetensors")
-    assert read_state(out / "blocks" / "000").kind == "disk" and not list(out.rglob(".*.part"))
+    assert read_state(out / "blocks" / "000").kind == "disk" and not list(out.rglob(".surfkit-*"))
     assert 0 < last.index < STEPS and damage is None
     monkeypatch.setattr(schedule, "train_waiting", train)
     run(recipe, data, out, Compute("cpu"), EVERY)

@@ -162,8 +162,7 @@ def test_the_driver_is_killed_and_started_again(undisturbed, data, recipe, tmp_p
     ]
     words += ["executor:pool", "--executor.workers", "2", "--checkpoint-every", "4", "--pictures-every", "0"]
     driver = subprocess.Popen([sys.executable, "-m", "surfkit.cli", *words], stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 60
-    while not any((tmp_path / "run" / "blocks").glob("00*/state.json")) and time.monotonic() < until:
+    while not any((tmp_path / "run" / "blocks").glob("00*/state.json")) and driver.poll() is None:
         time.sleep(0.01)
     driver.kill()
     driver.wait()
@@ -188,9 +187,9 @@ def test_a_block_that_was_deleted_is_tuned_again(undisturbed, data, recipe, tmp_
     shutil.copytree(undisturbed, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "blocks" / "001")
     (tmp_path / "run" / "point_cloud.ply").write_bytes(b"of an older merge")
-    (tmp_path / "run" / "blocks" / ".merge.json.7.part").write_bytes(b"of a process that is gone")
+    (tmp_path / "run" / "blocks" / ".surfkit-merge.json.7.part").write_bytes(b"of a process that is gone")
     run(recipe, data, tmp_path / "run", Compute("cpu"), EVERY)
-    assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".*.part"))
+    assert same(tmp_path / "run", undisturbed) and not list((tmp_path / "run").rglob(".surfkit-*"))
 
 
 def test_blocks_of_a_finished_run_can_be_deleted(undisturbed, data, recipe, tmp_path, capsys):
@@ -236,7 +235,7 @@ def test_a_block_that_is_worked_on_is_left_alone(undisturbed, tmp_path, capsys):
     folder = tmp_path / "run" / "blocks" / "000"
     before = (folder / "state.json").read_bytes()
     holding = "import sys, time\nfrom pathlib import Path\nfrom surfkit.core.lock import locked\n"
-    holding += f"with locked(Path({str(folder)!r})):\n    print('held', flush=True)\n    time.sleep(60)"
+    holding += f"with locked(Path({str(folder)!r})):\n    print('held', flush=True)\n    time.sleep(3600)"
     other = subprocess.Popen([sys.executable, "-c", holding], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"held\n"

@@ -22,9 +22,7 @@ STATES = {0: RUNNING, 1: DONE, 2: BlockState(), 3: FAILED}
 
 
 def wait_until(what):
-    until = time.monotonic() + 60
     while not what():
-        assert time.monotonic() < until, "it took too long"
         time.sleep(0.01)
 
 

@@ -41,9 +41,8 @@ def command(monkeypatch, run):
 
 def test_help_lists_every_command(capsys):
     assert main(["--help"]) == main([]) == 0
-    out = capsys.readouterr().out
-    for name, text in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(text)}$", out, re.M)
+    out = " ".join(capsys.readouterr().out.split())  # texts are wrapped
+    assert all(f" {name} {text}" in out for name, text in COMMANDS.items())
 
 
 def test_version(capsys):
@@ -135,7 +134,7 @@ def test_help_of_a_command_shows_recipes_and_settings(world, capsys):
         ([*OK, "--pretrain.losses.l1.weight", "x"], "--pretrain.losses.l1.weight: expected a number, got 'x'"),
         (
             [*OK, "--pretrain.losses.depth.until", "x"],
-            "--pretrain.losses.depth.until: expected None or a whole number, got 'x'",
+            "--pretrain.losses.depth.until: expected none or a whole number, got 'x'",
         ),
         ([*OK, "--pretrain.steps"], "--pretrain.steps: a value must follow"),
         (["evaluate", "RUN", "--seen"], "--seen: a value must follow"),
@@ -232,11 +231,65 @@ def test_bad_input_and_interrupts_are_one_line(monkeypatch, capsys):
     assert main(["export"]) == 3
 
 
-def test_sigterm_is_an_interrupt(monkeypatch, capsys):
-    before = signal.getsignal(signal.SIGTERM)
-    command(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGTERM))
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_sigterm_and_a_closed_terminal_are_an_interrupt(monkeypatch, capsys, number):
+    before, after = signal.getsignal(number), []
+
+    def asked():
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            if number == signal.SIGHUP:  # comes again, while what is begun is put away
+                os.kill(os.getpid(), number)
+            after.append("put away")
+
+    command(monkeypatch, asked)
     assert (main(["export"]), capsys.readouterr().err) == (130, "surfkit: interrupted\n")
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert signal.getsignal(number) == before and after == ["put away"]
+
+
+def test_under_nohup_a_closed_terminal_is_ignored(monkeypatch):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        command(monkeypatch, lambda: os.kill(os.getpid(), signal.SIGHUP))
+        assert main(["export"]) == 0 and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("module", ["surfkit", "surfkit.cli"])
+def test_it_runs_as_a_module(module, tmp_path):
+    """Where the command is not on the PATH; its exit status is that of the process."""
+    run = [sys.executable, "-m", module]
+    done = subprocess.run([*run, "--version"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("surfkit ")
+    done = subprocess.run([*run, "trian"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.startswith("surfkit: no command 'trian'; did you mean 'train'?")
+
+
+OUTLIVES = """
+import sys
+from pathlib import Path
+from surfkit.cli.streams import outlive_terminal
+outlive_terminal()
+outlive_terminal()
+print("on the terminal", flush=True)
+sys.stdin.readline()
+for stream in (sys.stdout, sys.stderr) * 2:
+    print("to nobody", file=stream, flush=True)
+Path(sys.argv[1]).write_text("saved")
+"""
+
+
+def test_output_to_a_terminal_that_was_closed_ends_nothing(tmp_path):
+    ours, theirs = os.openpty()
+    words = [sys.executable, "-c", OUTLIVES, str(tmp_path / "state")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        assert os.read(ours, 100) == b"on the terminal\r\n"
+        os.close(ours)
+        process.communicate(b"now\n")
+    assert process.returncode == 0 and (tmp_path / "state").read_text() == "saved"
 
 
 def test_our_own_mistakes_keep_their_traceback(monkeypatch):
@@ -406,3 +459,54 @@ def test_help_loads_neither_torch_nor_tyro():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_help_names_no_none_of_python_and_none_is_a_value(world, capsys):
+    assert main(["train", "recipe:discs", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "None" not in out and re.search(r"--pretrain\.losses\.depth\.until INT\b", out)
+    for word in ("none", "None"):
+        words = ["train", "recipe:balls", "--data", "d", "pretrain.losses.depth:depth"]
+        assert main([*words, "--pretrain.losses.depth.until", word]) == 0
+        assert "until=None" in capsys.readouterr().out
+
+
+def test_no_part_of_surfkit_shows_none_of_python(capsys):
+    for command in ("train", "evaluate", "mesh", "maps"):
+        assert main([command, *["recipe:citygs2"] * (command == "train"), "--help"]) == 0
+        assert "None" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_prose_of_help_is_wrapped(capsys, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    assert main(["mesh", "--help"]) == 0
+    about = capsys.readouterr().out.split("\n\n")[1:-1]
+    lines = "\n".join(part for part in about if "─" not in part).splitlines()
+    assert len(lines) > 2 and max(map(len, lines)) <= width
+    assert main(["--help"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines()[5:])) <= width
+
+
+def test_help_of_a_command_by_either_order(world, capsys):
+    assert main(["help", "train"]) == main(["train", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert out[: len(out) // 2] == out[len(out) // 2 :] != ""
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["discs"], "no recipe chosen: unexpected 'discs'; did you mean recipe:discs?"),
+        (["dics", "--data", "d"], "no recipe chosen: unexpected 'dics'; did you mean recipe:discs?"),
+        (
+            ["a/scene"],
+            "unexpected 'a/scene'; did you mean --data a/scene? And no recipe chosen: add one",
+        ),
+        ([*OK[1:], "relocate"], "unexpected 'relocate'; did you mean pretrain.grow:relocate?"),
+        ([*OK[1:], "a/scene"], "unexpected 'a/scene'; did you mean --data a/scene?"),
+    ],
+)
+def test_words_without_their_slot_or_flag(world, capsys, words, line):
+    assert main(["train", *words]) == 2
+    assert capsys.readouterr().err.startswith(f"surfkit: {line}")

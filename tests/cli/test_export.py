@@ -1,5 +1,6 @@
 """`surfkit export` from one format to another; runs are exported in tests/test_pipeline.py."""
 
+import json
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -86,6 +87,8 @@ def test_survey_coordinates_keep_their_digits(tmp_path, capsys):
         ("{here}/text.txt --format spz", "no file of splats of a known format; known: compressed-ply"),
         ("{here} --format spz", "no run folder"),
         ("{here}/scene.ply --out {here}/folder.spz", "a folder; name a file"),
+        ("{here}/scene.ply --format spz --geoid 40", "--geoid: files of the format spz keep heights as they are"),
+        ("{here}/scene.ply --format tiles3d --geoid 40", "--geoid 40: the data set has no coordinate reference system"),
     ],
 )
 def test_mistakes_are_one_line(ply, tmp_path, capsys, words, message):
@@ -110,5 +113,9 @@ def test_tiles_on_earth_leave_out_nothing(ply, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(Export, "_opened", opened)
     status, lines, _ = said(capsys, ply, "format:tiles3d", "--out", tmp_path / "tiles")
     assert status == 0 and not any("offset" in line for line in lines)
+    assert said(capsys, ply, "format:tiles3d", "--out", tmp_path / "high", "--geoid", "40")[0] == 0
+    low, high = (json.loads((tmp_path / name / "tileset.json").read_text()) for name in ("tiles", "high"))
+    move = np.subtract(high["root"]["transform"], low["root"]["transform"])[12:15]
+    assert np.linalg.norm(move) == pytest.approx(40, abs=1e-3)
     status, lines, _ = said(capsys, ply, "format:tiles3d", "--format.no-georeference", "--out", tmp_path / "other")
     assert status == 0 and lines[1].startswith("coordinates leave out the offset 512000 5800000")

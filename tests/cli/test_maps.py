@@ -68,6 +68,29 @@ def test_a_textured_mesh_of_the_same_surface_differs_by_nothing(run, tmp_path):
     assert found["area"] == pytest.approx(64, rel=0.02) and found["fill"] + found["cut"] < 1e-3
 
 
+@pytest.mark.parametrize("name", ["dsm.tif", "scan.laz"])
+def test_heights_of_rasters_and_laser_scans_are_subtracted(run, tmp_path, name):
+    """Of a plane 0.5 below the mesh."""
+    if name == "dsm.tif":
+        x = -4 + 0.2 * (np.arange(40) + 0.5)
+        place = rasterio.Affine(0.2, 0, -4, 0, -0.2, 4)
+        kind = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float64"}
+        with rasterio.open(tmp_path / name, "w", **kind, transform=place) as file:
+            file.write(np.broadcast_to(1.5 + 0.5 * x, (40, 40)), 1)
+    else:
+        laspy, plan = needs("laspy"), np.random.default_rng(0).uniform(-4, 4, (40_000, 2))
+        needs("lazrs")
+        made = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+        made.header.scales = [1e-4] * 3
+        made.x, made.y, made.z = plan[:, 0], plan[:, 1], 1.5 + 0.5 * plan[:, 0]
+        made.write(tmp_path / name)
+    words = ["maps", str(run), "--gsd", "0.1", "--up", "z", "--products", "hillshade", "--out", str(tmp_path / "m")]
+    assert main([*words, "--against", str(tmp_path / name)]) == 0
+    found = json.loads((tmp_path / "m/maps.json").read_text())["difference"]
+    assert found["area"] > 58 and found["median"] == pytest.approx(0.5, abs=0.03)
+    assert found["fill"] / found["area"] == pytest.approx(0.5, abs=0.03) and found["cut"] < 0.01
+
+
 def test_cells_are_as_large_as_pixels_and_the_cameras_say_what_is_up(run, capsys):
     assert main(["maps", str(run), "--products", "hillshade"]) == 0
     record = json.loads((run / "maps" / "maps.json").read_text())
@@ -114,12 +137,12 @@ def test_no_run_and_no_mesh(tmp_path, run, capsys):
     assert main(["maps", str(tmp_path)]) == 2
     assert "no run folder" in capsys.readouterr().err
     assert main(["maps", str(run), "--against", str(run / "point_cloud.ply"), "--gsd", "1"]) == 2
-    assert "a cloud of points; name a mesh" in capsys.readouterr().err
+    assert "splats, which are no surface; name a mesh" in capsys.readouterr().err
 
 
 def test_without_the_package_of_textures_nothing_is_read(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    monkeypatch.setattr("surfkit.cli.maps.read", lambda data: pytest.fail("the data set is read"))
+    monkeypatch.setattr("surfkit.cli.maps.read_unchanged", lambda run: pytest.fail("the data set is read"))
     assert main(["maps", str(run), "--colors", "photographs"]) == 2
     assert "needs the package fast_simplification" in capsys.readouterr().err
 

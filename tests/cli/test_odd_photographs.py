@@ -15,6 +15,7 @@ from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 pytestmark = needs_native
 SETTINGS = "recipe:surface mesh:none --steps 1 --device cpu --pictures-every 0 --primitive.sh-degree 0".split()
+SETTINGS += ["--test-every", "8"]
 HARDLY = "of the pixels of the depth maps are trusted; see whether the photographs are mirrored"
 OTHERS = "there are none that can be used; make others with `surfkit prepare depth {farm} --again`"
 
@@ -130,7 +131,7 @@ def test_it_ends_with_a_clear_word_and_nothing_half_written(made, tmp_path, own_
     before = files(farm)
     lines = [
         ["train", *SETTINGS, "--data", str(farm), "--out", str(out)],
-        ["prepare", "depth", str(farm), "estimator:patch-match", "--device", "cpu"],
+        ["prepare", "depth", str(farm), "estimator:patch-match", "--device", "cpu", "--test-every", "8"],
     ]
     for words, (status, text) in zip(lines, reversed(wanted), strict=True):
         assert main(words) == status

@@ -10,7 +10,7 @@ from PIL import Image
 
 from surfkit.cli import main
 from surfkit.cli.recipes import recipes
-from surfkit.core.lock import locked
+from surfkit.core.lock import NAME, locked
 from surfkit.core.tree import evolve
 from surfkit.depth.patch_match import PatchMatch
 from surfkit.depth.plane_sweep import PlaneSweep
@@ -67,14 +67,14 @@ def test_from_photographs_to_a_run_with_priors(farm, tmp_path, capsys):
 
 
 def test_one_process_at_a_time_and_what_a_killed_one_left_half_written_goes(farm, capsys):
-    left = farm / "estimated_depths/.view_001.png.npy.1.part"
+    left = farm / "estimated_depths/.surfkit-view_001.png.npy.1.part"
     with locked(left.parent):
         left.touch()
         assert main(["prepare", "depth", str(farm), *SMALL]) == 2
         assert "works in it; wait for its end" in capsys.readouterr().err
         assert left.exists() and not maps(farm), "it may be what the other one writes"
     assert main(["prepare", "depth", str(farm), *SMALL]) == 0
-    assert not left.exists() and not (left.parent / "lock").exists() and len(maps(farm)) == 12
+    assert not left.exists() and not (left.parent / NAME).exists() and len(maps(farm)) == 12
 
 
 def test_an_interrupted_estimate_goes_on_to_the_same_maps(farm, monkeypatch, capsys):

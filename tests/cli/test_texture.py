@@ -92,7 +92,7 @@ def test_other_folders_are_left_alone(run, tmp_path, capsys):
 
 def test_without_the_package_one_line_says_what_to_install(run, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
-    monkeypatch.setattr("surfkit.cli.texture.read", lambda data: pytest.fail("the data set is read"))
+    monkeypatch.setattr("surfkit.cli.texture.read_unchanged", lambda run: pytest.fail("the data set is read"))
     assert main(["texture", str(run)]) == 2
     said = capsys.readouterr().err
     assert "needs the package fast_simplification" in said and "surfkit[texture]" in said and said.count("\n") == 1

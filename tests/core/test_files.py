@@ -9,7 +9,15 @@ import pytest
 
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
-from surfkit.core.files import refuse_own, refuse_special, refuse_unwritable, replacing, replacing_folder, sweep
+from surfkit.core.files import (
+    being_written,
+    refuse_own,
+    refuse_special,
+    refuse_unwritable,
+    replacing,
+    replacing_folder,
+    sweep,
+)
 
 
 def test_a_file_is_replaced_after_the_disk_has_it(tmp_path, monkeypatch):
@@ -28,7 +36,7 @@ def test_two_threads_write_the_same_file(tmp_path):
     def write(text):
         with replacing(tmp_path / "a.txt") as file:
             file.write(text)
-            both.wait(60)
+            both.wait()
 
     with ThreadPoolExecutor(2) as threads:
         list(threads.map(write, [b"one", b"two"]))
@@ -53,18 +61,41 @@ def test_a_full_disk_names_the_file(tmp_path):
 
 def test_what_the_dead_left_is_swept_away(tmp_path):
     for name in (
-        "x/.a.json.12.part",
+        "x/.surfkit-a.json.12.part",
         "x/a.json",
-        ".c.part",
-        "x/.tmpAb1cD2",
+        ".surfkit-c.part",
         ".hidden",
-        ".t.9.part/.u.9.part",
-        ".t.9.part/v",
+        ".surfkit-t.9.part/.surfkit-u.9.part",
+        ".surfkit-t.9.part/v",
     ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
+    (tmp_path / "x" / "mine.part").mkdir()
+    elsewhere = tmp_path.with_name(f"{tmp_path.name}-elsewhere")
+    (elsewhere / "folder").mkdir(parents=True)
+    (elsewhere / "folder" / ".surfkit-b.part").touch()
+    (tmp_path / "linked").symlink_to(elsewhere)
+    (tmp_path / ".surfkit-link.part").symlink_to(elsewhere / "folder")
+    for name in (".c.part", "x/.a.json.12.part", "x/.tmpAb1cD2"):  # of other programs, and of users
+        (tmp_path / name).touch()
     sweep(tmp_path)
-    assert sorted(p.name for p in tmp_path.rglob("*")) == [".hidden", "a.json", "x"]
+    left = sorted(p.name for p in tmp_path.rglob("*"))
+    assert left == [".a.json.12.part", ".c.part", ".hidden", ".tmpAb1cD2", "a.json", "linked", "mine.part", "x"]
+    assert (elsewhere / "folder" / ".surfkit-b.part").exists(), "a link is not followed"
+
+
+def test_a_link_in_the_place_of_what_is_being_written_is_not_followed(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    being_written(tmp_path / "a.json").symlink_to(tmp_path / "mine.txt")
+    with replacing(tmp_path / "a.json") as file:
+        file.write(b"new")
+    assert (tmp_path / "mine.txt").read_text() == "mine" and (tmp_path / "a.json").read_text() == "new"
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "tiles").symlink_to(tmp_path / "folder")
+    with replacing_folder(tmp_path / "tiles") as new:
+        (new / "one").touch()
+    assert not (tmp_path / "tiles").is_symlink() and not list((tmp_path / "folder").iterdir())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "folder", "mine.txt", "tiles"]
 
 
 def test_a_folder_is_replaced_as_a_whole(tmp_path):

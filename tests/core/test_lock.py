@@ -1,6 +1,7 @@
 import fcntl
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -8,7 +9,7 @@ import pytest
 
 from surfkit.core import lock
 from surfkit.core.check import BadInput
-from surfkit.core.lock import lock_holder, locked
+from surfkit.core.lock import FORMER, NAME, lock_holder, locked
 
 WAITS = """
 import sys
@@ -37,14 +38,14 @@ def test_a_second_process_is_refused_until_the_first_is_dead(other, tmp_path, mo
     assert lock_holder(tmp_path / "run").startswith(f"process {other.pid} on ")
     other.kill()
     other.wait()
-    assert lock_holder(tmp_path / "run") is None and (tmp_path / "run" / "lock").exists(), "killed, it leaves the file"
+    assert lock_holder(tmp_path / "run") is None and (tmp_path / "run" / NAME).exists(), "killed, it leaves the file"
     with locked(tmp_path / "run"):
-        assert json.loads((tmp_path / "run" / "lock").read_text())["pid"] == os.getpid()
+        assert json.loads((tmp_path / "run" / NAME).read_text())["pid"] == os.getpid()
 
 
 def test_an_empty_folder_does_not_stay(tmp_path):
     with pytest.raises(ValueError, match="on the way"), locked(tmp_path / "a" / "b"):
-        assert (tmp_path / "a" / "b" / "lock").exists()
+        assert (tmp_path / "a" / "b" / NAME).exists()
         raise ValueError("on the way")
     assert not (tmp_path / "a").exists()
     with locked(tmp_path / "a" / "b"):
@@ -53,7 +54,7 @@ def test_an_empty_folder_does_not_stay(tmp_path):
 
 
 def test_a_lock_that_was_deleted_meanwhile_is_none(tmp_path, monkeypatch):
-    path, flock, calls = tmp_path / "lock", fcntl.flock, []
+    path, flock, calls = tmp_path / NAME, fcntl.flock, []
 
     def slow(file, how):  # between our opening and our locking, the one before deletes its file
         calls.append(how)
@@ -76,3 +77,42 @@ def test_without_locks_there_is_a_note(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", refuse)
     with locked(tmp_path / "run"):
         assert len(said) == 1 and "cannot be locked" in said[0]
+
+
+@pytest.mark.parametrize("kind", ["link", "link to nothing", "text", "json", "nested", "folder", "pipe"])
+def test_what_is_not_our_file_stays_as_it_is(tmp_path, kind):
+    out, mine = tmp_path / "run", tmp_path / "mine.txt"
+    out.mkdir()
+    path, content = out / NAME, {"json": '{"pid": 1}', "nested": "[" * 4000}.get(kind, "my own text")
+    mine.write_text(content)
+    if kind.startswith("link"):
+        path.symlink_to(mine if kind == "link" else tmp_path / "new.txt")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.write_text(content)
+    with pytest.raises(BadInput, match=f"{re.escape(str(path))}: not a file that surfkit made"), locked(out):
+        pass
+    assert lock_holder(out) is None
+    assert os.path.lexists(path) and mine.read_text() == content and not (tmp_path / "new.txt").exists()
+    assert not path.is_file() or path.read_text() == content
+
+
+def test_a_file_called_lock_may_be_the_users(tmp_path):
+    (tmp_path / FORMER).write_text("mine")
+    with locked(tmp_path):
+        assert lock_holder(tmp_path).startswith(f"process {os.getpid()} on ")
+    assert [path.name for path in tmp_path.iterdir()] == [FORMER] and (tmp_path / FORMER).read_text() == "mine"
+
+
+def test_a_process_of_an_older_version_is_waited_for(tmp_path):
+    (tmp_path / FORMER).write_text('{"pid": 77, "host": "there"}')
+    with (tmp_path / FORMER).open("r+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert lock_holder(tmp_path) == "process 77 on there"
+        with pytest.raises(BadInput, match="process 77 on there works in it; wait"), locked(tmp_path):
+            pass
+    with locked(tmp_path):
+        pass

@@ -10,7 +10,7 @@ def test_parts_stay_until_the_work_is_done(tmp_path):
     folder = tmp_path / "work"
     with pytest.raises(KeyboardInterrupt), kept_parts(folder, "a"):
         (folder / "part").write_text("1")
-        (folder / ".part.7.part").write_text("half")
+        (folder / ".surfkit-part.7.part").write_text("half")
         raise KeyboardInterrupt
     with kept_parts(folder, "a"):
         assert sorted(path.name for path in folder.iterdir()) == ["part", KEY]
@@ -33,7 +33,7 @@ def test_parts_of_something_else_are_deleted_and_it_is_said(tmp_path, monkeypatc
 
 
 def test_an_interruption_at_the_beginning_or_at_the_end_stops_nothing(tmp_path):
-    (tmp_path / f".{KEY}.1-2.part").write_text("{")
+    (tmp_path / f".surfkit-{KEY}.1-2.part").write_text("{")
     with pytest.raises(BadInput, match="wrong"), kept_parts(tmp_path, "a"):
         raise BadInput("wrong")
     assert not tmp_path.exists(), "nothing to go on with"

@@ -16,7 +16,7 @@ from surfkit.core.memory import size
 from surfkit.core.tree import evolve
 from surfkit.densify.adc import ADC
 from surfkit.densify.filters import CountCap
-from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, one_digit
+from surfkit.doctor.estimate import Load, Room, advice, duration, estimate, first_look, one_digit
 from surfkit.doctor.examine import examine
 from surfkit.doctor.forecast import Plan, beyond, forecast, schedule, within
 from surfkit.doctor.growth import Growth, growth
@@ -27,6 +27,7 @@ from surfkit.primitives.points import Points
 from surfkit.raster.select import select
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
+from surfkit.recipes.surface import SURFACE
 from surfkit.scene.scene import Cloud
 from surfkit.testing.simulated_gpu import OnSimulatedGpu, simulated_gpu
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -320,3 +321,27 @@ def test_what_to_lower_where_a_gpu_is_small(free, words):
     assert [finding.what for finding in advice(found)] == ["gpu-memory"] * (words is not None)
     assert words is None or words in advice(found)[0].text and "filters.0.points 1000000" in advice(found)[0].text
     assert estimate(LOAD, parts(10**6, 2 * 10**6), rising(2_000_000), probed(), ROOM).gpu is None
+
+
+def test_points_that_begin_dense_multiply_less():
+    """By runs of recipe:surface: steps, points at the beginning and at the end."""
+    measured = [
+        (1_000, 178_403, 192_182),
+        (3_000, 178_403, 258_159),
+        (700, 131_896, 182_641),
+        (3_500, 131_896, 439_368),
+    ]
+    for steps, first, last in measured:
+        stage = with_steps(SURFACE, steps).pretrain
+        dense = growth(stage, first, 30_000_000, is_dense=True)
+        assert last / 1.7 < dense.last < last * 1.7
+        assert dense.at(0) == first and dense.at(1) == dense.last
+    whole = growth(SURFACE.pretrain, 484_693, 18_000_000, is_dense=True)
+    assert whole.last < 5 * 484_693 < growth(SURFACE.pretrain, 484_693, 18_000_000).last
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(3_600, 0), (4 * 3_600, 1)])
+def test_a_first_look_is_proposed_where_the_run_takes_hours(seconds, count):
+    found = estimate(LOAD, parts(1_000_000, 2_000_000), rising(2_000_000), probed(), ROOM)
+    notes = first_look(replace(found, seconds=float(seconds)))
+    assert len(notes) == count and all("recipe:surface-short" in note.text and "4 h" in note.text for note in notes)

@@ -12,8 +12,9 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.comparison import usual_visible
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
+from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.visibility import visible, visible_counts
-from surfkit.evaluate.geometry.volume import CropSettings, visible_crop
+from surfkit.evaluate.geometry.volume import CropSettings, heightened, outside_shares, visible_crop
 from surfkit.scene.camera import Camera
 from surfkit.scene.crop import Crop, read_crop, within, write_crop
 from surfkit.scene.scene import Frame, View
@@ -207,3 +208,29 @@ def test_the_volume_ends_where_the_views_do():
     assert np.abs(moved.polygon.mean(0) - [100, 0]).max() < 2 and moved.area == pytest.approx(4 * crop.area, rel=0.05)
     with pytest.raises(BadInput, match="seen by 5 or more of 5 views.*give --transform"):
         visible_crop(ground + [500, 0, 0], views, Frame(np.zeros(3), 1.0), np.eye(4), CropSettings(1.0, "z", 2.0, 0.25))
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_a_volume_reaches_as_far_as_the_reconstruction(axis):
+    """A square of 8 at height 1; a floor 2 below it, a roof 3 above, a sky at 500, and a deep floor beside it."""
+    order = {"x": [2, 0, 1], "z": [0, 1, 2]}[axis]
+    crop = Crop(np.array([[0, 0], [8, 0], [8, 8], [0, 8]], float), 0.5, 1.5, axis)
+
+    def level(height, left=1.0, size=6.0):
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + [left, 1.0]
+        return np.column_stack([corners, np.full(4, height)])[:, order]
+
+    parts = [level(1.0), level(-1.0), level(4.0), level(500.0), level(-9.0, left=20.0)]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = Surface("given", np.concatenate(parts), np.concatenate([faces + 4 * at for at in range(len(parts))]))
+    found = heightened(crop, mesh, np.eye(4), 0.25)
+    assert (found.low, found.high) == (-1.25, 4.25) and found.axis == axis
+    assert heightened(crop, Surface("given", level(1.0), faces), np.eye(4), 0.25) == crop
+    fifth = pytest.approx(0.2)
+    assert outside_shares(mesh, np.eye(4), found) == {"above": fifth, "below": 0, "beside": fifth}
+    assert outside_shares(mesh, np.eye(4), crop) == {"above": pytest.approx(0.4), "below": fifth, "beside": fifth}
+    cloud = Surface("given", mesh.rows)
+    assert outside_shares(cloud, np.eye(4), crop) == {"above": pytest.approx(0.4), "below": fifth, "beside": fifth}
+    up = np.eye(4)
+    up["xyz".index(axis), 3] = 5.0
+    assert heightened(crop, mesh, up, 0.25).high == 9.25

@@ -1,14 +1,20 @@
 """Meshes and clouds from files of every kind, and what is wrong with bad ones."""
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 from needs import needs
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry import surface
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.highest import highest
+from surfkit.evaluate.geometry.las import read_las
+from surfkit.evaluate.geometry.place import same_plan
+from surfkit.evaluate.geometry.sampling import face_areas
+from surfkit.evaluate.geometry.surface import Surface, read_surface, system_of
 from surfkit.export.ply import write_points
 
 trimesh = needs("trimesh")
@@ -135,7 +141,6 @@ def test_bad_points_with_lists(tmp_path):
         ("empty", np.empty((0, 3)), [], 3, "no points in it"),
         ("nan", np.full((3, 3), np.nan), [[0, 1, 2]], 3, "none of its 3 points is finite"),
         ("far", [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 3]], 3, "names vertex 3 of 3"),
-        ("quads", [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]] * 8, 4, "triangulate it"),
     ],
 )
 def test_bad_meshes(tmp_path, name, vertices, faces, corners, message):
@@ -156,3 +161,134 @@ def test_bad_files(tmp_path):
     (tmp_path / "mesh.xyzzy").write_text("hello")
     with pytest.raises(BadInput, match="cannot be read as a mesh"):
         read_surface(tmp_path / "mesh.xyzzy")
+
+
+@pytest.mark.parametrize("name", ["faces.ply", "text.ply", "faces.obj"])
+@pytest.mark.parametrize("corners", [[4], [5], [3, 4, 5], [4, 3]])
+def test_faces_of_more_corners_are_triangulated(tmp_path, name, corners):
+    """The areas of regular polygons of radius 1, side by side."""
+    path, vertices, faces = tmp_path / name, [], []
+    for at, count in enumerate(corners):
+        faces.append([len(vertices) + k for k in range(count)])
+        turn = 2 * np.pi * np.arange(count) / count
+        vertices += np.column_stack([np.cos(turn) + 3 * at, np.sin(turn), 0 * turn]).tolist()
+    if name.endswith(".obj"):
+        lines = [f"v {x} {y} {z}\n" for x, y, z in vertices]
+        path.write_text("".join(lines + [f"f {' '.join(str(k + 1) for k in face)}\n" for face in faces]))
+    else:
+        kind = "ascii" if name == "text.ply" else "binary_little_endian"
+        head = f"ply\nformat {kind} 1.0\nelement vertex {len(vertices)}\n"
+        head += "".join(f"property float {axis}\n" for axis in "xyz")
+        head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        if kind == "ascii":
+            rows = [*vertices, *([len(face), *face] for face in faces)]
+            body = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
+        else:
+            body = np.array(vertices, "<f4").tobytes()
+            body += b"".join(bytes([len(face)]) + np.array(face, "<i4").tobytes() for face in faces)
+        path.write_bytes(head.encode() + body)
+    found = read_surface(path)
+    wanted = sum(count / 2 * np.sin(2 * np.pi / count) for count in corners)
+    assert face_areas(found).sum() == pytest.approx(wanted, rel=1e-5)
+
+
+def scan(path, points, system=None):
+    """A LAS or LAZ file of points on a millimetre, by laspy."""
+    laspy = needs("laspy")
+    needs("lazrs")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.offsets, header.scales = points.min(0), np.full(3, 0.001)
+    if system is not None:
+        text = needs("pyproj").CRS(system).to_wkt("WKT1_GDAL")
+        header.vlrs.append(needs("laspy.vlrs.known").WktCoordinateSystemVlr(text))
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = points.T
+    made.write(path)
+
+
+PLACES = np.random.default_rng(0).uniform(0, 50, (2_000, 3)) + [500_000.0, 5_800_000.0, 100.0]
+
+
+@pytest.mark.parametrize("name", ["scan.las", "scan.laz", "SCAN.LAZ"])
+def test_laser_scans_are_clouds(tmp_path, name, told, monkeypatch):
+    scan(tmp_path / name, PLACES, "EPSG:32633")
+    found = read_surface(tmp_path / name)
+    assert found.faces is None and np.abs(found.vertices() - PLACES).max() < 1e-3
+    assert system_of(tmp_path / name) == "EPSG:32633" and not told
+    monkeypatch.setattr("surfkit.evaluate.geometry.las.AT_ONCE", 300)
+    xyz, rgb, _ = read_las(tmp_path / name, 900)
+    assert np.abs(xyz - PLACES[::3]).max() < 1e-3 and rgb is None
+    assert len(told) == 1 and "667 of 2,000 points are used" in told[0]
+
+
+def test_a_file_that_is_no_scan_is_refused(tmp_path):
+    needs("laspy")
+    (tmp_path / "a.las").write_bytes(b"LASF, but no more")
+    with pytest.raises(BadInput, match="a.las: cannot be read"):
+        read_surface(tmp_path / "a.las")
+    (tmp_path / "a.e57").write_bytes(b"hello")
+    with pytest.raises(BadInput, match="a.e57"):  # without pye57 that names the package
+        read_surface(tmp_path / "a.e57")
+
+
+@pytest.mark.parametrize("north_up", [True, False])
+def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, told, monkeypatch):
+    rasterio = needs("rasterio")
+    rows, columns = np.indices((30, 40))
+    heights = (100 + 0.5 * columns + 0.25 * rows).astype(np.float32)
+    heights[3, 4] = -9999
+    step = -2.0 if north_up else 2.0
+    place = rasterio.Affine(2.0, 0, 500_000.0, 0, step, 5_800_000.0)
+    kind = {"driver": "GTiff", "width": 40, "height": 30, "count": 1, "dtype": "float32", "nodata": -9999}
+    with rasterio.open(tmp_path / "dsm.tif", "w", **kind, transform=place, crs="EPSG:32633") as file:
+        file.write(heights, 1)
+    found = read_surface(tmp_path / "dsm.tif")
+    xyz = found.vertices()
+    assert len(xyz) == 30 * 40 - 1 and system_of(tmp_path / "dsm.tif") == "EPSG:32633"
+    column, row = (xyz[:, 0] - 500_000) / 2 - 0.5, (xyz[:, 1] - 5_800_000) / step - 0.5
+    assert np.allclose(xyz[:, 2], 100 + 0.5 * column + 0.25 * row, atol=1e-4)
+    corners = xyz[found.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normals[:, 2] > 0).all()
+    flat = np.abs(normals[:, 2]).sum() / 2
+    # Six of the triangles of two square units each meet in the cell without a height.
+    assert flat == pytest.approx(4 * 29 * 39 - 6 * 2)
+    monkeypatch.setattr("surfkit.evaluate.geometry.heights.MAX_CELLS", 300)
+    assert len(read_surface(tmp_path / "dsm.tif")) < 320 and "read as 20 x 15" in told[-1]
+
+
+def test_pictures_and_rasters_without_a_place_are_refused(tmp_path):
+    Image.fromarray(np.zeros((9, 9, 3), np.uint8)).save(tmp_path / "photo.tif")
+    with pytest.raises(BadInput, match="a picture of 3 bands"):
+        read_surface(tmp_path / "photo.tif")
+    Image.fromarray(np.zeros((9, 9), np.float32)).save(tmp_path / "dsm.tif")
+    with pytest.raises(BadInput, match="where it lies"):
+        read_surface(tmp_path / "dsm.tif")
+
+
+def test_the_highest_points_of_a_cloud_are_a_surface():
+    draw = np.random.default_rng(1)
+    plan = draw.uniform(0, 30, (20_000, 2))
+    ground = np.column_stack([plan, 0.1 * plan[:, 0]])
+    roof = np.column_stack([10 + draw.uniform(0, 10, (30_000, 2)), np.full(30_000, 8.0)])
+    found = highest(Surface(Path("given"), np.concatenate([ground, roof]) + [400_000, 0, 0]))
+    xyz = found.vertices() - [400_000, 0, 0]
+    inner = (np.abs(xyz[:, :2] - 15) < 4.5).all(1)
+    outer = (np.abs(xyz[:, :2] - 15) > 6).any(1)
+    assert (np.abs(xyz[inner, 2] - 8) < 1e-9).mean() > 0.98, "but for squares in which no point of the roof fell"
+    assert np.abs(xyz[outer, 2] - 0.1 * xyz[outer, 0]).max() < 0.1
+    assert inner.sum() > 500 and len(found.faces) > len(xyz)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("EPSG:32633", "epsg:32633", True),
+        ("EPSG:25833", "EPSG:25833+7837", True),
+        ("EPSG:32633", "EPSG:32634", False),
+        ("EPSG:32633", "topocentric 1 2 3", False),
+    ],
+)
+def test_systems_are_compared_in_plan(one, other, same):
+    needs("pyproj")
+    assert same_plan(one, other) is same

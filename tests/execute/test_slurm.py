@@ -30,10 +30,8 @@ def job(folder: Path, index: int, code: str = "pass", **more) -> Job:
     return Job(index, place, lambda: index, ("-c", f"import os; os.chdir({str(place)!r}); exec({code!r})"), **more)
 
 
-def wait_for(what, seconds=60):
-    until = time.monotonic() + seconds
+def wait_for(what):
     while not what():
-        assert time.monotonic() < until, "it took too long"
         time.sleep(0.05)
 
 
@@ -55,7 +53,7 @@ SAVING = (
     "import signal, sys, time\nfrom pathlib import Path\n"
     "def save(*_):\n    time.sleep(0.3)\n    Path('saved').touch()\n    sys.exit(130)\n"
     "signal.signal(signal.SIGTERM, save)\n"
-    "Path('new').write_text(str(os.getppid()) + ' ' + str(os.getpid()))\nPath('new').rename('began')\ntime.sleep(60)"
+    "Path('new').write_text(str(os.getppid()) + ' ' + str(os.getpid()))\nPath('new').rename('began')\ntime.sleep(3600)"
 )
 
 
@@ -90,7 +88,7 @@ def leave(tmp_path, monkeypatch):
     monkeypatch.setattr(slurm.Queue, "ended", ended)
     with pytest.raises(Stop):
         next(Slurm("local", parallel=2).run([job(tmp_path, at, SAVING) for at in (0, 1, 2)]))
-    assert not psutil.wait_procs(found, timeout=60)[1]
+    assert not psutil.wait_procs(found)[1]
     assert all((tmp_path / f"00{at}" / "saved").exists() for at in (0, 1)) and not (tmp_path / "002" / LOG).exists()
 
 

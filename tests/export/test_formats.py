@@ -247,3 +247,8 @@ def test_read_splats_is_as_exact_as_before(tmp_path):
     splats = table(count=30)
     PLY().write(tmp_path / "a.ply", splats)
     assert same(read_splats(tmp_path / "a.ply"), splats)
+
+
+def test_the_median_scale_of_an_even_number_is_between_two():
+    few = table(count=1, log_scales=torch.tensor([[0.0, 2.0, -9.0]]))
+    assert few.median_scale() == pytest.approx(math.exp(1.0))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from needs import needs
 from scipy.spatial.transform import Rotation
 
 from surfkit.core.check import BadInput
@@ -100,6 +101,41 @@ def test_splats_lie_on_earth_where_proj_has_them(tmp_path):
     )
     up = np.array(ECEF) / np.linalg.norm(ECEF)
     assert transform[:3, 2] @ up > 0.999
+
+
+@pytest.mark.parametrize(
+    ("crs", "geoid", "height", "said"),
+    [
+        ("EPSG:25834", "", 120.0, "EPSG:25834 does not say what heights are above"),
+        ("EPSG:25834+7837", "", 120.0, "PROJ knows no geoid for them; give"),
+        ("EPSG:25834+7837", "34.5", 154.5, None),
+        ("EPSG:32634", "34.5", 154.5, None),
+    ],
+)
+def test_heights_above_sea_level_are_raised_by_the_geoid_or_told_of(tmp_path, monkeypatch, crs, geoid, height, said):
+    pyproj, told = needs("pyproj"), []
+    monkeypatch.setattr("surfkit.export.tileset.emit", told.append)
+    table = on_the_map(splat_table(count=20))
+    Tiles3D(compress="none", geoid=geoid).write(tmp_path / "t", table, replace(MAPPED, crs=crs))
+    place = np.reshape(tileset(tmp_path / "t")["root"]["transform"], (4, 4))[3, :3]
+    found = pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*place)[2]
+    assert found == pytest.approx(height, abs=1e-3)
+    assert said is None or said in told[0].text
+
+
+def test_what_has_no_place_on_earth_leaves_nothing_behind(tmp_path):
+    needs("pyproj")
+    table = on_the_map(splat_table(count=20))
+    for frame, said in (
+        (replace(MAPPED, crs="EPSG:3857"), "1 m to the east or north is"),
+        (replace(MAPPED, metres=0.3048), "EPSG:32634 is in units of metre"),
+        (replace(MAPPED, crs="EPSG:5513"), "its axes point south and west"),
+    ):
+        with pytest.raises(BadInput, match=said):
+            Tiles3D().write(tmp_path / "t", table, frame)
+    with pytest.raises(BadInput, match="--geoid 40: the data set has no coordinate reference system"):
+        Tiles3D(geoid="40").write(tmp_path / "t", table, replace(MAPPED, crs=None))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_json_is_what_cesiumjs_expects(tmp_path):

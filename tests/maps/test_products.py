@@ -12,6 +12,7 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.maps.cloud import sample_evenly, write_cloud
 from surfkit.maps.contours import contour_lines, even_interval
+from surfkit.maps.difference import write_difference
 from surfkit.maps.geotiff import Sheet, workshop
 from surfkit.maps.grid import Window, map_crs, same_crs
 from surfkit.maps.hillshade import hillshade
@@ -155,6 +156,21 @@ def test_a_surface_does_not_differ_from_itself(tmp_path):
     assert [found[name] for name in ("fill", "cut", "median", "median_absolute", "percentile_90")] == [0] * 5
 
 
+@pytest.mark.parametrize("heights", [[-4.0, 1.0, 2.0, 9.0], [-4.0, 1.0, 9.0], [3.0, -5.0], [2.0]])
+def test_the_median_of_an_even_number_of_differences_is_a_mean(tmp_path, heights):
+    grid = grid_of(1.0, *UTM, UTM[0] + len(heights), UTM[1] + 1)
+    crs, _ = map_crs(FRAME)
+    with workshop(tmp_path, ()) as folder:
+        sheet = Sheet(grid, crs, folder, tmp_path)
+        for name, row in (("here.tif", heights), ("there.tif", np.zeros(len(heights)))):
+            with sheet.raster(name, "heights") as file:
+                file.write(np.array([row]), Window(0, 0, len(heights), 1), {})
+        found = write_difference(sheet, (tmp_path / "here.tif", tmp_path / "there.tif"), "difference.tif", 64)
+    assert found.median == pytest.approx(np.median(heights), abs=1e-4)
+    assert found.median_absolute == pytest.approx(np.median(np.abs(heights)), abs=1e-4)
+    assert found.percentile_90 == pytest.approx(np.percentile(np.abs(heights), 90), abs=1e-4)
+
+
 def test_surfaces_apart_cannot_be_subtracted(tmp_path):
     west, east = UTM, (UTM[0] + 30, UTM[1])
     here, there = (heightfield(rising(0), at, (at[0] + 20, at[1] + 20)) for at in (west, east))
@@ -186,12 +202,49 @@ def test_maps_stay_when_the_next_ones_would_show_nothing(tmp_path, bounds, said)
 
 @pytest.mark.parametrize(
     "crs, metres, unit",
-    [("EPSG:32633", 1.0, "m"), ("EPSG:2263+6360", 0.3048006096012192, "US ft"), ("EPSG:2222", 0.3048, "ft")],
+    [
+        ("EPSG:32633", 1.0, "m"),
+        ("EPSG:2263+6360", 0.3048006096012192, "US ft"),
+        ("EPSG:2263", 0.3048006096012192, "US ft"),
+        ("EPSG:2222", 0.3048, "ft"),
+        ("EPSG:2180", 1.0, "m"),
+    ],
 )
 def test_lengths_are_called_as_their_system_does(tmp_path, crs, metres, unit):
     here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
     frame = Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)
     assert make_maps(Subject(here, frame), MapSettings((), 0.5), tmp_path)["unit"] == unit
+
+
+@pytest.mark.parametrize(
+    "crs, metres, said",
+    [
+        ("EPSG:2263+5703", 0.3048006096012192, "in units of US survey foot, heights in metre"),
+        ("EPSG:2263", 1.0, "EPSG:2263 is in units of US survey foot"),
+        ("EPSG:32633", 0.3048, "EPSG:32633 is in units of metre"),
+        ("EPSG:5513", 1.0, "its axes point south and west"),
+        ("EPSG:2048", 1.0, "its axes point west and south"),
+        ("EPSG:3857", 1.0, r"lengths on the map are 1\.\d+ times those on the ground here, areas [12]\.\d+ times"),
+    ],
+)
+def test_a_system_that_would_make_volumes_wrong_is_refused(tmp_path, crs, metres, said):
+    here = heightfield(rising(0), UTM, (UTM[0] + 20, UTM[1] + 20))
+    with pytest.raises(BadInput, match=said):
+        make_maps(Subject(here, Frame(np.array([*UTM, 0.0]), 0.01, metres, crs)), MapSettings((), 0.5), tmp_path / "m")
+    assert not (tmp_path / "m").exists()
+
+
+def test_lengths_that_a_map_stretches_a_little_are_told_of(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("surfkit.maps.grid.emit", told.append)
+    place = (2_000_000.0, 2_000_000.0)  # 64 degrees north
+    for crs, at in (("EPSG:3035", (4_321_000.0, 3_210_000.0)), ("EPSG:3995", place)):
+        map_crs(Frame(np.array([*at, 0.0]), 0.01, 1.0, crs))
+    longer = float(told[0].text.split("are ")[1].split(" times")[0])
+    pyproj = needs("pyproj")
+    lon, lat = pyproj.Transformer.from_crs("EPSG:3995", "EPSG:4326", always_xy=True).transform(*place)
+    scale = pyproj.Proj("EPSG:3995").get_factors(lon, lat).areal_scale ** 0.5
+    assert len(told) == 1 and longer == pytest.approx(scale, abs=2e-3)
 
 
 def test_a_coordinate_reference_system_is_the_same_however_it_is_spelt():

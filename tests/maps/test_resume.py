@@ -1,5 +1,6 @@
 """Maps that are interrupted go on, and come to the same bytes."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned
 from surfkit.maps import contours, surface_model
 from surfkit.maps import make as making
-from surfkit.maps.geotiff import WORK
 from surfkit.maps.make import MapSettings, Subject, make_maps
+from surfkit.maps.ours import NAMES, WORK
 from surfkit.scene.scene import Frame
 from surfkit.texture import make as texturing
 
@@ -115,3 +116,60 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     with pytest.raises(BadInput, match="not surfkit's"):
         make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
     assert (tmp_path / WORK / "novel.txt").read_text() == "chapter 1"
+
+
+def files_of(folder):
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("name", ["dsm.tif", "hillshade.tif", "maps.json"])
+def test_files_of_another_program_are_not_replaced(tmp_path, name):
+    (tmp_path / name).write_text("of another program")
+    with pytest.raises(OSError, match=f"surfkit did not write, .*: '{name}'; name another folder"):
+        make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
+    assert files_of(tmp_path) == {name: b"of another program"}
+
+
+def test_beside_our_maps_too(tmp_path, monkeypatch):
+    """Maps that are made again, also smaller ones, or after an interruption, replace and delete ours alone."""
+    few, less = replace(SETTINGS, products=("contours",)), replace(SETTINGS, products=())
+    make_maps(Subject(hill(4.0), FRAME), few, tmp_path)
+    (tmp_path / "hillshade.tif").write_text("of another program")
+    (tmp_path / "difference.png").symlink_to("nowhere")
+    make_maps(Subject(hill(4.0), FRAME), few, tmp_path)
+    stopped(monkeypatch, Subject(hill(4.0), FRAME), few, tmp_path)
+    before = files_of(tmp_path)
+    for settings, other in ((replace(SETTINGS, products=("hillshade",)), None), (few, hill(3.0))):
+        with pytest.raises(OSError, match="surfkit did not write, .*: '(hillshade.tif|difference.png)';"):
+            make_maps(Subject(hill(4.0), FRAME), settings, tmp_path, other)
+    assert files_of(tmp_path) == before
+    make_maps(Subject(hill(4.0), FRAME), less, tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"dsm.tif", "maps.json", "hillshade.tif", "difference.png"}
+    assert (tmp_path / "hillshade.tif").read_text() == "of another program"
+
+
+def test_what_a_version_before_left_of_an_interruption_is_ours(tmp_path, monkeypatch):
+    stopped(monkeypatch, Subject(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
+    (tmp_path / WORK / NAMES).unlink()
+    make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path)
+    assert (tmp_path / "maps.json").exists()
+
+
+def test_maps_that_end_half_way_leave_nothing_that_is_in_the_way(tmp_path, monkeypatch):
+    with monkeypatch.context() as change:
+        change.setattr(making, "trace", lambda *_: (_ for _ in ()).throw(BadInput("too many levels")))
+        with pytest.raises(BadInput, match="too many levels"):
+            make_maps(Subject(hill(4.0), FRAME), replace(SETTINGS, products=("contours",)), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_record_names_no_file_outside(tmp_path):
+    """maps.json lies in a folder that others may write to: what it names is deleted only if it is a map's name."""
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "kept.txt").write_text("chapter 1")
+    make_maps(Subject(hill(4.0), FRAME), SETTINGS, tmp_path / "maps")
+    record = json.loads((tmp_path / "maps/maps.json").read_text())
+    (tmp_path / "maps/maps.json").write_text(json.dumps(record | {"files": ["../kept.txt", *record["files"]]}))
+    make_maps(Subject(hill(4.0), FRAME), replace(SETTINGS, products=()), tmp_path / "maps")
+    assert (tmp_path / "kept.txt").read_text() == "chapter 1"

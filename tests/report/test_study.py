@@ -1,5 +1,6 @@
 """Running tables, with runs that only pretend to train."""
 
+import csv
 import io
 import json
 from dataclasses import replace
@@ -11,9 +12,13 @@ from rich.console import Console
 from surfkit.core import registry
 from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
+from surfkit.core.registry import find
 from surfkit.densify import CountCap, Elongation
+from surfkit.densify.base import Prune
+from surfkit.losses.depth import DepthRegression
 from surfkit.method.stereo import StereoFusion
 from surfkit.readers.data import Data
+from surfkit.readers.depth_prior import OFF
 from surfkit.readers.fingerprint import fingerprint as data_fingerprint
 from surfkit.readers.read import read
 from surfkit.recipes.ablations import COARSE_BASELINE, MODEL, TABLES, stereo_alone
@@ -22,10 +27,11 @@ from surfkit.report import rows
 from surfkit.report.ablation import Row, Table, build
 from surfkit.report.rows import Outcome
 from surfkit.report.screen import Screen
-from surfkit.report.study import Plan, ablate, fingerprint, report_of, trials, unfinished
+from surfkit.report.study import Plan, ablate, fingerprint, report_of, run_folder, trials, unfinished
 from surfkit.report.table import lines, markdown
 from surfkit.report.truth import Truth
 from surfkit.run import shared
+from surfkit.run.folder import Run
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from surfkit.train.progress import Display
 
@@ -280,6 +286,7 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
         return {"f1": 0.25 * len(calls), "truth": str(files[1]), "tau": settings.tau}
 
     monkeypatch.setattr(truth, "opened", Opened)
+    monkeypatch.setattr(truth, "read_unchanged", lambda run: read(run.data))
     monkeypatch.setattr(truth, "measure_geometry", measure)
     gt = tmp_path / "gt.ply"
     vertices = "".join(f"{x} {y} 0\n" for x in range(20) for y in range(20))
@@ -304,16 +311,20 @@ def test_f1_of_every_row_in_the_volume_of_the_first(data, runs, monkeypatch, tmp
 
 def test_a_fingerprint_tells_what_a_run_is_made_from(data, monkeypatch):
     recipe = COARSE_BASELINE
-    first = fingerprint(recipe, data)
-    assert first == fingerprint(replace(recipe, about="in other words"), data) and len(first) == 12
+
+    def made_by(recipe, data):
+        return fingerprint(recipe, data, shared.versions(recipe))
+
+    first = made_by(recipe, data)
+    assert first == made_by(replace(recipe, about="in other words"), data) and len(first) == 12
     others = [
-        fingerprint(replace(recipe, seed=1), data),
-        fingerprint(recipe, replace(data, scale=2.0)),
-        fingerprint(recipe, Data(data.path.parent)),
+        made_by(replace(recipe, seed=1), data),
+        made_by(recipe, replace(data, scale=2.0)),
+        made_by(recipe, Data(data.path.parent)),
     ]
     newer = [replace(plugin, version="99") for plugin in shared.records()]
     monkeypatch.setattr(shared, "records", lambda: newer)
-    others.append(fingerprint(recipe, data))
+    others.append(made_by(recipe, data))
     assert len({first, *others}) == 5
 
 
@@ -334,16 +345,52 @@ def test_other_code_of_a_plugin_is_another_run(data, tmp_path, monkeypatch):
     monkeypatch.setenv("SURFKIT_PLUGINS", "acme")
     registry.reload()
     try:
-        known, first = shared.versions(), fingerprint(COARSE_BASELINE, data)
+        using = replace(COARSE_BASELINE, pretrain=replace(COARSE_BASELINE.pretrain, prune=(find(Prune, "odd")(),)))
+        known, first = shared.versions(using), run_folder(tmp_path, using, data)
         assert known.keys() == {"surfkit", "acme"} and known["acme"].startswith("1.0+") and "+" not in known["surfkit"]
-        assert fingerprint(COARSE_BASELINE, data) == first
+        assert shared.versions(COARSE_BASELINE).keys() == {"surfkit"}, "no part of it is the plugin's"
+        without = run_folder(tmp_path, COARSE_BASELINE, data)
         rule.write_text("ODD = 1 - 1\n")
-        assert fingerprint(COARSE_BASELINE, data) != first
+        assert run_folder(tmp_path, using, data) != first
+        assert run_folder(tmp_path, COARSE_BASELINE, data) == without
         rule.write_text("ODD = None\n")
-        assert fingerprint(COARSE_BASELINE, data) == first
+        assert run_folder(tmp_path, using, data) == first
+        named_by_all = tmp_path / fingerprint(COARSE_BASELINE, data, shared.versions())  # as of an older version
+        assert named_by_all != without
+        named_by_all.mkdir()
+        assert run_folder(tmp_path, COARSE_BASELINE, data) == named_by_all
     finally:
         monkeypatch.undo()
         registry.reload()
+
+
+def test_rows_that_could_not_run_as_named_are_blank_and_marked(data, tmp_path, monkeypatch):
+    """Their depth losses were switched off: their figures are those of the row above."""
+    made = {"images": {"psnr": 20.0, "ssim": 0.5}, "points": 9, "seconds": 1.0, "cpu_seconds": 1.0}
+
+    def run_it(recipe, data, folder, *_args, **_kwargs):
+        write_json(folder / "metrics.json", made)
+        lacks = Run(folder, recipe, data).wants_priors
+        write_json(folder / "run.json", {"notes": [f"no depth priors, so {OFF}"] if lacks else []})
+        return made
+
+    monkeypatch.setattr(rows.pipeline, "run", run_it)
+    losses = COARSE_BASELINE.pretrain.losses | {"depth": DepthRegression()}
+    rows_with_depth = (Row("plain"), Row("depth", {"pretrain.losses": losses}))
+    table = Table("depths", "Depth", COARSE_BASELINE, rows_with_depth)
+    report = ablate(Plan(table, (data,), tmp_path / "out"), Silent())
+    plain, depth = rows_in(report)
+    assert plain["mean"]["psnr"] == 20 and plain["not_as_named"] is None
+    assert depth["mean"] == {} and "depth map" in depth["not_as_named"] and depth["failed"] is None
+    assert [run["folder"] for run in depth["runs"]] and not unfinished(Plan(table, (data,), tmp_path / "out"))
+    first, second = csv.DictReader((tmp_path / "out/ablation.csv").open())
+    assert first["psnr"] == "20.0" and not first["not_as_named"]
+    assert second["psnr"] == "" and "depth map" in second["not_as_named"] and second["folder"]
+    tex = (tmp_path / "out/ablation.tex").read_text()
+    line = next(line for line in tex.splitlines() if line.startswith("depth"))
+    assert line.startswith(r"depth$^\dagger$ &") and not set("0123456789") & set(line)
+    assert r"$^\dagger$" in tex.split("bottomrule")[1] and "depth map" in tex.split("bottomrule")[1]
+    assert "not run as named" in markdown(report)
 
 
 def test_f1_with_other_settings_or_of_another_file_is_measured_again(tmp_path):

@@ -68,7 +68,9 @@ def maps(cache):
 
 def own_maps(farm):
     """Let a data set have the maps of SWEEP."""
-    words = "estimator:plane-sweep --estimator.longest 32 --estimator.neighbours 2 --estimator.max-planes 16"
+    words = (
+        "estimator:plane-sweep --estimator.longest 32 --estimator.neighbours 2 --estimator.max-planes 16 --test-every 8"
+    )
     assert main(f"prepare depth {farm.path} {words}".split()) == 0
 
 

@@ -337,6 +337,19 @@ def test_a_full_disk_stops_the_run_with_its_checkpoint_whole(data, recipe, tmp_p
     assert run(recipe, data, out)["steps"] == STEPS and steps(out) == list(range(1, STEPS + 1))
 
 
+def test_a_disk_that_fills_before_the_first_checkpoint_claims_none(data, recipe, tmp_path):
+    out = tmp_path / "run"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(Fault, match=r"checkpoint.safetensors: the disk is full \(.*\): free some space") as found:
+            run(recipe, data, out, intervals=Intervals(5))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "is whole" not in str(found.value) and str(found.value).endswith("give the same command again")
+    assert not list(out.rglob("*.safetensors")) and run(recipe, data, out)["steps"] == STEPS
+
+
 def test_out_of_memory_is_one_line_and_the_checkpoint_stays(data, recipe, tmp_path, monkeypatch):
     step = Trainer.step
 

@@ -84,7 +84,7 @@ def test_a_damaged_entry_is_deleted_with_a_warning(run, tmp_path, warnings, dama
 
 def test_what_a_dead_process_left_is_never_an_entry(run, tmp_path):
     store = StageStore(tmp_path / "stages")
-    left = tmp_path / "stages" / ".k1.77.part"
+    left = tmp_path / "stages" / ".surfkit-k1.77.part"
     left.mkdir(parents=True)
     (left / RECORD).write_text(json.dumps({}))
     assert store.find("k1") is None

@@ -5,7 +5,10 @@ import pytest
 from needs import needs
 
 from surfkit.core.check import BadInput
-from surfkit.scene.earth import Site, from_utm, to_ecef, utm
+from surfkit.scene.earth import Site, from_utm, on_earth, to_ecef, utm
+from surfkit.scene.geoid import geoid_of
+
+from .grids import plane, write_gtx
 
 LOCAL = "+proj=topocentric +ellps=WGS84 +lat_0=47.5 +lon_0=8.9 +h_0=430.0"
 PROJ_ECEF = [  # pyproj 3.7, to EPSG:4978
@@ -61,7 +64,10 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
 @pytest.mark.parametrize(
     ("crs", "text"),
     [
-        ("EPSG:2263", "its axes are not east, north and up in one unit"),  # feet on the map, metres of height
+        ("EPSG:2263+5703", "in units of US survey foot, heights in metre"),
+        ("EPSG:3857", "1 m to the east or north is .* m on the map"),
+        ("EPSG:5513", "its axes point south and west"),
+        ("+proj=utm +zone=33 +ellps=bessel", "the shift from its datum to WGS 84 is not known"),
         ("EPSG:4326", "it is in degrees, where lengths belong"),
         ("EPSG:1", "pyproj cannot place it on Earth"),
     ],
@@ -69,7 +75,7 @@ def test_a_site_in_utm_has_metres_of_the_ground_and_the_axes_of_the_grid():
 def test_what_has_no_place_is_refused_in_one_line(crs, text):
     needs("pyproj")
     with pytest.raises(BadInput, match=text) as caught:
-        Site.at(crs, np.array([8.9, 47.5, 430.0]))
+        Site.at(crs, np.array([1e6, 6e6, 430.0]))
     assert "\n" not in str(caught.value)
 
 
@@ -82,3 +88,73 @@ def test_without_pyproj_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
     with pytest.raises(BadInput, match=r"EPSG:25832.*pip install 'surfkit\[crs\]'"):
         to_ecef("EPSG:25832", np.array([[5e5, 5.3e6, 0]]))
+
+
+PLACE = np.array([451_234.5, 5_873_456.25, 37.0])  # 8.273207 east, 53.008438 north
+BERLIN = np.array([[4_590_000.0, 5_820_000.0, 50.0]])
+
+
+def ellipsoidal(ecef):
+    """Longitude, latitude and height above the ellipsoid, by PROJ."""
+    return needs("pyproj").Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*np.ravel(ecef))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:25832+7837", "EPSG:32632+5773"])
+def test_heights_above_a_geoid_that_is_given(tmp_path, crs):
+    needs("rasterio")
+    for geoid, height in ((str(write_gtx(tmp_path / "g.gtx")), plane(53.00843816, 8.27320668)), ("39.5", 39.5)):
+        convert, notes = on_earth(crs, PLACE, geoid_of(geoid))
+        found = ellipsoidal(convert(PLACE[None]))
+        np.testing.assert_allclose(found[:2], (8.27320668, 53.00843816), atol=1e-7)
+        assert found[2] == pytest.approx(37 + height, abs=1e-3) and notes == ()
+
+
+def test_a_geoid_that_proj_has_is_used_without_a_word(tmp_path):
+    """The system names a grid that is there; PROJ itself gives the height."""
+    pyproj = needs("pyproj")
+    text = f"+proj=utm +zone=32 +datum=WGS84 +geoidgrids={write_gtx(tmp_path / 'g.gtx')} +type=crs"
+    convert, notes = on_earth(text, PLACE)
+    wanted = pyproj.Transformer.from_crs(text, "EPSG:4979", always_xy=True).transform(*PLACE)
+    np.testing.assert_allclose(ellipsoidal(convert(PLACE[None])), wanted, atol=1e-6)
+    assert wanted[2] == pytest.approx(37 + plane(53.00843816, 8.27320668), abs=1e-3) and notes == ()
+
+
+@pytest.mark.parametrize(
+    ("crs", "grid"),
+    [
+        ("+proj=utm +zone=32 +datum=WGS84 +geoidgrids=no_such_geoid.gtx", "no_such_geoid.gtx"),
+        ("EPSG:25832+7837", "de_bkg_gcg2016.tif"),
+        ("EPSG:32632+5773", "us_nga_egm96_15.tif"),
+    ],
+)
+def test_a_geoid_that_is_not_installed_is_named(crs, grid):
+    """PROJ leaves the height as it is, and says so in the description of its transformation only."""
+    needs("pyproj")
+    convert, notes = on_earth(crs, PLACE)
+    height = ellipsoidal(convert(PLACE[None]))[2]
+    if crs.startswith("EPSG") and not notes:  # a machine that has the grid
+        assert height == pytest.approx(37 + 39.5, abs=2)
+        return
+    assert len(notes) == 1 and f"`pyproj sync --file {grid}`" in notes[0] and "--geoid FILE or METRES" in notes[0]
+    assert height == pytest.approx(37, abs=1e-3)
+
+
+def test_without_a_vertical_part_heights_are_above_the_ellipsoid_of_the_datum_and_a_note_says_so():
+    pyproj = needs("pyproj")
+    for crs, metres, place in (("EPSG:25832", 1, PLACE), ("EPSG:2263", 1200 / 3937, [980_000.0, 200_000.0, 50.0])):
+        convert, notes = on_earth(crs, np.array(place))
+        known = pyproj.Transformer.from_crs(pyproj.CRS(crs).to_3d(), "EPSG:4979", always_xy=True)
+        wanted = known.transform(*place[:2], place[2] * metres)
+        np.testing.assert_allclose(ellipsoidal(convert(np.array([place]))), wanted, rtol=0, atol=1e-6)
+        assert f"{crs} does not say what heights are above" in notes[0] and "--geoid" in notes[0]
+    assert Site.at("EPSG:2263", np.array(place)).unit == pytest.approx(1200 / 3937, rel=1e-4)
+
+
+def test_a_datum_that_is_placed_roughly_only_is_told():
+    """Without its grid, PROJ brings DHDN to WGS 84 within 2 m there; far from Germany by any shift that it knows."""
+    needs("pyproj")
+    notes = on_earth("EPSG:31468", BERLIN[0], geoid_of("40"))[1]
+    if notes:  # else the grid is installed here
+        assert "EPSG:31468 is placed on Earth within 2 m; for 1 m PROJ needs the grid de_adv_BETA2007.tif" in notes[0]
+    (note,) = on_earth("EPSG:25832", np.array([5e5, 2e6, 0.0]), geoid_of("40"))[1]
+    assert "EPSG:25832 is not meant for latitude 18." in note

@@ -1,21 +1,24 @@
 """Where a data set lies on Earth, against PROJ, and that nothing of it is lost in files of float32."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.export.ply import read_splats, read_vertices, write_splats
 from surfkit.export.table import SplatTable
 from surfkit.readers.data import Data
 from surfkit.readers.georeference import place_on_earth
-from surfkit.readers.read import read
+from surfkit.readers.opensfm import ODM
+from surfkit.readers.read import observations, read, read_capture
 from surfkit.run.notes import collect_notes
 from surfkit.scene.earth import utm
 from surfkit.scene.scene import Frame
-from surfkit.testing.synthetic import Flight, photograph
+from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 from .folders import surveyed
 
@@ -54,6 +57,35 @@ def test_a_topocentric_reconstruction_comes_where_proj_puts_it(tmp_path):
     moved = place.moved.points(local)
     np.testing.assert_allclose(moved[:, :2], wanted[:, :2], atol=2e-3)
     np.testing.assert_allclose(moved[:, 2], wanted[:, 2], atol=2e-2, err_msg="heights are scaled too, by 0.05 %")
+
+
+@pytest.mark.parametrize(("away", "said"), [(500.0, None), (1_000.0, 0.08), (2_500.0, 0.49), (5_000.0, 1.96)])
+def test_how_far_the_earth_bends_below_a_reconstruction_is_told(tmp_path, away, said):
+    """A camera that far from the reference is d^2 / 2 R lower on the round Earth than the similarity puts it."""
+    model = {
+        "cameras": {"c": {"projection_type": "perspective", "width": 40, "height": 30, "focal": 1}},
+        "shots": {
+            f"{at}.png": {"camera": "c", "rotation": [np.pi, 0, 0], "translation": translation}
+            for at, translation in enumerate([[0.0, 0.0, 100.0], [-away, 0.0, 100.0], [0.0, 50.0, 100.0]])
+        },
+    }
+    project(tmp_path)
+    (tmp_path / "opensfm/reconstruction.json").write_text(json.dumps([model]))
+    (tmp_path / "images").mkdir()
+    for name in model["shots"]:
+        Image.new("RGB", (40, 30), (90, 90, 90)).save(tmp_path / "images" / name)
+    with collect_notes() as notes:
+        capture = read_capture(Data(tmp_path), ODM())
+    found = [text for text in notes.texts if "the Earth is round" in text]
+    east = -capture.shots[1].pose[:3, :3].T @ capture.shots[1].pose[:3, 3] - capture.shift
+    assert abs(east[0] - 468 - away) < 0.01 * away, "the case is one"
+    if said is None:
+        assert found == []
+    else:
+        off = float(
+            re.search(r"'EPSG:32632' is flat: at the outermost camera, coordinates are ([.\d]+) m off", found[0])[1]
+        )
+        assert off == pytest.approx(said, abs=0.06), "the map is scaled too, heights with it"
 
 
 def test_moving_changes_no_pixel(tmp_path):
@@ -145,3 +177,28 @@ def test_an_offset_that_is_none(tmp_path):
 def test_the_unit_that_a_user_gives():
     with pytest.raises(BadInput, match="--metres-per-unit 0: it must be more than 0"):
         Data(None, metres_per_unit=0)
+
+
+PLACED = {"crs": "EPSG:25832", "offset": [451_234.5, 5_873_456.25, 37.0]}
+
+
+@pytest.mark.parametrize("place", [".", "sparse", "sparse/0"])
+def test_a_colmap_model_is_on_the_map_by_a_file_beside_it_or_above(tmp_path, place):
+    write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
+    plain = read(Data(tmp_path))
+    local = observations(Data(tmp_path), plain).xyz
+    (tmp_path / place / "georeference.json").write_text(json.dumps(PLACED))
+    scene = read(Data(tmp_path))
+    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == ("EPSG:25832", 1.0, tuple(PLACED["offset"]))
+    np.testing.assert_allclose(scene.frame.origin, plain.frame.origin + PLACED["offset"], atol=1e-6)
+    np.testing.assert_allclose(observations(Data(tmp_path), scene).xyz, local, atol=1e-6)
+
+
+def test_two_files_that_put_a_colmap_model_in_two_places_are_refused(tmp_path):
+    write_colmap(tmp_path, photograph(Flight(views=3, width=40, height=30, points=20)))
+    for place in (".", "sparse/0"):
+        (tmp_path / place / "georeference.json").write_text(json.dumps(PLACED))
+    assert read(Data(tmp_path)).frame.crs == "EPSG:25832"
+    (tmp_path / "georeference.json").write_text(json.dumps(PLACED | {"crs": "EPSG:25833"}))
+    with pytest.raises(BadInput, match=r"sparse/0/georeference.json and .*/georeference.json differ"):
+        read(Data(tmp_path))

@@ -486,6 +486,21 @@ def test_what_files_leave_out_is_found_where_the_file_names_no_offset(tmp_path):
     assert frame.crs == "EPSG:32632" and np.abs(np.array(frame.shift[:2]) - ORIGIN[:2]).max() < 1e4
 
 
+def test_the_unit_of_a_map_is_that_of_its_system(tmp_path):
+    """US survey feet, unless the file says otherwise; where it contradicts the system, a line does."""
+    needs("pyproj")
+    realitycapture(tmp_path)
+    place = '{"crs": "EPSG:2263", "offset": [980000, 200000, 0]%s}'
+    (tmp_path / "georeference.json").write_text(place % "")
+    with collect_notes() as notes:
+        assert read(Data(tmp_path)).frame.metres == pytest.approx(1200 / 3937, rel=1e-12)
+    assert not any("EPSG:2263" in text for text in notes.texts)
+    (tmp_path / "georeference.json").write_text(place % ', "metres_per_unit": 1')
+    with collect_notes() as notes:
+        assert read(Data(tmp_path)).frame.metres == 1
+    assert any("EPSG:2263 is in units of US survey foot" in text for text in notes.texts)
+
+
 def moved_to_the_map(text):
     head, *rows = text.splitlines()
     words = [row.split(",") for row in rows]

@@ -27,8 +27,7 @@ def test_ctrl_c_cancels_the_work_and_waits_for_its_end(interruptible):
 
     def work(token):
         _thread.interrupt_main()
-        until = time.monotonic() + 60
-        while not token.is_cancelled and time.monotonic() < until:
+        while not token.is_cancelled:
             time.sleep(0.01)
         for _ in range(100):  # of somebody impatient, at any moment of the wait
             _thread.interrupt_main()
@@ -52,7 +51,7 @@ def test_ctrl_c_just_when_the_work_is_cancelled(interruptible, monkeypatch):
 
     def work(token):
         _thread.interrupt_main()
-        ended.append(cancelled.wait(60))
+        ended.append(cancelled.wait())
 
     monkeypatch.setattr(engine, "load_engine", lambda: SimpleNamespace(CancellationToken=Token))
     with pytest.raises(KeyboardInterrupt):

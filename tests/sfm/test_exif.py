@@ -9,6 +9,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from surfkit.sfm import exif
 from surfkit.sfm.exif import Exif, facts, read_exif
+from surfkit.sfm.xmp import read_xmp
 from surfkit.testing.exif import write_exif
 
 DJI = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GpsLatitude="+52.1" drone-dji:RtkFlag="50"
@@ -71,7 +72,7 @@ def test_focal_lengths():
     ],
 )
 def test_accuracies(xmp, found):
-    assert facts({}, {}, {}, exif._xmp(xmp and xmp.encode()), (40, 30)).accuracy_m == found
+    assert facts({}, {}, {}, read_xmp(xmp and xmp.encode()), (40, 30)).accuracy_m == found
     assert facts({}, {}, {exif.ERROR_M: 4.0}, {}, (40, 30)).accuracy_m == (4, 4, 8)
 
 
@@ -84,11 +85,89 @@ def test_halves_of_the_earth_and_heights_below_either_zero(south, below, height)
 
 def test_which_of_several_equal_cameras_it_is():
     basic = {exif.MAKE: "MicaSense", exif.MODEL: "RedEdge", exif.ORIENTATION: IFDRational(6)}
-    rig = exif._xmp("<Camera:RigCameraIndex>2</Camera:RigCameraIndex>")
+    rig = read_xmp("<Camera:RigCameraIndex>2</Camera:RigCameraIndex>")
     found = facts(basic, {exif.BODY: "RX01-17"}, {}, rig, (40, 30))
     assert found.which == "MicaSense RedEdge RX01-17 2.0" and found.camera == "MicaSense RedEdge"
     assert facts(basic, {}, {}, {}, (40, 30)).which == "MicaSense RedEdge"
     assert type(found.orientation) is int and found.orientation == 6, "it is kept as a whole number"
+
+
+@pytest.mark.parametrize(
+    "value, letter, wanted, signed",
+    [
+        ((33, 30, 0), None, 33.5, False),
+        ((33, 30, 0), "\0", 33.5, False),
+        ((33, 30, 0), "", 33.5, False),
+        ((33, 30, 0), "?", 33.5, False),
+        ((33, 30, 0), "south", -33.5, True),
+        ((33, 30, 0), b"s\0", -33.5, True),
+        ((33, 30, 0), "North", 33.5, True),
+        ((-33, 30, 0), None, -33.5, True),
+        ((-33, 30, 0), "S", -33.5, True),
+        ((-33, 30, 0), "N", 33.5, False),
+        (IFDRational(335, 10), "S", -33.5, True),
+        ((IFDRational(335, 10),), "S", -33.5, True),
+        ((33, IFDRational(30, 1)), "S", -33.5, True),
+        ("33.5", "S", -33.5, True),
+    ],
+)
+def test_degrees_and_their_sign(value, letter, wanted, signed):
+    gps = {exif.LATITUDE: value, exif.LATITUDE_REF: letter, exif.LONGITUDE: (70, 0, 0), exif.LONGITUDE_REF: "E"}
+    found = facts({}, {}, gps, {}, (40, 30))
+    assert found.position == (pytest.approx(wanted), 70, None)
+    assert found.unsigned == (() if signed else ("latitude",)), "without a sign it is not north by default"
+
+
+@pytest.mark.parametrize(
+    "reference, height, unsure",
+    [(None, 12.5, True), (b"", 12.5, True), (b"\0", 12.5, False), (b"\1", -12.5, False), ("1", -12.5, False)],
+)
+def test_what_altitudes_are_counted_from(reference, height, unsure):
+    gps = {1: "N", 2: (1, 0, 0), 3: "E", 4: (1, 0, 0), exif.ALTITUDE: 12.5, exif.ALTITUDE_REF: reference}
+    found = facts({}, {}, gps, {}, (40, 30))
+    assert (found.position[2], found.no_reference) == (height, unsure)
+    found = facts({}, {}, gps | {exif.ALTITUDE: -12.5, exif.ALTITUDE_REF: b"\1"}, {}, (40, 30))
+    assert found.position[2] == -12.5, "below, said twice"
+    found = facts({}, {}, gps | {exif.ALTITUDE: IFDRational(0, 0)}, {}, (40, 30))
+    assert found.position[2] is None and not found.no_reference
+
+
+@pytest.mark.parametrize(
+    "xmp, position, altitude, above",
+    [
+        ('drone-dji:GpsLatitude="-33.5" drone-dji:GpsLongitude="+70.25"', (-33.5, 70.25, None), None, None),
+        (
+            "<drone-dji:GpsLatitude>33.5</drone-dji:GpsLatitude><drone-dji:GpsLongtitude>-70.25</drone-dji:GpsLongtitude>"
+            "<drone-dji:AbsoluteAltitude>+120.5</drone-dji:AbsoluteAltitude>"
+            "<drone-dji:RelativeAltitude>+40.1</drone-dji:RelativeAltitude>",
+            (33.5, -70.25, 120.5),
+            120.5,
+            40.1,
+        ),
+        (
+            'exif:GPSLatitude="33,30S" exif:GPSLongitude="70,15,0E" exif:GPSAltitude="2410/20" exif:GPSAltitudeRef="0"',
+            (-33.5, 70.25, 120.5),
+            120.5,
+            None,
+        ),
+        (
+            "exif:GPSAltitude='12/1' exif:GPSAltitudeRef='1' exif:GPSLatitude='33,30.0n' exif:GPSLongitude='70,15w'",
+            (33.5, -70.25, -12.0),
+            -12.0,
+            None,
+        ),
+        ('drone-skydio:Latitude="33.5" drone-skydio:Longitude="-70.25"', (33.5, -70.25, None), None, None),
+        ('photoshop:Latitude="33.5" photoshop:Longitude="-70.25"', None, None, None),
+        ('drone-dji:GpsLatitude="+0.000000" drone-dji:GpsLongitude="+0.000000"', None, None, None),
+        ('exif:GPSLatitude="33,30" exif:GPSLongitude="70,15"', None, None, None),  # no letters
+        ('drone-dji:GpsLatitude="nan" drone-dji:GpsLongitude="95"', None, None, None),
+        ('drone-dji:GpsLatitude="95" drone-dji:GpsLongitude="95" drone-dji:AbsoluteAltitude="1/0"', None, None, None),
+    ],
+)
+def test_positions_in_xmp(xmp, position, altitude, above):
+    found = facts({}, {}, {}, read_xmp(f"<rdf:Description {xmp} x='y'/>".encode()), (40, 30))
+    assert found.position is None and found.xmp_position == (position and pytest.approx(position))
+    assert (found.xmp_altitude, found.above_start) == (altitude, above)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +177,7 @@ def test_which_of_several_equal_cameras_it_is():
         {exif.LATITUDE: (91, 0, 0), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
         {exif.LATITUDE: (52, 0, math.nan), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
         {exif.LATITUDE: 52, exif.LONGITUDE: "x", exif.ALTITUDE: 1},
-        {exif.LATITUDE: (52, 0, 0), exif.LONGITUDE: (10, 0, 0)},
+        {exif.LATITUDE: (52, 0, 0, 0), exif.LONGITUDE: (10, 0, 0)},
         {exif.LATITUDE: (52, 0, IFDRational(1, 0)), exif.LONGITUDE: (10, 0, 0), exif.ALTITUDE: 1},
     ],
 )

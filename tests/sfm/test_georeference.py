@@ -79,6 +79,21 @@ def test_rtk_positions_are_believed():
     assert isinstance(found, Placement) and found.fit.sigma.max() < 0.05
 
 
+def test_positions_that_state_an_accuracy_among_others_that_state_none():
+    """Six of a receiver with corrections, at 0.02 m, and others that are 3 m off and do not say so."""
+    onto = grid(40)
+    shots, photos = survey(onto, noise=3.0)
+    _, exact = survey(onto, noise=0.02, accuracy=(0.02, 0.02, 0.04))
+    photos = [exact[at] if at % 7 == 0 else photo for at, photo in enumerate(photos)]
+    found = place(shots, photos, chart_of(np.array([photo.exif.position for photo in photos]), "auto"))
+    rtk = np.arange(40) % 7 == 0
+    assert found.fit.inside[rtk].all()
+    away = found.similarity.points(np.stack(list(shots.values()))) - onto
+    assert np.linalg.norm(away, axis=1).max() < 0.1
+    np.testing.assert_allclose(found.sigma[rtk], np.tile((0.02, 0.02, 0.04), (rtk.sum(), 1)))
+    assert (found.sigma[~rtk] > 2).all() and (found.sigma[~rtk] < 4.5).all(), "by their residuals"
+
+
 @pytest.mark.parametrize("count", [5, 20])
 def test_a_receiver_that_gave_one_position_only_determines_nothing(count):
     shots, photos = survey(grid(count))

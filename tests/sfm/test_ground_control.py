@@ -1,6 +1,6 @@
 """Ground control points: lists of OpenDroneMap, triangulation, similarities, checkpoints, and points that are wrong."""
 
-from types import SimpleNamespace
+import re
 
 import numpy as np
 import pytest
@@ -15,7 +15,9 @@ from surfkit.sfm.exif import Exif
 from surfkit.sfm.georeference import Refused
 from surfkit.sfm.ground_control import doubts, place_by_points, read_ground, read_list, triangulate
 from surfkit.sfm.photographs import Photo
+from surfkit.sfm.plausible import upside_down
 
+from .models import reconstruction
 from .pictures import arc
 
 OFFSET = np.array([512_000.0, 5_800_000.0, 90.0])
@@ -37,15 +39,7 @@ def pixels(place):
 
 def model():
     """The cameras in a frame that is turned, moved and of a tenth of the size, as pycolmap has them."""
-    engine, found = load_pycolmap(), {}
-    for at, (name, pose) in enumerate(POSES.items()):
-        turn = pose[:3, :3] @ TURN.T
-        centre = 0.1 * TURN @ (-pose[:3, :3].T @ pose[:3, 3]) + (3, 4, 5)
-        rigid = engine.Rigid3d(engine.Rotation3d(turn), -turn @ centre)
-        found[at] = SimpleNamespace(
-            name=name, camera=lens(), cam_from_world=lambda rigid=rigid: rigid, projection_center=lambda c=centre: c
-        )
-    return SimpleNamespace(reg_image_ids=lambda: list(found), image=found.get)
+    return reconstruction(POSES, PLACES, TURN, 0.1, (3, 4, 5), lens())
 
 
 def written(path, first="EPSG:32633", places=PLACES, names=True):
@@ -76,7 +70,7 @@ def test_rays_meet_in_the_point():
     assert triangulate(images, {"0.jpg": (10, 10), "elsewhere.jpg": (3, 3)}) is None
 
 
-@pytest.mark.parametrize("first", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
+@pytest.mark.parametrize("first", ["epsg:32633", "WGS84 UTM 33n", "+proj=utm +zone=33 +ellps=WGS84 +units=m +no_defs"])
 def test_points_place_the_model_and_checkpoints_check_it(tmp_path, first):
     ground = read_ground(written(tmp_path / "gcp_list.txt", first), "auto", SIZES)
     found = place_by_points(model(), ground, 3)
@@ -160,7 +154,8 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
     def told():
         found = place_by_points(model(), read_ground(path, "auto", SIZES), 0)
         assert max(found.rms(found.control).values()) < 0.01, "the residuals are no help"
-        return doubts(found, centres, TURN @ (0, 0, 1), photos)
+        why = upside_down(model(), found.similarity, TURN @ (0, 0, 1), 1.0, found.handed)
+        return [*([] if why is None else [why]), *doubts(found, centres, photos)]
 
     assert told() == []
     path.write_text("\n".join(lines).replace("EPSG:32633", "EPSG:32634"))
@@ -169,10 +164,25 @@ def test_places_with_x_and_y_exchanged_or_of_another_zone_are_told(tmp_path):
     exchanged = [lines[0]] + [" ".join([y, x, *rest]) for x, y, *rest in (line.split() for line in lines[1:])]
     path.write_text("\n".join(exchanged))
     upside, far = told()
-    assert "upside down" in upside and "96 km from" in far
+    assert re.search("upside down, 1. m below the ground, with .* view 3. degrees above the horizon", upside)
+    assert "96 km from" in far
+    low = [lines[0]] + [" ".join([x, y, str(float(z) - 500), *rest]) for x, y, z, *rest in map(str.split, lines[1:])]
+    path.write_text("\n".join(low))
+    sea, below = told()
+    assert re.search("[34].. m below zero", sea)
+    assert re.search("5.. m below their altitudes in EXIF: do the heights of the list count up", below)
     path.write_text("\n".join([lines[0]] + ["5" + line for line in exchanged[1:]]))  # where no zone reaches
     with pytest.raises(BadInput, match="x is east and y north"):
         read_ground(path, "auto", SIZES)
+
+
+def test_heights_that_count_down_are_found_out(tmp_path):
+    path, mirror = tmp_path / "gcp_list.txt", np.array([1, 1, -1])
+    found = place_by_points(model(), read_ground(written(path, places=PLACES * mirror), "auto", SIZES), 0)
+    assert isinstance(found, Refused) and "fit mirrored only, to 0.00 m for" in found.reason
+    noise = np.random.default_rng(0).normal(0, 0.3, PLACES.shape)
+    found = place_by_points(model(), read_ground(written(path, places=PLACES + noise), "auto", SIZES), 0)
+    assert not isinstance(found, Refused)
 
 
 def test_points_that_do_not_fit_at_all_place_nothing(tmp_path):

@@ -54,6 +54,12 @@ def test_neighbours_are_the_nearest():
     assert found == wanted
 
 
+@pytest.mark.parametrize("lacking", [2, 1])
+def test_positions_without_an_altitude_have_neighbours_too(lacking):
+    given = photos(20, position=lambda at: (52 + 1e-4 * at, 16.0, None if at % lacking == 0 else 1600.0))
+    assert {(at, at + 1) for at in range(19)} <= near(given, 2)
+
+
 def test_likeness_finds_the_same_scene():
     found = alike(24, 3, scenes(24, 4), 0, range(24))
     assert len(found) >= 24 * 3 / 2 and all((one - two) % 4 == 0 for one, two in found)

@@ -1,6 +1,7 @@
 """What is found out about each photograph before any is compared."""
 
 import os
+from dataclasses import replace
 
 import pytest
 from PIL import Image, ImageFilter
@@ -51,6 +52,13 @@ def test_what_is_known_is_not_looked_at_again(folder, monkeypatch):
     assert seen == ["a.jpg"]
     assert after["d.jpg"].usable, "it was a copy of what is another photograph now"
     assert after["c.png"] == before[1]
+
+
+def test_what_an_earlier_edition_found_is_looked_at_again(folder):
+    (first, *_) = look(folder)
+    old = replace(first, edition=first.edition - 1, exif=photographs.Exif(camera="of before"))
+    assert look(folder, [replace(old, edition=first.edition)])[0].exif.camera == "of before"
+    assert look(folder, [old])[0] == first
 
 
 def test_lenses_are_shared_by_camera_size_and_focal_length():

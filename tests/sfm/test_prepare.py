@@ -106,6 +106,8 @@ def test_the_report_says_what_became_of_each(prepared):
     place = report["models"][0]["georeference"]
     assert list(place["left_out"]) == [WRONG] and place["left_out"][WRONG] == pytest.approx(500, abs=1)
     assert max(place["rms_m"].values()) < 0.2
+    [lens] = report["models"][0]["weighed"]["focal_lengths_px"]
+    assert lens["exif"] is None and lens["photographs"] == 6 and lens["final"] == pytest.approx(260, rel=0.03)
     assert set(report["seconds"]) == {
         "photographs", "features", "pairs", "matches", "cameras", "georeference", "undistortion"
     }  # fmt: skip
@@ -175,7 +177,7 @@ def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkey
         with monkeypatch.context() as patch:
             patch.setattr(module, name, stop)
             assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 130
-        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/lock").exists()
+        assert not (tmp_path / "s/sparse").exists() and not (tmp_path / "s/prepare/.surfkit-lock").exists()
     seen = watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert "_keep" not in seen
@@ -319,6 +321,51 @@ def test_ground_control_places_it_and_checkpoints_are_reported(folder, prepared,
     for name, centre in cameras(scene).items():
         assert np.linalg.norm(centre - CENTRES[name.replace("_", " ")] - ORIGIN) < 0.2
 
+    flat = [line for line in lines[1:] if float(line.split()[2]) == ORIGIN[2]]
+    rows = [(float(x) - ORIGIN[0], float(y) - ORIGIN[1], rest) for x, y, *rest in map(str.split, flat)]
+    exchanged = [" ".join([f"{y + 5e5} {x + 5e5}", *rest]) for x, y, rest in rows]
+    (tmp_path / "gcp_list.txt").write_text("\n".join([lines[0], *exchanged]))
+    words = ["--gcp", str(tmp_path / "gcp_list.txt"), *QUICK]
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *words]) == 0
+    said = capsys.readouterr().err
+    assert (
+        "by the ground control points the photographs would be upside down, 1" in said and "m below the ground" in said
+    )
+    assert read(Data(tmp_path / "s")).frame.crs is None
+
+
+def test_geo_txt_places_it_instead_of_exif(folder, prepared, tmp_path, monkeypatch, capsys):
+    shutil.copytree(prepared, tmp_path / "s")
+    shutil.copytree(folder, tmp_path / "p", copy_function=shutil.copy2)
+    move = np.array([1500.0, -300, 20])
+    rows = [" ".join([name, *map(str, CENTRES[name] + ORIGIN + move)]) for name in POSES]
+    (tmp_path / "p/geo.txt").write_text("\n".join(["WGS84 UTM 33n", *rows]))
+    seen = watched(monkeypatch)
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    assert seen == [], "only the place is another"
+    said = capsys.readouterr().err
+    assert "geo.txt gives the positions of 6 photographs in EPSG:32633, instead of those in EXIF of 6" in said
+    assert "geo.txt puts the photographs 2 km from their positions in EXIF" in said
+    for name, centre in cameras(read(Data(tmp_path / "s"))).items():
+        assert np.linalg.norm(centre - CENTRES[name] - ORIGIN - move) < 0.2
+    rows = [" ".join(row.split()[:4]) for row in rows]  # without heights: "view 0.jpg", x and y
+    (tmp_path / "p/geo.txt").write_text("\n".join(["WGS84 UTM 33n", *rows]))
+    assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *QUICK]) == 0
+    said = capsys.readouterr()
+    assert "sparse/0 is placed in plan" in said.err and " north of 6" in said.out
+    for name, centre in cameras(read(Data(tmp_path / "s"))).items():
+        assert np.linalg.norm((centre - CENTRES[name] - ORIGIN - move)[:2]) < 0.5
+    place = json.loads((tmp_path / "s/report.json").read_text())["models"][0]["georeference"]
+    assert place["rms_m"]["u"] is None and place["heights"] == "above the middle of the ground"
+
+
+def test_a_list_that_cannot_be_used_is_refused_before_the_work(folder, tmp_path, capsys):
+    (tmp_path / "t.csv").write_text("view 0.jpg,1,2,3")
+    words = ["prepare", "photos", str(folder), "--out", str(tmp_path / "s"), "--positions", str(tmp_path / "t.csv")]
+    assert main(words) == 2 and "names no coordinate reference system" in capsys.readouterr().err
+    assert main([*words[:-1], str(tmp_path / "no.csv")]) == 2 and "no such file" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.npz"))
+
 
 def maps_of(scene):
     return {path.name: path.read_bytes() for path in (scene / "estimated_depths").glob("*.npy")}
@@ -346,10 +393,10 @@ def test_depth_maps_are_the_last_stage_and_go_on(folder, prepared, tmp_path, mon
     capsys.readouterr()
     assert main([*words, *SMALL_MAPS]) == 0 and seen == []
     said = capsys.readouterr()
-    assert "1 of 5 photographs have depth maps already" in said.err
-    assert "of 5 of 5 photographs" in said.out and f"surfkit train recipe:surface --data {scene}" in said.out
+    assert "1 of 6 photographs have depth maps already" in said.err
+    assert "of 6 of 6 photographs" in said.out and f"surfkit train recipe:surface --data {scene}" in said.out
     report = json.loads((scene / "report.json").read_text())
-    assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (5, [])
+    assert (report["depth_maps"]["photographs"], report["depth_maps"]["without"]) == (6, [])
     assert report["depth_maps"]["estimator"]["longest"] == 48 and report["seconds"]["depth maps"] > 0
     sweep = ("estimator:plane-sweep", "--estimator.longest", "48", "--device", "cpu")
     assert main(["prepare", "depth", str(other), *sweep]) == 0

@@ -88,3 +88,50 @@ def test_the_same_draws_give_the_same_bits():
     xyz, onto, _ = known(30, noise=2.0)
     one, two = (fit_robustly(xyz, onto, seed=3) for _ in range(2))
     assert (one.residuals == two.residuals).all()
+
+
+def mixed(count, accurate, seed, noise=(0.02, 3.0)):
+    """Positions of which the first few are exact; what the others and the whole say of them is known."""
+    rng = np.random.default_rng(seed)
+    sigma = np.where(np.arange(count) < accurate, *noise)
+    xyz = rng.normal(0, 1, (count, 3)) * (100, 80, 30)
+    return xyz, xyz + rng.normal(0, 1, xyz.shape) * sigma[:, None], sigma
+
+
+@pytest.mark.parametrize("count, accurate", [(30, 5), (60, 6), (60, 1), (60, 2), (40, 20), (30, 26)])
+def test_a_few_exact_positions_among_many_poor_ones_decide(count, accurate):
+    origin = np.zeros((1, 3))
+    kept, ours, best = [], [], []
+    for seed in range(5):
+        xyz, onto, sigma = mixed(count, accurate, seed)
+        fit = fit_robustly(xyz, onto, sigma, seed)
+        kept.append(fit.inside[:accurate].mean())
+        ours.append(np.linalg.norm(fit.similarity.points(origin)))
+        best.append(np.linalg.norm(umeyama(xyz, onto, 1 / sigma**2).points(origin)))
+    assert np.mean(kept) > 0.97 and np.median(ours) < 1.3 * np.median(best) + 0.005
+
+
+def test_a_wrong_one_among_a_few_exact_positions_is_found():
+    for seed in range(5):
+        xyz, onto, sigma = mixed(60, 6, seed)
+        onto[2] += (15, -20, 10)
+        fit = fit_robustly(xyz, onto, sigma, seed)
+        assert np.flatnonzero(~fit.inside[:6]).tolist() == [2]
+        good = np.arange(60) != 2
+        same(fit.similarity, umeyama(xyz[good], onto[good], 1 / sigma[good] ** 2), 2e-3)
+
+
+def test_exact_positions_that_are_all_wrong_are_left_out():
+    """Heights above the ellipsoid among heights above sea level."""
+    xyz, onto, sigma = mixed(60, 6, 0)
+    onto[:6] += (0, 0, 40)
+    fit = fit_robustly(xyz, onto, sigma)
+    assert not fit.inside[:6].any() and fit.inside[6:].mean() > 0.95
+
+
+def test_positions_less_exact_than_they_state_are_weighed_by_their_residuals():
+    """A reconstruction is bent by more than receivers are off."""
+    xyz, onto, sigma = mixed(60, 8, 0)
+    onto += np.random.default_rng(9).normal(0, 0.3, onto.shape)
+    fit = fit_robustly(xyz, onto, sigma)
+    assert fit.inside[:8].all() and 0.15 < np.median(fit.spread[:8]) < 0.6 and np.median(fit.spread[8:]) > 2

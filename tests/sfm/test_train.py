@@ -78,14 +78,14 @@ def test_depth_maps_of_the_scene_are_taken_and_not_made_again(photos, monkeypatc
     assert main(["prepare", "photos", str(photos), "--features", "1500", *words]) == 0
     folder = photos.parent / "flight-scene/estimated_depths"
     before = {path.name: path.stat().st_mtime_ns for path in folder.rglob("*.npy")}
-    assert len(before) == 2 * 4, "one of five is held out"
+    assert len(before) == 2 * 5, "a surface is made of all photographs"
     run = ["train", "recipe:surface", *QUICK[1:], "--data", str(photos), "--prepare", "--out"]
     assert main([*run, str(tmp_path / "run")]) == 0
     assert {path.name: path.stat().st_mtime_ns for path in folder.rglob("*.npy")} == before
     assert not list((tmp_path / "cache").rglob("*.npy")), "the recipe uses depth maps, and takes those"
     save(photos / "day 1" / "5.jpg", picture(arc(6)[5]))
     assert main([*run, str(tmp_path / "second")]) == 0
-    assert len(list(folder.rglob("*.npy"))) == 2 * 5
+    assert len(list(folder.rglob("*.npy"))) == 2 * 6
 
 
 @pytest.mark.parametrize(

@@ -177,6 +177,22 @@ def test_columns_that_do_not_fit_are_named(begin, tmp_path):
         load(tmp_path / "c.safetensors")
 
 
+def test_a_closed_terminal_asks_as_often_as_it_is_told_and_not_at_all_where_it_is_ignored():
+    before = signal.getsignal(signal.SIGHUP)
+    with graceful() as request:
+        for _ in range(3):  # the shell tells, and the system
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert request.asked
+    assert signal.getsignal(signal.SIGHUP) is before
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # by nohup
+    try:
+        with graceful() as request:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not request.asked and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_asks_and_the_handlers_come_back(number):
     before = signal.getsignal(number)

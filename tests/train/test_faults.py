@@ -22,12 +22,21 @@ def cuda_error():
     raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
 
 
+def saved(out):
+    """Let there be a checkpoint in a run folder."""
+    (out / "pretrain").mkdir()
+    (out / "pretrain" / "checkpoint.safetensors").touch()
+
+
 @pytest.mark.parametrize("fails", [real_cpu_error, python_error, cuda_error])
-def test_out_of_memory_says_what_to_lower(fails):
-    with pytest.raises(
-        Fault, match=r"run: out of (GPU )?memory.*--longest.*--pretrain.densify.threshold.*checkpoint is whole"
-    ):
-        with in_one_line(Path("run")):
+def test_out_of_memory_says_what_to_lower(fails, tmp_path):
+    told = rf"{tmp_path}: out of (GPU )?memory.*--longest.*--pretrain.densify.threshold"
+    with pytest.raises(Fault, match=f"{told}.*; no checkpoint is written yet, and .* the same command may do"):
+        with in_one_line(tmp_path):
+            fails()
+    saved(tmp_path)
+    with pytest.raises(Fault, match=f"{told}.*; the last checkpoint is whole, and .* the same command goes on from"):
+        with in_one_line(tmp_path):
             fails()
 
 
@@ -57,9 +66,26 @@ def test_other_errors_stay_what_they_are():
         assert found.value is error and not is_out_of_memory(error)
 
 
-def test_a_full_disk_is_one_line():
-    with pytest.raises(Fault, match=r"/dev/full: the disk is full .*checkpoint in run is whole: free some space"):
-        with in_one_line(Path("run")):
+@pytest.mark.parametrize(
+    ("kept", "told"),
+    [
+        (None, "free some space, and give the same command again"),
+        (
+            "pretrain/checkpoint.safetensors",
+            "the last checkpoint in .* is whole: free some space, and the same command",
+        ),
+        ("pretrain/checkpoint-before.safetensors", "the last checkpoint in .* is whole: free some space"),
+        ("blocks/003/tune/checkpoint.safetensors", "the last checkpoint in .* is whole: free some space"),
+        ("method/state.pt", "the last checkpoint in .* is whole: free some space"),
+        ("pretrain/other.txt", "free some space, and give the same command again"),
+    ],
+)
+def test_a_full_disk_is_one_line_that_claims_no_checkpoint_that_is_not_there(tmp_path, kept, told):
+    if kept is not None:
+        (tmp_path / kept).parent.mkdir(parents=True)
+        (tmp_path / kept).touch()
+    with pytest.raises(Fault, match=rf"^/dev/full: the disk is full \(No space left on device\)[;:] {told}"):
+        with in_one_line(tmp_path):
             file = os.open("/dev/full", os.O_WRONLY)
             try:
                 os.write(file, b"x")

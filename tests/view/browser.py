@@ -7,15 +7,10 @@ from urllib.parse import urlencode, urlsplit
 
 from needs import needs
 
-LONG_S = 60.0
-"""No moment of a test waits longer: the machine may be busy with others meanwhile."""
 
-
-def wait_until(what, seconds=LONG_S):
-    """Until `what()` is true."""
-    until = time.monotonic() + seconds
+def wait_until(what):
+    """Until `what()` is true. The runner of the tests ends one that hangs; the machine may be busy with others."""
     while not what():
-        assert time.monotonic() < until, "it took too long"
         time.sleep(0.01)
 
 
@@ -27,7 +22,7 @@ class Browser:
         self.messages = needs("viser._messages")
         at = urlsplit(url)
         protocol = f"viser-v{viser.__version__}"
-        settings = {"subprotocols": [protocol], "max_size": None, "open_timeout": LONG_S, "ping_timeout": LONG_S}
+        settings = {"subprotocols": [protocol], "max_size": None, "open_timeout": None, "ping_timeout": None}
         self.socket = client.connect(f"ws://{at.netloc}/?{at.query}", **settings)
         self.told, self.gui = [], {}
         self.stand(0.0)
@@ -66,11 +61,9 @@ class Browser:
         """Of all parts of the panel."""
         return [row["_markdown"] for row in self.gui.values() if row.get("_markdown")]
 
-    def wait_for(self, seen, seconds=LONG_S):
+    def wait_for(self, seen):
         """What `seen(self)` returns as soon as it is true, after messages that have come."""
-        until = time.monotonic() + seconds
         while not (found := seen(self)):
-            assert time.monotonic() < until, (self.texts(), [row["type"] for row in self.told][-20:])
             try:
                 self._take(self.socket.recv(timeout=0.2))
             except TimeoutError:
@@ -105,7 +98,7 @@ class Browser:
 def get(page, target, **headers):
     """Status, body and headers of the answer of a served page to a request."""
     at = urlsplit(page.url)
-    connection = http.client.HTTPConnection(at.hostname, at.port, timeout=LONG_S)
+    connection = http.client.HTTPConnection(at.hostname, at.port)
     connection.request("GET", target, headers=headers)
     answer = connection.getresponse()
     return answer.status, answer.read(), answer.headers

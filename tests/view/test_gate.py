@@ -100,7 +100,7 @@ def knock(page, query="", **headers):
                 additional_headers=headers,
                 max_size=None,
             ) as socket_:
-                return len(await asyncio.wait_for(socket_.recv(), 10))
+                return len(await socket_.recv())
         except refused as error:
             return -error.response.status_code
 

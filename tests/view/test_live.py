@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from browser import LONG_S, Browser, ask, tag, wait_until
+from browser import Browser, ask, tag, wait_until
 from models import data_set
 from needs import needs, needs_native
 
@@ -194,7 +194,7 @@ class Training:
     def __exit__(self, *_):
         self.over.set()
         self.control.pause(False)
-        self.thread.join(LONG_S)
+        self.thread.join()
         assert not self.thread.is_alive()
 
     def run(self):
@@ -472,8 +472,8 @@ def drive(url, seen):
     """What a user does while a run goes on: waits for pictures and curves, pauses, and has it stopped."""
     browser, charts = Browser(url), {"loss", "PSNR of training views, dB"}
     try:
-        browser.wait_for(backgrounds, 60)
-        browser.wait_for(lambda b: charts <= {row.get("title") for row in b.gui.values()}, 60)
+        browser.wait_for(backgrounds)
+        browser.wait_for(lambda b: charts <= {row.get("title") for row in b.gui.values()})
         browser.press("pause")
         browser.wait_for(lambda b: any("**Paused.**" in text for text in b.texts()))
         seen += browser.texts()

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import LONG_S, Browser, wait_until
+from browser import Browser, wait_until
 from needs import needs, needs_native
 
 from surfkit.export.table import SplatTable
@@ -217,7 +217,7 @@ def test_following_a_camera():
         now = time.monotonic()
         following.moved()
         rests += time.monotonic() - last >= REST_S  # this thread was held up, so that the camera has rested
-        assert len(told) <= rests + (time.monotonic() - begun) / TICK_S and now - begun < LONG_S
+        assert len(told) <= rests + (time.monotonic() - begun) / TICK_S
         last = now
         time.sleep(0.01)
     wait_until(lambda: told[-1] is False)
@@ -225,7 +225,7 @@ def test_following_a_camera():
     assert told[0] is True and told.count(False) <= rests and max(together) == 1
     (thread,) = new_threads(before)
     following.stop()
-    thread.join(LONG_S)
+    thread.join()
     assert not thread.is_alive()
     count = len(told)
     following.moved()
@@ -264,7 +264,7 @@ def test_a_page_follows_its_browser(tmp_path, monkeypatch):
         inside.append(1)
         together.append(len(inside))
         eyes.append(eye)
-        assert first.wait(LONG_S)
+        assert first.wait()
         time.sleep(0.15)
         inside.pop()
         return plain(self, budget, eye)
@@ -282,9 +282,8 @@ def test_a_page_follows_its_browser(tmp_path, monkeypatch):
         first.set()
         browser.wait_for(lambda b: any(row.get("label") == "write path file" for row in b.gui.values()))
         browser.wait_for(lambda b: any(t.startswith("500 splats, drawn by lot") for t in b.texts()))
-        at, until = 0.0, time.monotonic() + LONG_S
+        at = 0.0
         while len(eyes) < 5:  # never at rest, and always far from where it was
-            assert time.monotonic() < until, "nothing is chosen while the camera moves"
             at += 5
             browser.stand(at)
             time.sleep(0.02)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from browser import LONG_S, Browser, ask, cookie, get, tag, wait_until
+from browser import Browser, ask, cookie, get, tag, wait_until
 from needs import needs
 from scipy.spatial.transform import Rotation
 
@@ -200,7 +200,7 @@ def test_one_at_a_time_and_the_server_goes_on(tmp_path):
 
     def draw(view):
         entered.set()
-        assert leave.wait(2 * LONG_S)
+        assert leave.wait()
         return Maps(median=torch.full((1, 1), 2.0))
 
     points = Points(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
@@ -208,13 +208,13 @@ def test_one_at_a_time_and_the_server_goes_on(tmp_path):
         client, first = tag(browser)[0], []
         thread = threading.Thread(target=lambda: first.append(ask(page, client=client, x=0, y=0)))
         thread.start()
-        assert entered.wait(LONG_S)
+        assert entered.wait()
         assert ask(page, client=client, x=0, y=0) == (429, "one at a time")
         assert get(page, "/", **cookie(page))[0] == 200 and not first
         with connected(page) as other:
             assert tag(other)[0] != client
         leave.set()
-        thread.join(LONG_S)
+        thread.join()
         status, said = first[0]
         height = float(TEXT.fullmatch(said)[3])
         assert status == 200 and height == pytest.approx(430 + 200), "2 units of 100 m above the camera"

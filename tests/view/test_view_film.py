@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import torch
-from browser import LONG_S, Browser, wait_until
+from browser import Browser, wait_until
 from needs import needs
 
 from surfkit.raster.api import Maps
@@ -39,7 +39,7 @@ class Drawing:
     def __call__(self, view):
         if len(self.heights) == self.hold_at:
             self.held.set()
-            assert self.go_on.wait(LONG_S)
+            assert self.go_on.wait()
         if self.error is not None:
             raise self.error
         camera = view.camera
@@ -125,7 +125,7 @@ def test_the_server_ends_meanwhile(tmp_path, capsys):
         browser.press("make the video")
         wait_until(drawing.held.is_set)
         thread = [each for each in threading.enumerate() if each.name == "video"][-1]
-    thread.join(LONG_S)
+    thread.join()
     assert not thread.is_alive()
     assert len(drawing.heights) == 3 and not list((tmp_path / "out").glob("*.mp4"))
     said = capsys.readouterr().err

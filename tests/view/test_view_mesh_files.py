@@ -15,9 +15,11 @@ from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.export.gltf_reader import UPS
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
+from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes
 from surfkit.texture.files import Part, write_obj, write_textured_glb
+from surfkit.view.mesh_files import textured
 from surfkit.view.page import show
 from surfkit.view.screen import WORLD
 from surfkit.view.server import Address, served
@@ -134,3 +136,35 @@ def test_a_textured_mesh_is_compared_where_it_lies(tmp_path, case):
         words = ["--gt", str(tmp_path / "plain.ply"), "--align", "none", "--crop", "none", "--tau", str(0.01 * width)]
         assert main(["evaluate", str(tmp_path / name), *words, "--out", str(tmp_path / name[-3:])]) == 0
         assert json.loads((tmp_path / name[-3:] / "metrics.json").read_text())["geometry"]["f1"] > 0.99
+
+
+@pytest.mark.parametrize("place", ["images", "buffers", "extensions"])
+def test_a_file_that_names_an_address_is_not_sent_to_the_browser(tmp_path, place):
+    """A browser would fetch what it names; `data:` is within the file."""
+    path = tmp_path / "textured.glb"
+    textured_glb(path, *CASES["on the map"])
+    root = root_of(path)
+    assert textured(path, root) is not None
+    outside = {"uri": "http://a.example/b.png"}
+    root[place] = {"A_b": {"c": [outside]}} if place == "extensions" else [*root.get(place, []), outside]
+    with collect_notes() as notes:
+        assert textured(path, root) is None
+    assert "http://a.example/b.png" in notes.texts[-1] and "without pictures" in notes.texts[-1]
+    root["extensions"] = root["buffers"] = {}
+    root["images"] = [{"uri": "data:image/png;base64,AAAA"}]
+    assert textured(path, root) is not None
+
+
+@pytest.mark.parametrize("missing", ["a.png", "a.mtl"])
+def test_an_obj_without_its_picture_is_shown_without(tmp_path, missing):
+    Image.fromarray(np.full((4, 4, 3), 90, np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 1 1\nmap_Kd a.png\n")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
+    needs("trimesh")
+    with collect_notes() as notes, opened_subject(tmp_path / "a.obj", "cpu") as subject:
+        assert np.allclose(subject.mesh.colors, 90, atol=1) and not notes.texts
+    (tmp_path / missing).unlink()
+    with collect_notes() as notes, opened_subject(tmp_path / "a.obj", "cpu") as subject:
+        assert subject.mesh.colors is None and len(subject.mesh.faces) == 1
+    assert len(notes.texts) == 1 and repr(missing) in notes.texts[0]

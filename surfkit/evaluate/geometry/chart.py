@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from surfkit.core.check import printable
 from surfkit.core.files import replacing
 
 INCHES, DPI = (9.0, 5.6), 100
@@ -54,7 +55,7 @@ def write_lines(
     style = {**matplotlib.rcParamsDefault, "text.parse_math": False}  # names may have dollar signs
     with matplotlib.rc_context({name: style[name] for name in style if name != "backend"}):  # not the user's own style
         figure = Figure(INCHES, DPI, layout="constrained")
-        axes = figure.add_subplot(title=title, xlabel=x_label)
+        axes = figure.add_subplot(title=printable(title), xlabel=x_label)
         drawn = [axes.plot(line.x, line.y, color=line.color, linewidth=line.width)[0] for line in lines]
         axes.set_xlim(0, max(float(line.x.max()) for line in lines) or 1)
         axes.set_ylim(0, top or 1.05 * max(float(line.y.max()) for line in lines) or 1)
@@ -66,7 +67,7 @@ def write_lines(
                 axis.set_major_formatter(EngFormatter(sep=""))  # 20k, 3M
         axes.grid(color="0.88")
         axes.set_axisbelow(True)
-        names = [line.name for line in lines]
+        names = [printable(line.name) for line in lines]
         columns = max(1, min(len(names), LEGEND_LETTERS // max(map(len, names))))
         figure.legend(drawn, names, loc="outside lower center", ncols=columns, frameon=False)
         with replacing(path) as file:

@@ -25,10 +25,10 @@ from surfkit.evaluate.geometry.repetition import (
     refuse_few,
     warn_if_sparse,
 )
-from surfkit.evaluate.geometry.scores import spacing, tree
+from surfkit.evaluate.geometry.scores import shares, spacing, tree
 from surfkit.evaluate.geometry.surface import Surface
 from surfkit.evaluate.geometry.transform import apply, read_transform, scale_of
-from surfkit.evaluate.geometry.volume import CropSettings, extent_text, visible_crop
+from surfkit.evaluate.geometry.volume import CropSettings, extent_text, heightened, outside_shares, visible_crop
 from surfkit.scene.crop import PLANES, Axis, Crop, read_crop
 from surfkit.scene.scene import Frame, View
 
@@ -41,6 +41,8 @@ SHARE, ENOUGH = 0.05, 5
 many photographs show a place depends on their overlap, not on the size of the survey."""
 RESIZED = 0.02
 """Change of scale by ICP above which a warning is printed."""
+LOSS = 0.002
+"""Of F1 by alignment, above which a warning is printed; less is chance."""
 SHORTEST, FURTHEST = 1e-7, 1e4
 """Lengths that can be meant, as shares of the diagonal of the truth."""
 MOST_DRAWS = 1000
@@ -163,6 +165,7 @@ class Outcome:
         seen: Number of points of the ground truth that enough views see; None where the crop volume was given.
         voxel: By which the truth was thinned first, or None.
         sides: The reconstruction and the truth, which the points were drawn from.
+        outside: Shares of the reconstruction above, below and beside the volume; None without one.
     """
 
     draws: tuple[Draw, ...]
@@ -173,6 +176,7 @@ class Outcome:
     seen: int | None
     voxel: float | None
     sides: tuple[Side, Side]
+    outside: dict[str, float] | None = None
 
 
 def compare(
@@ -201,6 +205,8 @@ def compare(
     first = theirs.points(np.random.default_rng(settings.seed))
     refuse_few(first, truth.path)
     crop, seen = volume(first, settings, views, frame, (matrix, tau))
+    if crop is not None and settings.crop == "auto":
+        crop = heightened(crop, reconstruction, matrix, tau)
     box = None if crop is None else around(crop, tau)
     own_box, own_tau = box and seen_from(np.linalg.inv(matrix), box), tau / scale_of(matrix)
     ours = make_side(reconstruction, None, settings.samples, own_tau, own_box)
@@ -223,9 +229,11 @@ def compare(
             emit(Progress("measuring", done, total))
         others = others or found
         draws.append(usable(found[settings.align], tau, quiet=number > 0))
+    warn_of_loss(draws[0], others["none"], settings.align, tau)
     if settings.align == "similarity":
         warn_of_size(draws[0].alignment.scale / scale_of(matrix))
-    return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs))
+    outside = crop and outside_shares(reconstruction, draws[0].alignment.matrix, crop)
+    return Outcome(tuple(draws), others, tau, matrix, crop, seen, theirs.voxel, (ours, theirs), outside)
 
 
 def refuse_sizes(settings: Comparison, truth: Surface) -> None:
@@ -334,6 +342,19 @@ def usable(draw: Draw | None, tau: float, quiet: bool) -> Draw:
     if apart > OFF * tau and not quiet:
         emit(Warned(f"the reconstruction is rough, or the truth is in another frame or unit (--transform): {text}"))
     return draw
+
+
+def warn_of_loss(draw: Draw, unaligned: Draw | None, way: str, tau: float) -> None:
+    """Warn if the two fit less well after alignment than before."""
+    if unaligned is None:
+        return
+    before, after = (shares(each.distances, tau)[2] for each in (unaligned, draw))
+    if after < before - LOSS:
+        emit(
+            Warned(
+                f"--align {way} lowers F1 from {before:.3f} to {after:.3f}: if both are in one frame, take --align none"
+            )
+        )
 
 
 def warn_of_size(change: float) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.events import FileWritten, emit
+from surfkit.core.events import FileWritten, Warned, emit
 from surfkit.evaluate.geometry.chart import write_chart
 from surfkit.evaluate.geometry.class_pictures import write_classes
 from surfkit.evaluate.geometry.classes import class_figures, classify
@@ -22,9 +22,10 @@ from surfkit.evaluate.geometry.errors import (
     write_plan,
     write_row,
 )
+from surfkit.evaluate.geometry.place import same_plan
 from surfkit.evaluate.geometry.repetition import Draw
 from surfkit.evaluate.geometry.scores import chamfer, curve, shares
-from surfkit.evaluate.geometry.surface import read_surface
+from surfkit.evaluate.geometry.surface import read_surface, system_of
 from surfkit.evaluate.geometry.transform import apply, scale_of, write_transform
 from surfkit.evaluate.images.seams import Seams
 from surfkit.scene.crop import write_crop
@@ -62,6 +63,8 @@ def measure_geometry(
         BadInput: A file that cannot be used, or two that do not belong together.
     """
     reconstruction, truth = map(read_surface, files)
+    if settings.transform is None and frame is not None:
+        warn_of_other_system(files[1], frame)
     outcome = compare(reconstruction, truth, settings, views, frame)
     found = figures(outcome, settings) | {"reconstruction": str(files[0]), "truth": str(files[1])}
     for left in (*out.glob("view[0-9].png"), *out.glob("class-*.png")):  # of an earlier comparison
@@ -74,6 +77,13 @@ def measure_geometry(
         found["classes"] = class_figures(classes, outcome.draws[0], outcome.tau)
         write_classes(out, outcome, classes, views, frame)
     return found
+
+
+def warn_of_other_system(truth: Path, frame: Frame) -> None:
+    """Warn if the truth names another coordinate reference system than the photographs; heights do not count."""
+    theirs = system_of(truth)
+    if theirs is not None and frame.crs is not None and not same_plan(theirs, frame.crs):
+        emit(Warned(f"{truth}: its coordinates are in {theirs}, and those of the photographs in {frame.crs}"))
 
 
 def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
@@ -99,6 +109,7 @@ def figures(outcome: Outcome, settings: Comparison) -> dict[str, Any]:
         "chamfer_dtu": {**chamfer(first.distances, far), "far": far},
         "points": {"reconstruction": len(first.reconstruction), "truth": len(first.truth)},
         "crop": crop and {"from": settings.crop, "low": crop.low, "high": crop.high, "area": crop.area},
+        "outside": outcome.outside,
         "truth_voxel": outcome.voxel,
         "seen_points": outcome.seen,
         "curve": {"tau": taus.tolist(), "precision": precision, "recall": recall},

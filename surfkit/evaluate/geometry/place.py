@@ -110,3 +110,23 @@ def _rotation(path: Path, root: dict[str, Any]) -> np.ndarray:
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6):
         raise BadInput(f"{path}: the matrix of its node is damaged; write the file again")
     return turn
+
+
+def same_plan(one: str, other: str) -> bool:
+    """Whether two coordinate reference systems are the same in plan, however they are spelt; heights do not count.
+
+    Where pyproj is not installed, the same text is the same system.
+    """
+    if one == other:
+        return True
+    try:
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+    except ImportError:
+        return False
+    try:
+        first, second = (CRS.from_user_input(each) for each in (one, other))
+    except CRSError:
+        return False
+    flat = [each.sub_crs_list[0] if each.is_compound else each for each in (first, second)]
+    return flat[0].equals(flat[1], ignore_axis_order=True)

@@ -1,4 +1,8 @@
-"""Alignment of a reconstruction to the truth: three rounds of point-to-point ICP at shrinking distances."""
+"""Alignment of a reconstruction to the truth: three rounds of point-to-point ICP at shrinking distances.
+
+Where one of the two reaches beyond the other, the nearest point of what is beyond lies on the border, and pulls the fit
+towards it. Pairs that are nearest in both directions have no such points (mutual matches: the overlap decides).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from surfkit.evaluate.geometry.scores import WORKERS
+from surfkit.evaluate.geometry.scores import WORKERS, tree
 from surfkit.evaluate.geometry.transform import apply, fitted, scale_of
 
 ROUNDS = ((1.0, 80.0), (0.5, 20.0), (0.5, 2.0))
@@ -17,6 +21,8 @@ RESIZED = 2.0
 """Factor of size at which a round gives up."""
 CHANGE = 1e-6
 """Of the matched share and of the residual, as a share of it, at which a round is over."""
+MUTUAL = 2.0
+"""Voxels between a point and the one that its partner finds, up to which the two are a mutual match."""
 MOST = 100_000
 """Points of the reconstruction that are matched: many more than seven numbers need."""
 
@@ -46,7 +52,7 @@ Clouds = Callable[[float, np.ndarray], tuple[np.ndarray, object, np.ndarray]]
 tree and as the (m, 3) points of it, each thinned and inside the crop volume."""
 
 
-def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool) -> Alignment:
+def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool, mutual: bool = False) -> Alignment:
     """The reconstruction brought to the truth, from a start that is not far off.
 
     Args:
@@ -54,18 +60,26 @@ def align(clouds: Clouds, start: np.ndarray, tau: float, with_scale: bool) -> Al
         start: (4, 4), such as the identity.
         tau: Threshold that sets the distances of the rounds.
         with_scale: Whether the size may change.
+        mutual: Whether only mutual matches count.
     """
     found = Alignment(start, 0.0, None)
     for voxel, reach in ROUNDS:
         source, there, target = clouds(voxel * tau, found.matrix)
         if len(source) > MOST:
             source = source[np.linspace(0, len(source) - 1, MOST).astype(np.int64)]
-        found = icp(source, there, target, Alignment(found.matrix, 0.0, None), reach * tau, with_scale)
+        begin, slack = Alignment(found.matrix, 0.0, None), MUTUAL * voxel * tau if mutual else None
+        found = icp(source, there, target, begin, reach * tau, with_scale, slack)
     return found
 
 
 def icp(
-    source: np.ndarray, there: object, target: np.ndarray, start: Alignment, reach: float, with_scale: bool
+    source: np.ndarray,
+    there: object,
+    target: np.ndarray,
+    start: Alignment,
+    reach: float,
+    with_scale: bool,
+    slack: float | None = None,
 ) -> Alignment:
     """One round: match each point with the nearest within reach, fit, and again, until nothing changes.
 
@@ -76,11 +90,15 @@ def icp(
         start: Where to begin.
         reach: Largest distance of a match.
         with_scale: Whether the size may change.
+        slack: Largest distance, in the frame of the truth, of a point from the one that its partner finds; None if
+            the partner is not asked.
     """
-    found = start
+    found, here = start, None if slack is None else tree(source)
     for _ in range(ITERATIONS):
         away, partner = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
         near = np.isfinite(away)
+        if here is not None and slack is not None:
+            near[near] = _answered(source[near], here, source, target[partner[near]], found.matrix, slack)
         residual = float(np.sqrt((away[near] ** 2).mean())) if near.any() else None
         now = Alignment(found.matrix, float(near.mean()), residual)
         settled = found.residual is not None and residual is not None
@@ -96,3 +114,11 @@ def icp(
     away, _ = there.query(apply(found.matrix, source), distance_upper_bound=reach, workers=WORKERS)
     near = np.isfinite(away)
     return Alignment(found.matrix, float(near.mean()), float(np.sqrt((away[near] ** 2).mean())) if near.any() else None)
+
+
+def _answered(
+    points: np.ndarray, here: object, source: np.ndarray, partners: np.ndarray, matrix: np.ndarray, slack: float
+) -> np.ndarray:
+    """(n,) bool: whether the partners of (n, 3) points find these, or points of the source near them."""
+    _, back = here.query(apply(np.linalg.inv(matrix), partners), workers=WORKERS)
+    return np.linalg.norm(source[back] - points, axis=1) * scale_of(matrix) <= slack

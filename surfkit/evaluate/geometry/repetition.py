@@ -13,10 +13,10 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.memory import size
 from surfkit.evaluate.geometry.registration import Alignment, align
 from surfkit.evaluate.geometry.sampling import face_areas, sample_surface
-from surfkit.evaluate.geometry.scores import Distances, nearest, tree
+from surfkit.evaluate.geometry.scores import WORKERS, Distances, nearest, tree
 from surfkit.evaluate.geometry.surface import Surface, part_within
 from surfkit.evaluate.geometry.thinning import thin, voxel_for
-from surfkit.evaluate.geometry.transform import apply
+from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.volume import extent_text
 from surfkit.scene.crop import Crop
 from surfkit.scene.memory import free_bytes
@@ -25,6 +25,12 @@ MOST = 4_000_000
 """Points of a cloud or of a mesh that are compared; larger clouds are thinned to about as many while they are read."""
 FOR_ICP = 400_000
 """Points of the reconstruction that ICP thins and looks at: many more than seven numbers need."""
+FOR_MISSED = 100_000
+"""Points of the truth by which alignments are compared."""
+GAIN = 0.02
+"""Share by which another alignment must leave less of the truth uncovered than the usual one, to take its place."""
+UNTOLD_SIZE = 1e-3
+"""Change of size by ICP that is taken as it is; a larger one must gain."""
 LEAST = 10
 """Points on either side without which shares mean nothing."""
 SAMPLE_BYTES = 200
@@ -151,6 +157,7 @@ class Measurement:
         self.target = self.cropped(target)
         self.spans = extent_text(self.source), extent_text(target)
         self.targets = cache(self._target)
+        self.found: dict[tuple[bytes, bool], Alignment] = {}
 
     def cropped(self, points: np.ndarray) -> np.ndarray:
         """Those in the crop volume, of (n, 3) points in the frame of the truth."""
@@ -172,9 +179,7 @@ class Measurement:
 
     def draw(self, start: np.ndarray, way: str) -> Draw | None:
         """Align in one way, and compare; None where that leaves too few points to compare."""
-        found = Alignment(start, 0.0, None)
-        if way != "none":
-            found = align(self.clouds, start, self.tau, with_scale=way == "similarity")
+        found = Alignment(start, 0.0, None) if way == "none" else self.aligned(start, way == "similarity")
         ours = self.thinned(self.cropped(apply(found.matrix, self.source)), self.tau / 2)
         there, theirs = self.targets(self.tau / 2)
         if min(len(ours), len(theirs)) < LEAST:
@@ -185,6 +190,32 @@ class Measurement:
             residual = float(np.sqrt((near**2).mean())) if len(near) else None
             found = Alignment(start, len(near) / len(ours), residual)
         return Draw(ours, theirs, distances, found)
+
+    def aligned(self, start: np.ndarray, with_scale: bool) -> Alignment:
+        """The alignment that leaves least of the truth uncovered, of ICP by all matches, by mutual ones, and of none.
+
+        All matches lead astray where the reconstruction reaches beyond the truth: a smaller, or a shifted one has more
+        of them. What the truth misses does not gain by that. The size changes only where that gains: noise alone lets
+        ICP shrink.
+        """
+        if (start.tobytes(), with_scale) not in self.found:
+            first = align(self.clouds, start, self.tau, with_scale)
+            others = [align(self.clouds, start, self.tau, with_scale, mutual=True), Alignment(start, 0.0, None)]
+            if with_scale and abs(first.scale / scale_of(start) - 1) > UNTOLD_SIZE:
+                others, first = [first, *others], self.aligned(start, with_scale=False)
+            misses = {id(each): self.missed(each.matrix) for each in (first, *others)}
+            best = min(others, key=lambda each: misses[id(each)])
+            better = misses[id(best)] < (1 - GAIN) * misses[id(first)]
+            self.found[start.tobytes(), with_scale] = best if better else first
+        return self.found[start.tobytes(), with_scale]
+
+    def missed(self, matrix: np.ndarray) -> float:
+        """Mean distance, tau at most, of the truth in the crop volume to a reconstruction in that place."""
+        few = self.source[:: max(1, len(self.source) // FOR_ICP)]
+        there, (_, target) = tree(apply(matrix, few)), self.targets(self.tau / 2)
+        target = target[:: max(1, len(target) // FOR_MISSED)]
+        away, _ = there.query(target, distance_upper_bound=self.tau, workers=WORKERS)
+        return float(np.minimum(away, self.tau).mean())
 
     def refuse_other_frame(self, matrix: np.ndarray) -> None:
         """BadInput if the two cannot lie in one frame."""

@@ -11,7 +11,9 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
-from surfkit.evaluate.geometry.lists import has_lists, points_beside_lists
+from surfkit.evaluate.geometry.heights import RASTERS, raster_system, read_heights_raster
+from surfkit.evaluate.geometry.las import CLOUDS, SCANS, las_notes, read_e57, read_las
+from surfkit.evaluate.geometry.lists import fans, has_lists, points_beside_lists
 from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.export.ply import TYPES, read_vertices
 from surfkit.readers.sparse_ply import read_points
@@ -58,6 +60,13 @@ class Surface:
             yield block[np.isfinite(block).all(1)]
 
 
+def system_of(path: Path) -> str | None:
+    """The coordinate reference system that a LAS file or a raster of heights names; None where there is none."""
+    if path.suffix.lower() in CLOUDS:
+        return las_notes(path).get("crs")
+    return raster_system(path) if path.suffix.lower() in RASTERS else None
+
+
 def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
     """The faces of a mesh that reach into a box; of those that reach far out of it, pieces.
 
@@ -83,7 +92,8 @@ def part_within(mesh: Surface, low: np.ndarray, high: np.ndarray) -> Surface:
 
 
 def read_surface(path: Path) -> Surface:
-    """The mesh or cloud in a file: PLY read here, block by block; OBJ, STL, GLB, OFF and text PLY meshes by trimesh.
+    """The mesh or cloud in a file: PLY read here, block by block; OBJ, STL, GLB, OFF and text PLY meshes by trimesh;
+    LAS, LAZ and E57 by their libraries, and rasters of heights as meshes.
 
     Meshes of surfkit that leave out an offset, or are turned, are brought back to the coordinates of the input.
     Points that are not finite are left out, with a warning, and so are faces at such vertices.
@@ -93,7 +103,13 @@ def read_surface(path: Path) -> Surface:
     """
     if not path.is_file():
         raise BadInput(f"{path}: no such file; name a mesh or a cloud of points")
-    found = _ply(path) if path.suffix.lower() == ".ply" else _other(path)
+    kind = path.suffix.lower()
+    if kind in SCANS:
+        found = Surface(path, read_e57(path) if kind == ".e57" else read_las(path)[0])
+    elif kind in RASTERS:
+        found = Surface(path, *read_heights_raster(path))
+    else:
+        found = _ply(path) if kind == ".ply" else _other(path)
     if not len(found):
         raise BadInput(f"{path}: no points in it; write the file again")
     if found.faces is not None and not len(found.faces):
@@ -132,7 +148,7 @@ def _header(path: Path) -> list[str]:
 
 
 def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.ndarray:
-    """(F, 3) corners, mapped from a binary file whose faces come after its vertices."""
+    """(F, 3) corners, mapped from a binary file whose faces come after its vertices; fans of larger polygons."""
     elements = [line.split()[1] for line in lines if line.startswith("element ")]
     if elements[1] != "face":
         raise BadInput(f"{path}: element {elements[1]!r} lies before the faces; write vertices, then faces")
@@ -153,13 +169,14 @@ def _faces(path: Path, lines: list[str], rows: np.ndarray, count: int) -> np.nda
         return np.empty((0, 3), np.int32)
     start = (rows.offset + rows.nbytes) if isinstance(rows, np.memmap) else 0
     size = path.stat().st_size
-    if not start or size - start < count * dtype.itemsize:
-        raise BadInput(
-            f"{path}: not {count} triangles in it: it is cut off, or has faces of other kinds; triangulate it"
-        )
-    mapped = np.memmap(path, dtype, "r", start, (count,))
+    if not start:
+        raise BadInput(f"{path}: its faces cannot be found; write the file again")
+    whole = min(count, (size - start) // dtype.itemsize)
+    mapped = np.memmap(path, dtype, "r", start, (whole,)) if whole else np.empty(0, dtype)
     if (mapped["size"] != 3).any():
-        raise BadInput(f"{path}: has faces with more or fewer than 3 corners; triangulate it")
+        return fans(path, dtype, start, count)
+    if whole < count:
+        raise BadInput(f"{path}: {whole} of {count} triangles in it: it is cut off; write or copy it again")
     return mapped["corners"]
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.outline import outline
 from surfkit.evaluate.geometry.scores import surface_gap, tree
+from surfkit.evaluate.geometry.surface import BLOCK, Surface
 from surfkit.evaluate.geometry.transform import apply, scale_of
 from surfkit.evaluate.geometry.visibility import visible_counts
-from surfkit.scene.crop import PLANES, Axis, Crop
+from surfkit.scene.crop import PLANES, Axis, Crop, within
 from surfkit.scene.scene import Frame, View
 
 RADIUS = 0.02
@@ -67,6 +68,61 @@ def visible_crop(
     radius = settings.radius or max(RADIUS * float(np.linalg.norm(np.ptp(ground, axis=0))), 1e-9)
     low, high = float(along.min()) - settings.margin, float(along.max()) + settings.margin
     return Crop(outline(ground, radius), low, high, settings.axis), len(kept)
+
+
+def heightened(crop: Crop, reconstruction: Surface, matrix: np.ndarray, room: float) -> Crop:
+    """The volume as high and as deep as a reconstruction reaches above and below the polygon.
+
+    Else nobody would see a false surface below the truth, or above it. What lies farther away than the volume is wide,
+    as a sky does, stays outside.
+
+    Args:
+        crop: That the truth fills.
+        reconstruction: In its own frame.
+        matrix: (4, 4) from that frame to that of the truth.
+        room: Added below and above.
+    """
+    low, high, axis = crop.low, crop.high, "xyz".index(crop.axis)
+    wide = float(np.linalg.norm(np.ptp(crop.polygon, axis=0)))
+    for block in reconstruction.blocks():
+        moved = apply(matrix, block)
+        moved = moved[(moved[:, axis] > crop.low - wide) & (moved[:, axis] < crop.high + wide)]
+        along = moved[within(crop.polygon, moved[:, list(PLANES[crop.axis])]), axis]
+        low, high = min(low, along.min(initial=low)), max(high, along.max(initial=high))
+    return replace(crop, low=low - room * (low < crop.low), high=high + room * (high > crop.high))
+
+
+def outside_shares(reconstruction: Surface, matrix: np.ndarray, crop: Crop) -> dict[str, float]:
+    """Shares of a reconstruction that lie outside of a volume: above it, below it, and beside it.
+
+    Of the area of a mesh, each triangle by its centre, or of the points of a cloud.
+
+    Args:
+        reconstruction: In its own frame.
+        matrix: (4, 4) from that frame to that of the truth.
+        crop: The volume.
+    """
+    axis, whole = "xyz".index(crop.axis), 0.0
+    found = {"above": 0.0, "below": 0.0, "beside": 0.0}
+    for points, weights in _weighted(reconstruction):
+        moved = apply(matrix, points)
+        inside = within(crop.polygon, moved[:, list(PLANES[crop.axis])])
+        parts = (inside & (moved[:, axis] > crop.high), inside & (moved[:, axis] < crop.low), ~inside)
+        for name, part in zip(found, parts, strict=True):
+            found[name] += float(weights[part].sum())
+        whole += float(weights.sum())
+    return {name: share / whole if whole else 0.0 for name, share in found.items()}
+
+
+def _weighted(surface: Surface) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(n, 3) places and (n,) weights: centres and areas of triangles, or points that weigh the same."""
+    if surface.faces is None:
+        yield from ((block, np.ones(len(block))) for block in surface.blocks())
+        return
+    for start in range(0, len(surface.faces), BLOCK):
+        corners = surface.vertices(np.asarray(surface.faces[start : start + BLOCK]).ravel()).reshape(-1, 3, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        yield corners.mean(1), np.linalg.norm(normals, axis=1) / 2
 
 
 def centres(views: Sequence[View], frame: Frame) -> np.ndarray:

@@ -7,9 +7,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, printable
 from surfkit.core.files import replacing
 from surfkit.report.html.elements import Cell, Group, Section, Table, pictures
 from surfkit.report.html.gallery import encode_all
@@ -145,7 +145,19 @@ def environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader(TEMPLATES)
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_quoted,
+    )
+
+
+def _quoted(value: Any) -> Any:
+    """What a template prints, without control characters; HTML that it includes stays as it is."""
+    return printable(value, lines=True) if type(value) is str else value
 
 
 def write_report(folders: Sequence[Path], out: Path, options: Options) -> int:

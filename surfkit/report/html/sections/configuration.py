@@ -26,7 +26,7 @@ def configuration(runs: Sequence[Source]) -> Section:
 
 def settings(run: Source) -> dict[str, Any]:
     """The recipe and the data set by dotted path, as on the command line."""
-    recipe = {key: value for key, value in run.recipe.items() if key != "about"}
+    recipe = {key: value for key, value in run.recipe.items() if key not in ("about", "test_every")}
     return {path: value for path, value in (flat(recipe) | flat(mapping(run.record, "data"), "data")).items() if path}
 
 

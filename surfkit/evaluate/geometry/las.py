@@ -1,4 +1,4 @@
-"""Points of LAS and LAZ files, such as those of `surfkit maps`."""
+"""Points of LAS, LAZ and E57 files: laser scans, and the clouds of `surfkit maps`."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.memory import is_out_of_memory
 from surfkit.core.optional import needed
-from surfkit.view.display import by_height, height_bounds
 
 CLOUDS = (".las", ".laz")
-MOST = 10_000_000
-"""Points that are kept; a click looks among these."""
+SCANS = (*CLOUDS, ".e57")
+MAX_POINTS = 40_000_000
+"""Points that are kept of a larger file: a gigabyte of positions."""
 AT_ONCE = 1_000_000
 """Points in memory besides."""
 RECORDS = {"WktCoordinateSystemVlr", "GeoKeyDirectoryVlr"}
@@ -23,10 +23,38 @@ RECORDS = {"WktCoordinateSystemVlr", "GeoKeyDirectoryVlr"}
 COLORS = ("red", "green", "blue")
 
 
-def read_las(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
+def read_e57(path: Path) -> np.ndarray:
+    """(N, 3) float64 positions of all scans of an E57 file, in its own coordinates.
+
+    Of more than MAX_POINTS every second, third and so on is taken.
+
+    Raises:
+        BadInput: pye57 is not installed, or the file is damaged or empty.
+    """
+    with needed("pye57", str(path)):
+        import pye57
+    try:
+        file = pye57.E57(str(path))
+        count = sum(file.get_header(at).point_count for at in range(file.scan_count))
+        every, parts = max(1, -(-count // MAX_POINTS)), []
+        for at in range(file.scan_count):
+            scan = file.read_scan(at, ignore_missing_fields=True)
+            parts.append(np.stack([scan[f"cartesian{axis}"][::every] for axis in "XYZ"], axis=1).astype(np.float64))
+    except Exception as error:  # of libE57Format
+        if is_out_of_memory(error):
+            raise
+        raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}; write or copy it again") from error
+    if not (found := np.concatenate(parts) if parts else np.zeros((0, 3))).size:
+        raise BadInput(f"{path}: there are no points in it")
+    _tell_fewer(path, len(found), count)
+    return found
+
+
+def read_las(path: Path, most: int = MAX_POINTS) -> tuple[np.ndarray, np.ndarray | None, dict[str, str]]:
     """(N, 3) float64 positions, (N, 3) uint8 colours, and what the file says of its coordinates, as PLY headers do.
 
-    Of more than MOST points every second, third and so on is taken. Points without colours have those of their heights.
+    It is read in pieces. Of more than `most` points every second, third and so on is taken. Colours are None where the
+    file has none.
 
     Raises:
         BadInput: laspy is not installed, or the file is damaged or empty.
@@ -38,7 +66,7 @@ def read_las(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
             import lazrs  # noqa: F401 (what laspy reads it with)
     try:
         with laspy.open(path) as file:
-            xyz, rgb = _points(file)
+            xyz, rgb = _points(file, most)
             notes = _notes(path, file.header)
     except Exception as error:  # laspy and lazrs have errors of many kinds
         if is_out_of_memory(error):
@@ -46,14 +74,26 @@ def read_las(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, str]]:
         raise BadInput(f"{path}: cannot be read: {' '.join(str(error).split())}; write or copy it again") from error
     if not len(xyz):
         raise BadInput(f"{path}: there are no points in it")
-    if len(xyz) < file.header.point_count:
-        emit(Warned(f"{path}: {len(xyz):,} of {file.header.point_count:,} points are shown"))
-    return xyz, by_height(xyz[:, 2], height_bounds(xyz[:, 2])) if rgb is None else rgb, notes
+    _tell_fewer(path, len(xyz), file.header.point_count)
+    return xyz, rgb, notes
 
 
-def _points(file: Any) -> tuple[np.ndarray, np.ndarray | None]:
+def las_notes(path: Path) -> dict[str, str]:
+    """What a LAS or LAZ file says of its coordinates, as PLY headers do; nothing where it cannot be read."""
+    with needed("laspy", str(path)):
+        import laspy
+    with laspy.open(path) as file:
+        return _notes(path, file.header)
+
+
+def _tell_fewer(path: Path, used: int, count: int) -> None:
+    if used < count:
+        emit(Warned(f"{path}: {used:,} of {count:,} points are used"))
+
+
+def _points(file: Any, most: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions, and colours if there are some."""
-    every, before, places, colors = max(1, -(-file.header.point_count // MOST)), 0, [], []
+    every, before, places, colors = max(1, -(-file.header.point_count // most)), 0, [], []
     colored = set(COLORS) <= set(file.header.point_format.dimension_names)
     for chunk in file.chunk_iterator(AT_ONCE):
         rows = slice(-before % every, None, every)
@@ -81,6 +121,6 @@ def _notes(path: Path, header: Any) -> dict[str, str]:
         flat = found.sub_crs_list[0] if found.is_compound else found
         number, unit = flat.to_epsg(), flat.axis_info[0].unit_conversion_factor if flat.axis_info else 1.0
     except Exception as error:  # no pyproj, or what it does not know
-        emit(Warned(f"{path}: coordinates are shown without their reference system: {' '.join(str(error).split())}"))
+        emit(Warned(f"{path}: coordinates are used without their reference system: {' '.join(str(error).split())}"))
         return {}
     return {"crs": f"EPSG:{number}", "metres per unit": f"{unit:.15g}"} if number and flat.is_projected else {}

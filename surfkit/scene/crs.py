@@ -1,0 +1,222 @@
+"""Coordinate reference systems of maps: their axes and units, and transformations by pyproj that guess nothing.
+
+Where the grid of a datum or of a geoid is not installed, PROJ falls back to a "ballpark" transformation, which leaves
+out the shift of the datum (some 100 m) or of the heights (up to 100 m) and says nothing. Here it never does:
+`exact` transforms with what is known, or not at all, and `missing` names the grids that would do better.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from surfkit.core.check import BadInput
+from surfkit.core.optional import needed
+
+NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
+TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+lon_0={NUMBER} \+h_0={NUMBER}")
+UTM = re.compile(r"EPSG:32([67])(0[1-9]|[1-5]\d|60)", re.IGNORECASE)
+DEGREES = "EPSG:4326"
+UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
+"""Short names of units of length, by those of EPSG."""
+SAME_UNIT = 1e-5
+"""Largest difference of two units that are one, as a share: feet of the two kinds differ by 2e-6."""
+UNIT_OFF = 0.01
+"""Largest difference, as a share, of a stated unit from that of the coordinate reference system."""
+STEP_M = 100.0
+"""Over which lengths on the map are measured."""
+MARGIN = 1.0
+"""Degrees beyond the area of a transformation that it is still used in."""
+COARSE_M = 2.0
+"""Accuracy of a transformation from which on a better one is told of, where it lacks its grid only."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Units of a system of easting and northing.
+
+    Attributes:
+        metres: Per unit of easting and northing.
+        unit: Its name, such as "US survey foot".
+        height_metres: Per unit of height; None where the system has no heights.
+        height_unit: Its name; "" where it has none.
+    """
+
+    metres: float = 1.0
+    unit: str = "metre"
+    height_metres: float | None = None
+    height_unit: str = ""
+
+    @property
+    def symbol(self) -> str:
+        """The unit behind numbers, such as "m" or "US ft"."""
+        return UNITS.get(self.unit, self.unit)
+
+
+def parsed(crs: str) -> Any:
+    """The system as pyproj has it.
+
+    Raises:
+        BadInput: pyproj is not installed, or does not know it.
+    """
+    with needed("pyproj", f"the coordinate reference system {crs}"):
+        from pyproj import CRS
+        from pyproj.exceptions import ProjError
+    try:
+        return CRS(crs)
+    except ProjError as error:
+        said = " ".join(str(error).split())[:200]
+        raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place it on Earth: {said}") from error
+
+
+def axes_of(crs: str) -> Axes:
+    """The units of a system.
+
+    Raises:
+        BadInput: It is not one of easting and northing in a unit of length, or heights are in another unit than
+            those; or pyproj is needed and not installed, or does not know it.
+    """
+    if is_plain(crs):
+        return Axes()
+    given = parsed(crs)
+    if given.is_geographic:
+        raise BadInput(f"{crs}: it is in degrees, where lengths belong; name a projected one, such as EPSG:32633")
+    if not given.is_projected:
+        raise BadInput(f"{crs}: it has no easting and northing; name a projected one, such as EPSG:32633")
+    x, y, *up = given.axis_info
+    toward = {x.direction, y.direction}
+    if toward != {"east", "north"} and toward not in ({"north"}, {"south"}):  # the latter about a pole
+        raise BadInput(
+            f"{crs}: its axes point {x.direction} and {y.direction}; convert the coordinates to a system whose axes "
+            "point east and north, as those of EPSG:5514 do and of EPSG:5513 do not"
+        )
+    metres, heights = x.unit_conversion_factor, up[0].unit_conversion_factor if up else None
+    if heights is not None and abs(heights / metres - 1) > SAME_UNIT:
+        feet = "; feet of height have EPSG:6360 (US survey feet) and EPSG:8228 (feet)" if 0.3 < metres < 0.31 else ""
+        raise BadInput(
+            f"{crs}: easting and northing are in units of {x.unit_name}, heights in {up[0].unit_name}; a scene has one "
+            f"unit on all axes: name a system with one{feet}"
+        )
+    return Axes(metres, x.unit_name, heights, up[0].unit_name if up else "")
+
+
+def is_plain(crs: str) -> bool:
+    """Whether it is a zone of UTM on WGS 84 or a topocentric frame, in metres, which need no pyproj."""
+    return bool(UTM.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
+
+
+def known_axes(crs: str) -> Axes | None:
+    """The same; None where it is none of a map with one unit, or pyproj is not there to tell."""
+    try:
+        return axes_of(crs)
+    except BadInput:
+        return None
+
+
+def refuse_other_unit(crs: str, metres: float | None, place: np.ndarray) -> None:
+    """BadInput where the metres per unit that were stated for coordinates contradict their system.
+
+    Args:
+        crs: The system.
+        metres: Stated; None is not.
+        place: (3,) easting, northing and height of the scene: a unit may also be as long as it is on the ground there.
+    """
+    axes = axes_of(crs)
+    if metres is None or abs(metres / axes.metres - 1) <= UNIT_OFF:
+        return
+    if abs(metres / (axes.metres * scale_at(crs, place)) - 1) > UNIT_OFF:
+        raise BadInput(
+            f"{crs} is in units of {axes.unit} ({axes.metres:.9g} m), and the data set or --metres-per-unit says that "
+            f"a unit is {metres:.9g} m; correct metres_per_unit in georeference.json, or name the system that the "
+            "coordinates are in"
+        )
+
+
+def scale_at(crs: str, place: np.ndarray) -> float:
+    """Length on the ground, as a share of that on the map, at an easting and northing; 1 where that is not known.
+
+    It is the geometric mean of both axes, within 0.1 % of 1 in a zone of UTM, and the cosine of the latitude in web
+    Mercator.
+    """
+    if is_plain(crs):
+        return 1.0
+    from pyproj import Geod
+
+    steps = STEP_M / axes_of(crs).metres * np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])
+    lon, lat = degrees_of(crs, np.asarray(place, np.float64)[:2] + steps)
+    if not np.isfinite([lon, lat]).all():
+        return 1.0
+    lengths = Geod(ellps="WGS84").inv(lon[[0, 2]], lat[[0, 2]], lon[[1, 3]], lat[[1, 3]])[2]
+    return float(np.sqrt(np.prod(lengths)) / (2 * STEP_M))
+
+
+def degrees_of(crs: str, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) longitudes and latitudes of (P, 2) eastings and northings, degrees on the datum of the system itself."""
+    from pyproj import Transformer
+
+    flat = parsed(crs).to_2d()
+    flat = flat.source_crs if flat.is_bound else flat
+    own = flat.geodetic_crs.to_2d()
+    found = Transformer.from_crs(flat, own, always_xy=True).transform(*np.asarray(places, np.float64)[:, :2].T)
+    lon, lat = (np.degrees(np.asarray(at) * own.axis_info[0].unit_conversion_factor) for at in found)
+    meridian = own.prime_meridian
+    return lon + np.degrees(meridian.longitude * meridian.unit_conversion_factor), lat
+
+
+def exact(source: Any, target: Any) -> Any | None:
+    """A transformer of pyproj, x before y, that leaves out no shift of datum or heights; None where there is none.
+
+    Args:
+        source: A coordinate reference system, or what names one.
+        target: Another one.
+    """
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        return Transformer.from_crs(source, target, always_xy=True, allow_ballpark=False)
+    except ProjError:
+        return None
+
+
+def used_beyond(known: Any, lon: float, lat: float) -> bool:
+    """Whether what a transformer did last is not meant for a place, in degrees: its shift may be far off there."""
+    area = known.get_last_used_operation().area_of_use
+    if area is None:
+        return False
+    wide = (area.east - area.west) % 360 or 360.0
+    along = (lon - area.west + MARGIN) % 360 <= wide + 2 * MARGIN
+    return not (along and area.south - MARGIN <= lat <= area.north + MARGIN)
+
+
+def missing(source: Any, target: Any, lon: float, lat: float) -> tuple[list[str], float]:
+    """Grids that the best transformation at a place in degrees lacks, and how exact it is, metres (-1: not known)."""
+    from pyproj.aoi import AreaOfInterest
+    from pyproj.exceptions import ProjError
+    from pyproj.transformer import TransformerGroup
+
+    area = AreaOfInterest(lon - 1e-3, max(lat - 1e-3, -90.0), lon + 1e-3, min(lat + 1e-3, 90.0))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the best one is not available, as is said here
+            group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
+    except ProjError:
+        return [], -1.0
+    best = min(group.unavailable_operations, key=lambda each: each.accuracy if each.accuracy >= 0 else math.inf,
+               default=None)  # fmt: skip
+    if best is None:
+        return [], -1.0
+    return [grid.short_name for grid in best.grids if not grid.available], best.accuracy
+
+
+def not_installed(grids: list[str]) -> str:
+    """That grids of PROJ are missing, and what installs them; "" if none is."""
+    if not grids:
+        return ""
+    named, get = " and ".join(grids), " and ".join(f"`pyproj sync --file {name}`" for name in grids)
+    return f"PROJ needs the grid{'s' if len(grids) > 1 else ''} {named}, not installed here; {get} gets what is missing"
