@@ -142,6 +142,12 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
     return (image.tag_v2[WIDTH], image.tag_v2[HEIGHT]) if image.format == "TIFF" else image.size
 
 
+def open_header(path: Path, use: Callable[[Image.Image], T]) -> T:
+    """What `use` makes of the header of a picture of any size; whatever Pillow finds wrong becomes BadInput."""
+    with _picture(path) as image:
+        return use(image)
+
+
 def open_picture(
     path: Path, use: Callable[[Image.Image], T], size: tuple[int, int] | None = None, draft: bool = False
 ) -> T:
