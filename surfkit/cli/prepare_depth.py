@@ -149,7 +149,7 @@ def write_overview(path: Path, root: Path, views: Iterable[View]) -> None:
         height, width = inverse.shape
         trust = torch.zeros(height, width) if confidence is None else torch.from_numpy(confidence)
         try:
-            photo = read_photo(view.path, (width, height)).float() / 255
+            photo = read_photo(view.path, (width, height), pixels=view.pixels).float() / 255
         except BadInput:  # damaged since its map was made
             continue
         rows.append(torch.cat([photo, colour_depth(1 / inverse), trust.expand(3, -1, -1)], dim=2))

@@ -65,8 +65,9 @@ class DepthAnythingV2(DepthEstimator):
     def estimate(self, given: DepthInput, wanted: Sequence[int]) -> Iterator[Estimate]:
         network = self.network().to(given.device).eval()
         for at in wanted:
-            camera = given.views[at].camera
-            rgb = read_photo(given.views[at].path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
+            view, camera = given.views[at], given.views[at].camera
+            photo = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels)
+            rgb = photo.to(given.device, torch.float32) / 255
             with torch.inference_mode():
                 inverse = self.inverse_depth(network, rgb)
             size = camera.fitted(max(inverse.shape))  # patches bend the shape a little

@@ -23,6 +23,7 @@ from surfkit.readers.depth_files import FOLDER, RECORD, is_whole, map_path, read
 from surfkit.readers.fingerprint import Fingerprint, digest
 from surfkit.readers.made_maps import Made, folder_of, read_made, write_made
 from surfkit.scene.observations import Observations
+from surfkit.scene.pixels import PLAIN
 from surfkit.scene.scene import Scene
 
 POLL_S = 1.0
@@ -49,6 +50,7 @@ def key_of(
     for view in scene.train:
         known, seen = prints.photographs[view.name], tracks.seen.get(view.name)
         parts += [view.name, known.camera, str(known.size), known.content, str(view.white)]
+        parts += [] if view.pixels == PLAIN else [str(view.pixels)]
         parts.append("" if seen is None else digest(seen))
     return digest("\0".join(parts))
 

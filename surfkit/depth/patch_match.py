@@ -268,7 +268,8 @@ class Work:
     def read(self, at: int) -> Tensor:
         """(H, W) uint8, a photograph at full size."""
         camera = self.camera(at, 0)
-        rgb = read_photo(self.given.views[at].path, (camera.width, camera.height)).to(torch.float32)
+        view = self.given.views[at]
+        rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels).to(torch.float32)
         return rgb.mean(0).round().to(torch.uint8)
 
     def grey(self, at: int, level: int) -> Grey:

@@ -138,8 +138,8 @@ class PlaneSweep(DepthEstimator):
         """A photograph at the working size."""
         view = given.views[at]
         camera = view.camera.fitted(self.longest)
-        rgb = read_photo(view.path, (camera.width, camera.height)).to(given.device, torch.float32) / 255
-        return Picture(camera, rgb)
+        rgb = read_photo(view.path, (camera.width, camera.height), pixels=view.pixels)
+        return Picture(camera, rgb.to(given.device, torch.float32) / 255)
 
     def sweep(
         self, given: DepthInput, at: int, here: Picture, others: Sequence[Picture]

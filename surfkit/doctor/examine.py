@@ -29,6 +29,7 @@ from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.scene.groups import groups_warning, untied_warning
+from surfkit.scene.photos import refuse_large
 
 Told = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -93,7 +94,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         told: Hears of the progress.
     """
     start = time.perf_counter()
-    gathered = gather(data)
+    gathered = gather(data, quick)
     seconds, peak = time.perf_counter() - start, peak_memory_bytes()
     geometry = survey(gathered.capture.shots, gathered.train, gathered.capture.xyz, recipe.pretrain.near)
     looks = _look(gathered, geometry, quick, told)
@@ -102,7 +103,7 @@ def examine(data: Data, recipe: Recipe, quick: bool = False, told: Told | None =
         *gathered.findings,
         *geometry.findings,
         *_photographs(data, gathered, looks),
-        *_sizes(gathered, known),
+        *_sizes(data, gathered, known),
         *_masks(gathered, known),
         *_split(gathered),
         *_groups(gathered),
@@ -124,6 +125,7 @@ def _look(gathered: Gathered, geometry: Geometry, quick: bool, told: Told | None
             shot.path,
             gathered.masks.get(shot.name),
             seen_by(shot, compared) if len(compared) and shot.name in geometry.sound else None,
+            gathered.pixels[shot.name],
         )
         for shot in gathered.capture.shots
         if shot.path.is_file()
@@ -170,14 +172,15 @@ def bare(path: Path, text: str) -> str:
     return text.removeprefix(f"{path}: ")
 
 
-def _sizes(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
-    """Photographs that are not what their cameras took."""
+def _sizes(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
+    """Photographs that are not what their cameras took, or too large."""
     faults = {}
     for shot in gathered.capture.shots:
         look = known.get(shot.name)
         if look is not None and look.size is not None:
             try:
                 check_size(shot, look.size)
+                refuse_large(shot.path, look.size, data.size(*look.size))
             except BadInput as error:
                 faults[shot.name] = bare(shot.path, str(error))
             except ZeroDivisionError:
@@ -308,8 +311,11 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     bent = sum(not is_pinhole(shot.camera) for shot in shots)
     if bent:
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
-    if gathered.masks:
-        told.append(f"ignore what is black in the masks of {len(gathered.masks)} photographs")
+    own = sum(gathered.masks.get(shot.name) == shot.path for shot in shots)
+    if count := len(gathered.masks) - own:
+        told.append(f"ignore what is black in the masks of {count} photographs")
+    if own:
+        told.append(f"ignore what is transparent in {own} photographs")
     if not recipe.has_stages:
         return (*told, f"reconstruct with method:{name_of(recipe.method)}")
     sparse = len(gathered.capture.xyz)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +18,11 @@ from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import DepthFile
 from surfkit.readers.depth_layout import DepthQuery, find_maps
-from surfkit.readers.masks import FOLDER, MARKS, find_masks
+from surfkit.readers.masks import FOLDER, MARKS, find_masks, with_opacity
+from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.read import model_folder, read_capture, reader_of
 from surfkit.scene.names import PICTURES
+from surfkit.scene.pixels import PLAIN, Pixels
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
@@ -34,6 +36,7 @@ class Gathered:
         capture: What could be read; its shots in name order. Photographs need not exist.
         masks: By name of the photograph.
         held_out: Names that are kept from training.
+        pixels: What the values of the photographs that are there mean, by name.
         loose: Pictures beside the photographs that have no pose; all pictures where nothing has one.
         findings: What the reader, the masks and the split give rise to.
     """
@@ -42,6 +45,7 @@ class Gathered:
     capture: Capture
     masks: dict[str, Path]
     held_out: frozenset[str]
+    pixels: Mapping[str, Pixels]
     loose: tuple[Path, ...]
     findings: tuple[Finding, ...]
 
@@ -51,24 +55,28 @@ class Gathered:
         return [shot for shot in self.capture.shots if shot.name not in self.held_out]
 
 
-def gather(data: Data) -> Gathered:
-    """Read a data set, and go on after every fault that leaves something to be read."""
+def gather(data: Data, quick: bool = False) -> Gathered:
+    """Read a data set, and go on after every fault that leaves something to be read; no photograph if it is `quick`."""
     with heard() as warnings, collecting() as faults:
         layout, capture = _read(data, faults)
-        said = list(warnings)
+        said, files = list(warnings), {shot.name: shot.path for shot in capture.shots if shot.path.is_file()}
         masks: dict[str, Path] = {}
         try:
             masks = find_masks(data.path, data.masks, capture.shots) if data.path.is_dir() else {}
         except BadInput as error:
             faults.append(error)
-        said = said if masks else list(warnings)  # how many masks there are is told anyway
+        told = bool(masks)  # in words of its own, how many masks there are
+        decided = Decided(dict.fromkeys(files, PLAIN), ()) if quick else decide(files, data.alpha, data.white)
+        masks = with_opacity(masks, [shot for shot in capture.shots if shot.name in files], decided)
+        said = [*said, *list(warnings)[len(said) + told :], *decided.lines]
         held_out: set[str] = set()
         try:
             held_out = data.held_out(capture) if capture.shots else held_out
         except BadInput as error:
             faults.append(error)
     findings = from_errors("data-set", faults) + from_errors("data-set", map(BadInput, said), "warning")
-    return Gathered(layout, capture, masks, frozenset(held_out), _loose(data, capture.shots), tuple(findings))
+    loose = _loose(data, capture.shots)
+    return Gathered(layout, capture, masks, frozenset(held_out), decided.pixels, loose, tuple(findings))
 
 
 def depth_maps(data: Data, gathered: Gathered) -> dict[str, DepthFile]:

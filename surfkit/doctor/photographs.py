@@ -15,7 +15,8 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.doctor.exposure import luminance
 from surfkit.readers.masks import check_mask, read_mask
-from surfkit.scene.photos import open_picture, read_draft
+from surfkit.scene.photos import open_header, read_draft
+from surfkit.scene.pixels import PLAIN, Pixels
 
 DRAFT = 256
 """Longer side at which photographs are looked at, pixels, or up to twice that."""
@@ -63,11 +64,13 @@ class Wanted:
         path: Of the photograph.
         mask: Of its mask.
         places: Where the brightness is wanted, if anywhere.
+        pixels: What the values of the photograph mean.
     """
 
     path: Path
     mask: Path | None = None
     places: Places | None = None
+    pixels: Pixels = PLAIN
 
 
 def look_at(wanted: Sequence[Wanted], quick: bool = False) -> Iterator[Photograph]:
@@ -90,15 +93,15 @@ def _look(wanted: Wanted, quick: bool) -> Photograph:
     found: dict = {}
     try:
         found["bytes"] = wanted.path.stat().st_size
-        open_picture(wanted.path, lambda image: found.update(_header(image)))
+        open_header(wanted.path, lambda image: found.update(_header(image)))
         if not quick:
-            found |= _pixels(read_draft(wanted.path, DRAFT), wanted.places)
+            found |= _pixels(read_draft(wanted.path, DRAFT, wanted.pixels), wanted.places)
     except BadInput as error:
         found["fault"] = str(error)
     except OSError as error:
         found["fault"] = f"{wanted.path}: cannot be read: {error.strerror}"
     if wanted.mask is not None:
-        found |= _mask(wanted.mask, found.get("size"), quick)
+        found |= _mask(wanted.mask, found.get("size"), quick, wanted.mask == wanted.path)
     return Photograph(**found)
 
 
@@ -113,7 +116,7 @@ def _pixels(pixels: np.ndarray, places: Places | None) -> dict:
     return {"flat": flat, "brightness": None if places is None else luminance(pixels, places())}
 
 
-def _mask(path: Path, size: tuple[int, int] | None, quick: bool) -> dict:
+def _mask(path: Path, size: tuple[int, int] | None, quick: bool, photo: bool) -> dict:
     try:
         if size is not None:
             check_mask(path, size)
@@ -121,6 +124,6 @@ def _mask(path: Path, size: tuple[int, int] | None, quick: bool) -> dict:
             return {}
         by = max(1, max(size or (DRAFT, DRAFT)) // DRAFT)
         width, height = size or (DRAFT, DRAFT)
-        return {"kept": float(read_mask(path, (max(1, width // by), max(1, height // by))).float().mean())}
+        return {"kept": float(read_mask(path, (max(1, width // by), max(1, height // by)), photo).float().mean())}
     except BadInput as error:
         return {"mask_fault": str(error)}

@@ -26,8 +26,8 @@ DRIVER = "SURFKIT_DRIVER"
 INTERRUPTED, CRASHED = 130, 70
 """Exit statuses: asked to stop; an unexpected error."""
 POLL_S = 0.2
-FORWARDED = ("PYTHONPATH", "SURFKIT_PLUGINS")
-"""Environment variables of the driver that decide which code runs."""
+FORWARDED = ("PYTHONPATH", "SURFKIT_PLUGINS", "SURFKIT_MAX_MEGAPIXELS")
+"""Environment variables of the driver that decide which code runs, and which photographs are read."""
 WATCHDOG = f"""
 import os, signal, subprocess, sys
 agent = int(os.environ["{DRIVER}"])

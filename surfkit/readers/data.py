@@ -16,6 +16,7 @@ from surfkit.core.registry import choice, name_of
 from surfkit.readers.capture import Capture
 from surfkit.readers.depth_layout import DepthLayout
 from surfkit.readers.split import Split
+from surfkit.scene.pixels import Alpha
 
 LONGEST = 1600
 """Default for the longest side of a photograph, pixels."""
@@ -56,6 +57,11 @@ class Reading:
     white: bool = False
     """Composite transparent pixels of photographs over white instead of black."""
 
+    alpha: Alpha | None = None
+    """What becomes of transparent pixels of photographs: mask ignores them in training and in the metrics, blend
+    composites them over black (or white, with --white), ignore takes their colours as stored. Default: blend, but
+    ignore where a fourth band of a TIFF file is no opacity."""
+
     metres_per_unit: float | None = None
     """Metres per unit of the data set's coordinates, if the data set does not state it. Settings in metres need it."""
 
@@ -80,6 +86,8 @@ class Reading:
             raise BadInput(f"--longest {self.longest}: it is the longest side in pixels, so it must be 1 or more")
         if sum(given is not None for given in (self.split, self.test_list, self.test_data)) > 1:
             raise BadInput("--split, --test-list and --test-data each choose what is held out; give one")
+        if self.white and self.alpha not in (None, "blend"):
+            raise BadInput(f"--white blends transparent pixels, and --alpha {self.alpha} does not; give one")
         if self.metres_per_unit is not None and not 0 < self.metres_per_unit < float("inf"):
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every is not None and self.test_every < 0:

@@ -16,6 +16,7 @@ from surfkit.core.codec import load as load_value
 from surfkit.core.files import replacing
 from surfkit.readers.depth_prior import Alignment
 from surfkit.scene.camera import Camera
+from surfkit.scene.pixels import PLAIN, Pixels
 from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
 
 
@@ -43,6 +44,7 @@ class Shot:
     lens: tuple[float, float, float, float]
     size: tuple[int, int]
     bent: Lens | None = None
+    pixels: Pixels = PLAIN
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def save(path: Path, made: Extract) -> None:
     """Write an extract."""
     scene, frame = made.scene, made.scene.frame
     shots = tuple(
-        Shot(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height), v.lens)
+        Shot(v.name, v.path, v.mask, v.white, (c.fx, c.fy, c.cx, c.cy), (c.width, c.height), v.lens, v.pixels)
         for v in scene.train
         for c in [v.camera]
     )
@@ -112,7 +114,7 @@ def load(path: Path) -> Extract:
 def _extract(arrays: dict[str, np.ndarray]) -> Extract:
     facts = load_value(Facts, from_json(str(arrays["facts"])))
     views = tuple(
-        View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white, s.bent)
+        View(s.name, Camera(torch.from_numpy(pose), *s.lens, *s.size), s.path, s.mask, s.white, s.bent, s.pixels)
         for s, pose in zip(facts.shots, arrays["poses"], strict=True)
     )
     frame = Frame(arrays["origin"], facts.scale, facts.metres, facts.crs, facts.shift)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -10,11 +10,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from surfkit.core.check import BadInput, reject
+from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot
+from surfkit.readers.pixels import Decided
 from surfkit.scene.cache import Cache
-from surfkit.scene.photos import open_picture, photo_size
+from surfkit.scene.photos import open_header, open_picture, photo_size
+from surfkit.scene.pixels import has_opacity, opacity_of
 from surfkit.scene.scene import View
 
 FOLDER = "masks"
@@ -46,30 +48,60 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[s
             found[shot.name] = mask
     if found:
         emit(Warned(f"what is black in their masks is ignored in {len(found)} of {len(shots)} photographs"))
+        if clear := [name for name, path in found.items() if _may_be_clear(path)]:
+            emit(
+                Warned(
+                    f"{len(clear)} masks have an alpha channel, that of {clear[0]} for one: where some of it is "
+                    "transparent, what is opaque is kept, and its colours do not count"
+                )
+            )
     elif known:
         emit(Warned(f"none of the {len(known)} masks has the name of a photograph; call them {FOLDER}/NAME.png"))
     return found
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> Tensor:
+def with_opacity(masks: Mapping[str, Path], shots: Sequence[Shot], decided: Decided) -> dict[str, Path]:
+    """Masks by name, with photographs whose own opacity is the mask; a mask that is there already goes before it."""
+    both, own = [], {}
+    for shot in shots:
+        if decided.pixels[shot.name].alpha == "mask":
+            own[shot.name] = shot.path
+            both += [shot.name] if shot.name in masks else []
+    if both:
+        text = f"{len(both)} photographs have a mask and an opacity, {few(both)}"
+        emit(Warned(f"{text}: the mask alone says what is ignored"))
+    return {**own, **masks}
+
+
+def read_mask(path: Path, size: tuple[int, int], photo: bool = False) -> Tensor:
     """(H, W) bool of a mask at another size: False where it is black, and the pixel is to be ignored.
 
-    Black is the lower half of the values; in a mask of 0 and 1 it is 0.
+    Black is the lower half of the values; in a mask of 0 and 1 it is 0. Of a mask of which pixels are transparent, what
+    is opaque by half is kept, whatever colour it has.
 
     Args:
         path: Any picture.
         size: Width and height wanted; every pixel takes the nearest one of the mask.
+        photo: Whether it is the photograph itself, of which the opacity alone counts.
 
     Raises:
         BadInput: The file is damaged.
     """
 
     def decode(image: Image.Image) -> np.ndarray:
+        if has_opacity(image):
+            clear = opacity_of(image)
+            if photo or clear.min(initial=255) < 255:
+                return np.asarray(Image.fromarray(clear).resize(size, Image.Resampling.NEAREST)) > 127
+        if photo:
+            return np.ones((size[1], size[0]), bool)
         plain = image.convert("L") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image
         values = np.asarray(plain.resize(size, Image.Resampling.NEAREST))
         return values.max(-1) if values.ndim == 3 else values
 
     values = open_picture(path, decode)
+    if values.dtype == bool:
+        return torch.from_numpy(values)
     most = int(values.max(initial=0))
     half = 0 if most <= 1 else 127 if most <= 255 else 32767
     return torch.from_numpy(values > half)
@@ -89,7 +121,8 @@ def mask_sizes(views: Sequence[View]) -> list[int]:
 
 def view_mask(view: View) -> Tensor | None:
     """(H, W) bool of the mask of a view, if it has one, at the size of its camera."""
-    return None if view.mask is None else read_mask(view.mask, (view.camera.width, view.camera.height))
+    size = view.camera.width, view.camera.height
+    return None if view.mask is None else read_mask(view.mask, size, view.mask == view.path)
 
 
 def check_mask(path: Path, size: tuple[int, int]) -> None:
@@ -97,6 +130,14 @@ def check_mask(path: Path, size: tuple[int, int]) -> None:
     width, height = photo_size(path)
     if abs(width * size[1] - height * size[0]) > 1.5 * max(width, height, *size):
         raise BadInput(f"{path}: {width} x {height} px is not the shape of its photograph; make the mask anew")
+
+
+def _may_be_clear(path: Path) -> bool:
+    """Whether a mask has an alpha channel."""
+    try:
+        return open_header(path, has_opacity)
+    except BadInput:  # told when the mask is looked at
+        return False
 
 
 def _folders(root: Path, folder: Path | None) -> list[Path]:

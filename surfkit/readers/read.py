@@ -18,7 +18,8 @@ from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.colmap import COLMAP, MODELS
 from surfkit.readers.data import Data
-from surfkit.readers.masks import check_mask, find_masks
+from surfkit.readers.masks import check_mask, find_masks, with_opacity
+from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
 from surfkit.readers.undistort import Picture, check_camera, is_pinhole, lens_of, pinhole_of, undistort
@@ -27,7 +28,7 @@ from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
-from surfkit.scene.photos import is_turned, photo_size
+from surfkit.scene.photos import is_turned, photo_size, refuse_large
 from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
 
 RANDOM_POINTS = 50_000
@@ -95,15 +96,20 @@ def build_scene(
         reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
+    data, shots = reduced(data, shots)
+    decided = decide({shot.name: shot.path for shot in shots}, data.alpha, data.white)
     wanted = [shot for shot in shots if only is None or shot.name in only]
-    views = _views(*reduced(data, wanted), frame, keep, pixels)
-    return Scene(
+    views = _views(data, wanted, decided, frame, keep, pixels)
+    scene = Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
         held_out=tuple(view for view in views if view.name in held_out),
         cloud=_cloud(capture, poses, frame),
         frame=frame,
     )
+    for line in decided.lines:
+        emit(Warned(line))
+    return scene
 
 
 def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
@@ -228,7 +234,9 @@ def _wanted() -> str:
     )
 
 
-def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None, pixels: bool) -> list[View]:
+def _views(
+    data: Data, shots: Sequence[Shot], decided: Decided, frame: Frame, keep: Path | None, pixels: bool
+) -> list[View]:
     """The photographs at the size to use them at, undistorted."""
 
     def straight(picture: Picture) -> Picture:
@@ -238,16 +246,24 @@ def _views(data: Data, shots: Sequence[Shot], frame: Frame, keep: Path | None, p
 
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
-    masks = find_masks(data.path, data.masks, shots)
+    masks = with_opacity(find_masks(data.path, data.masks, shots), shots, decided)
     with ThreadPoolExecutor(4) as pool:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
         turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
             check_size(shot, size)
+            refuse_large(shot.path, size, data.size(*size))
             if shot.name in masks:
                 check_mask(masks[shot.name], size)
         given = [
-            Picture(shot.path, masks.get(shot.name), shot.camera, data.size(*size), data.white)
+            Picture(
+                shot.path,
+                masks.get(shot.name),
+                shot.camera,
+                data.size(*size),
+                data.white,
+                decided.pixels[shot.name],
+            )
             for shot, size in zip(shots, sizes, strict=True)
         ]
         pictures = list(pool.map(straight, given))
@@ -292,7 +308,7 @@ def _view(shot: Shot, picture: Picture, bent: Lens | None, frame: Frame) -> View
         width=int(lens.width),
         height=int(lens.height),
     )
-    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white, bent)
+    return View(shot.name, full.resized(*picture.size), picture.path, picture.mask, picture.white, bent, picture.pixels)
 
 
 def _shares(pixels: np.ndarray, lens: object, camera: Camera) -> np.ndarray:

@@ -19,6 +19,7 @@ from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.masks import read_mask
 from surfkit.scene.copies import digest, place
 from surfkit.scene.photos import read_photo
+from surfkit.scene.pixels import PLAIN, Pixels
 from surfkit.scene.scene import Lens
 
 FOLDER = "undistorted"
@@ -41,6 +42,7 @@ class Picture:
         camera: pycolmap.Camera.
         size: Width and height to use it at.
         white: Whether its transparent pixels lie over white, or over black.
+        pixels: What the values of the file mean.
     """
 
     path: Path
@@ -48,6 +50,7 @@ class Picture:
     camera: Any
     size: tuple[int, int]
     white: bool = False
+    pixels: Pixels = PLAIN
 
 
 def is_pinhole(camera: Any) -> bool:
@@ -87,10 +90,16 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
     if not path.exists():
         if mask is not None:
             _save(mask, _keep(picture, grid, inside).to(torch.uint8).mul(255)[None].expand(3, -1, -1))
-        photo = read_photo(picture.path, picture.size, picture.white).float()
-        values = grid_sample(photo[None], grid, "bicubic", "border", align_corners=False)[0]
+        photo = read_photo(picture.path, picture.size, picture.white, picture.pixels).float()
+        if picture.mask == picture.path:  # colours of transparent pixels are none, and do not spread
+            shown = read_mask(picture.path, picture.size, photo=True).float()[None]
+            parts = grid_sample(torch.cat([photo * shown, shown])[None], grid, "bicubic", "border", align_corners=False)
+            values = parts[0, :3] / parts[0, 3:].clamp(min=0.1)
+        else:
+            values = grid_sample(photo[None], grid, "bicubic", "border", align_corners=False)[0]
         _save(path, (values * inside).round().clamp(0, 255).to(torch.uint8))  # last: with it, the mask is there too
-    return replace(picture, path=path, mask=mask, camera=camera, size=(camera.width, camera.height))
+    size = camera.width, camera.height
+    return replace(picture, path=path, mask=mask, camera=camera, size=size, pixels=PLAIN)
 
 
 def pinhole_of(picture: Picture) -> Picture:
@@ -137,14 +146,15 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
     """(h, w) bool: pixels that the photograph shows and its mask keeps."""
     if picture.mask is None:
         return inside
-    mask = read_mask(picture.mask, picture.size).float()[None, None]
+    mask = read_mask(picture.mask, picture.size, picture.mask == picture.path).float()[None, None]
     return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
 
 
 def _cached(picture: Picture, lens: Lens, root: Path) -> str:
     """The name of the undistorted picture, which depends on all that it was made from; as earlier versions spelt it."""
     paths = [path for path in (picture.path, picture.mask) if path is not None]
-    return f"{picture.path.stem}-{digest(root, f'{RECIPE} _{lens} {picture.white}', paths)}.png"
+    values = "" if picture.pixels == PLAIN else f" {picture.pixels}"
+    return f"{picture.path.stem}-{digest(root, f'{RECIPE} _{lens} {picture.white}{values}', paths)}.png"
 
 
 def cache_folder(root: Path) -> Path:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,26 +19,25 @@ from surfkit.core.optional import needed
 from surfkit.scene.cache import Cache
 from surfkit.scene.copies import Copies
 from surfkit.scene.gate import Gate
+from surfkit.scene.jpeg import tell, with_end
+from surfkit.scene.large import (
+    DECODED,
+    SIXTEEN,
+    SIXTEEN_COLOURS,
+    WITH_OPACITY,
+    any_size,
+    is_ordinary,
+    open_image,
+    refuse_too_large,
+)
 from surfkit.scene.names import HEIF
+from surfkit.scene.pixels import ORIENTATION, PLAIN, Pixels, kind_of, to_rgb
 from surfkit.scene.scene import View
 
 T = TypeVar("T")
-ORIENTATION = 0x0112
-"""EXIF tag; 1 is upright."""
 WIDTH, HEIGHT = 0x0100, 0x0101
 """Tags of TIFF: the size as stored."""
-TURN = Image.Transpose
-UNDONE = {
-    2: TURN.FLIP_LEFT_RIGHT,
-    3: TURN.ROTATE_180,
-    4: TURN.FLIP_TOP_BOTTOM,
-    5: TURN.TRANSPOSE,
-    6: TURN.ROTATE_90,
-    7: TURN.TRANSVERSE,
-    8: TURN.ROTATE_270,
-}
-"""What brings a picture back that was turned as its EXIF says."""
-# Photographs of 90 to 180 million pixels are no attack; larger ones are refused.
+# Whether a photograph is too large, `surfkit.scene.large` says.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 RECIPE = "1"
 """Changes when the same photograph would be read otherwise: copies on disk are then made again."""
@@ -57,7 +57,7 @@ def photo_cache(
     def read(at: int) -> Tensor:
         view = views[at]
         shape = (3, view.camera.height, view.camera.width)
-        key = f"{RECIPE} {shape} {view.white}"
+        key = f"{RECIPE} {shape} {view.white}" + (f" {view.pixels}" if view.pixels != PLAIN else "")
         try:
             return torch.from_numpy(copies.get(view.path, key, shape, lambda: view_photo(view).numpy()))
         except FileNotFoundError as error:
@@ -68,7 +68,7 @@ def photo_cache(
 
 def view_photo(view: View) -> Tensor:
     """(3, H, W) uint8 of the photograph of a view, at the size of its camera."""
-    return read_photo(view.path, (view.camera.width, view.camera.height), view.white)
+    return read_photo(view.path, (view.camera.width, view.camera.height), view.white, view.pixels)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
@@ -89,28 +89,31 @@ def is_turned(path: Path) -> bool:
         return image.getexif().get(ORIENTATION, 1) not in (0, 1)
 
 
-def read_photo(path: Path, size: tuple[int, int], white: bool = False) -> Tensor:
+def read_photo(path: Path, size: tuple[int, int], white: bool = False, pixels: Pixels = PLAIN) -> Tensor:
     """(3, height, width) uint8 RGB of a picture, reduced with an antialiasing filter.
 
     Args:
         path: Any picture of 8 or 16 bits that Pillow reads.
         size: Width and height wanted.
         white: Whether transparent pixels lie over white, or over black.
+        pixels: What its values mean.
 
     Raises:
         BadInput: The file is damaged or holds another kind of pixel.
     """
 
     def decode(image: Image.Image) -> np.ndarray:
-        plain = _rgb(image, path, 255 if white else 0)
+        plain = to_rgb(image, path, 255 if white else 0, pixels)
         if plain.size != size:
-            plain = plain.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
-        return np.array(plain)
+            masked = plain.mode == "RGBA"  # what rings at the edge of a mask would be no colour of the photograph
+            way = Image.Resampling.HAMMING if masked else Image.Resampling.LANCZOS
+            plain = plain.resize(size, way, reducing_gap=3.0)
+        return np.array(plain.convert("RGB") if plain.mode == "RGBA" else plain)
 
-    return torch.from_numpy(open_picture(path, decode)).permute(2, 0, 1).contiguous()
+    return torch.from_numpy(open_picture(path, decode, size)).permute(2, 0, 1).contiguous()
 
 
-def read_draft(path: Path, longest: int) -> np.ndarray:
+def read_draft(path: Path, longest: int, pixels: Pixels = PLAIN) -> np.ndarray:
     """(h, w, 3) uint8 RGB of a picture at a fraction of its size, the longer side `longest` to twice that if it can be.
 
     All of the file is read, but a JPEG is never held at its full size.
@@ -120,12 +123,12 @@ def read_draft(path: Path, longest: int) -> np.ndarray:
     """
 
     def decode(image: Image.Image) -> np.ndarray:
-        image.draft(image.mode, (longest, longest))
-        plain = _rgb(image, path, 0)
+        plain = to_rgb(image, path, 0, pixels)
         by = max(1, max(plain.size) // longest)
-        return np.array(plain.reduce(by) if by > 1 else plain)
+        plain = plain.reduce(by) if by > 1 else plain
+        return np.array(plain.convert("RGB") if plain.mode == "RGBA" else plain)
 
-    return open_picture(path, decode)
+    return open_picture(path, decode, (longest, longest), draft=True)
 
 
 def require_heif(what: str) -> None:
@@ -135,36 +138,62 @@ def require_heif(what: str) -> None:
     register_heif_opener()
 
 
-def _rgb(image: Image.Image, path: Path, under: int) -> Image.Image:
-    image = _as_stored(image)
-    if image.mode.startswith("I"):  # 16 bits of grey; Pillow's own conversion to RGB clips at 255
-        grey = np.asarray(image).astype(np.int64).clip(0, 65535)
-        return Image.fromarray(((grey + 128) // 257).astype(np.uint8)).convert("RGB")
-    if image.mode == "F":
-        raise BadInput(f"{path}: pixels are floating point; convert it to 8 bits, for example to PNG")
-    if "A" in image.getbands() or "a" in image.getbands() or "transparency" in image.info:
-        image = image.convert("RGBA")
-        return Image.alpha_composite(Image.new("RGBA", image.size, (under, under, under, 255)), image).convert("RGB")
-    return image if image.mode == "RGB" else image.convert("RGB")
-
-
 def _stored_size(image: Image.Image) -> tuple[int, int]:
     return (image.tag_v2[WIDTH], image.tag_v2[HEIGHT]) if image.format == "TIFF" else image.size
 
 
-def _as_stored(image: Image.Image) -> Image.Image:
-    """A picture before Pillow turns it: it does so, unasked, with the TIFF files among those that EXIF says to turn."""
-    if image.format != "TIFF":
-        return image
-    turn = image.getexif().get(ORIENTATION, 1)
-    image.load()
-    return image.transpose(UNDONE[turn]) if turn in UNDONE and ORIENTATION not in image.getexif() else image
-
-
-def open_picture(path: Path, use: Callable[[Image.Image], T]) -> T:
-    """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput."""
-    with _picture(path) as image, GATE.taking(len(image.getbands()) * image.width * image.height):
+def open_header(path: Path, use: Callable[[Image.Image], T]) -> T:
+    """What `use` makes of the header of a picture of any size; whatever Pillow finds wrong becomes BadInput."""
+    with _picture(path) as image:
         return use(image)
+
+
+def open_picture(
+    path: Path, use: Callable[[Image.Image], T], size: tuple[int, int] | None = None, draft: bool = False
+) -> T:
+    """What `use` makes of the open picture; whatever Pillow finds wrong becomes BadInput.
+
+    Args:
+        path: The file.
+        use: Called twice where the first time fails for the lack of a JPEG file's end.
+        size: Width and height of what is made, if it is a smaller picture.
+        draft: Whether any JPEG may be decoded at a fraction of its size for it, or only large ones.
+    """
+    with _picture(path) as image:
+        allowed = nullcontext() if is_ordinary(image.size) else any_size()
+        _ready(path, image, size, draft)
+        with allowed, GATE.taking(len(image.getbands()) * image.width * image.height):
+            try:
+                return use(image)
+            except OSError:
+                if image.format not in ("JPEG", "MPO") or (data := with_end(path)) is None:
+                    raise
+            with open_image(io.BytesIO(data)) as whole:
+                _ready(path, whole, size, draft)
+                made = use(whole)
+            tell(path)
+            return made
+
+
+def refuse_large(path: Path, stored: tuple[int, int], size: tuple[int, int]) -> None:
+    """BadInput if a photograph of a width and height is too large to be read at another size; it is not decoded."""
+    if not is_ordinary(stored):
+        with _picture(path) as image:
+            _ready(path, image, size, False)
+
+
+def _ready(path: Path, image: Image.Image, size: tuple[int, int] | None, draft: bool) -> None:
+    """Have a JPEG decoded at a half, a quarter or an eighth where that is enough; BadInput if a picture is too large.
+
+    Of a large one, twice the size that is wanted is enough.
+    """
+    if size is not None and (draft or not is_ordinary(image.size)):
+        image.draft(image.mode, size if draft else (2 * size[0], 2 * size[1]))
+    kind = kind_of(image)
+    per_pixel = WITH_OPACITY if kind.opacity else DECODED
+    if kind.wide:
+        per_pixel = SIXTEEN if image.mode.startswith("I") else SIXTEEN_COLOURS
+    refuse_too_large(path, image.size, per_pixel, size[0] * size[1] if size else 0)
 
 
 @contextmanager
@@ -173,10 +202,10 @@ def _picture(path: Path) -> Iterator[Image.Image]:
     if path.suffix.lower() in HEIF:
         require_heif(str(path))
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             yield image
     except BadInput:
         raise
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
         reason = "no such photograph" if isinstance(error, FileNotFoundError) else f"not a whole picture: {error}"
         raise BadInput(f"{path}: {reason}".replace(f" '{path}'", "").replace("\n", " ")) from error

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.scene.camera import Camera
+from surfkit.scene.pixels import PLAIN, Pixels
 
 MARGIN = 1.1
 """The scene extent is this times the largest distance of a training camera to their mean centre."""
@@ -46,6 +47,7 @@ class View:
         mask: Its mask on disk, black where the photograph is to be ignored.
         white: Whether its transparent pixels lie over white, or over black.
         lens: That of the photograph of which `path` is the undistorted picture; None where nothing was distorted.
+        pixels: What the values of the file mean.
     """
 
     name: str
@@ -54,6 +56,7 @@ class View:
     mask: Path | None = None
     white: bool = False
     lens: Lens | None = None
+    pixels: Pixels = PLAIN
 
 
 @dataclass(frozen=True)

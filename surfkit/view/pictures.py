@@ -80,7 +80,7 @@ def error_picture(maps: Maps, photo: Tensor) -> tuple[np.ndarray, str]:
 
 def thumbnail(view: View, longest: int) -> np.ndarray:
     """(h, w, 3) uint8 of a photograph, a side of `longest` to twice that."""
-    return read_draft(view.path, longest)
+    return read_draft(view.path, longest, view.pixels)
 
 
 def _bytes(image: Tensor) -> np.ndarray:

@@ -176,7 +176,7 @@ def test_copies_on_disk_are_the_same_pixels_and_made_once(tmp_path, monkeypatch)
 def test_large_photographs_are_decoded_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.setattr(photos.GATE, "most", 3 * 40 * 30)
     inside, most = [0], [0]
-    original = photos._rgb
+    original = photos.to_rgb
 
     def counted(*args):
         inside[0] += 1
@@ -186,7 +186,7 @@ def test_large_photographs_are_decoded_one_after_the_other(tmp_path, monkeypatch
         finally:
             inside[0] -= 1
 
-    monkeypatch.setattr(photos, "_rgb", counted)
+    monkeypatch.setattr(photos, "to_rgb", counted)
     views = [view(save(tmp_path / f"{at}.png", stripes(40, 30))) for at in range(20)]
     cache = photo_cache(views, threads=4)
     assert len({tuple(cache[at].shape) for at in range(20)}) == 1 and most[0] == 1
