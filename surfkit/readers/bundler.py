@@ -7,12 +7,14 @@ Metashape and others write it too.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from surfkit.core.check import BadInput, leaving_out
+from surfkit.core.check import BadInput, few, leaving_out, reject
+from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.camera_files import (
     MOST,
@@ -32,6 +34,12 @@ PLACES = ("bundle.out", "bundle/bundle.out")
 """Where Bundler writes its file; other programs call it NAME.bundle.out."""
 HEAD, MOST_HEAD = "# Bundle file v0.3", 1000
 """How the file begins, and bytes of its first line at most."""
+SLACK_PX = 2.0
+"""How far beyond the edge of a photograph a mark may lie, as programs differ by half a pixel."""
+FEWEST_MARKS, STRAY = 3, 0.02
+"""So many marks, and so large a share of them, lie outside of a photograph by no mistake."""
+INNER, MANY_MARKS = 0.7, 500
+"""Share of the way from the middle to the edge that some of so many marks lie beyond."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From Bundler's cameras (x right, y up, z backward) to x right, y down, z forward."""
 
@@ -46,6 +54,7 @@ class Bundler(Reader):
     def read(self, data: Data) -> Capture:
         bundle = _Bundle.read(data)
         shots, seen = bundle.shots(data), bundle.seen()
+        _check_sizes(bundle.path, shots, seen)
         return Capture(shots, bundle.xyz, bundle.rgb, groups=groups_of(shots, seen))
 
     def tracks(self, data: Data) -> Tracks:
@@ -132,6 +141,35 @@ class _Bundle:
         cut = np.searchsorted(self.sights[order, 0], np.arange(1, len(self.names)))
         parts = np.split(order, cut)
         return {name: (self.rows[part], self.sights[part, 2:]) for name, part in zip(self.names, parts, strict=True)}
+
+
+def _check_sizes(path: Path, shots: Sequence[Shot], seen: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """BadInput for photographs that are smaller than when their cameras were found, of which the file has no sizes: the
+    marks of points lie outside then. A line where all marks lie far inside, as if photographs had been enlarged."""
+    outside, reach, most = [], 0.0, 0.0
+    for shot in shots:
+        half = np.array([shot.camera.width, shot.camera.height]) / 2
+        offsets = np.abs(seen[shot.name][1])
+        beyond = (offsets > half + SLACK_PX).any(1)
+        if beyond.sum() >= FEWEST_MARKS and beyond.mean() > STRAY:
+            outside.append(shot.name)
+            most = max(most, float((offsets / half).max()))
+        reach = max(reach, float((offsets / half).max(initial=0)))
+    if outside:
+        reject(
+            BadInput(
+                f"{path}: marks of points lie outside of {len(outside)} of {len(shots)} photographs, {few(outside)}, "
+                f"up to {most:.2f} times as far from the middle as their edge: these are smaller than the photographs "
+                "that the cameras were found for, or turned; use those"
+            )
+        )
+    elif 0 < reach < INNER and sum(len(seen[shot.name][1]) for shot in shots) >= MANY_MARKS:
+        emit(
+            Warned(
+                f"{path}: all marks of points lie in the inner {reach:.0%} of the photographs: if these are larger "
+                "than those that the cameras were found for, use those, as the file has no sizes"
+            )
+        )
 
 
 def _files(root: Path) -> list[Path]:

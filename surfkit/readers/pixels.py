@@ -42,7 +42,7 @@ class Decided:
     lines: Sequence[str]
 
 
-def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = False) -> Decided:
+def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool | None = None) -> Decided:
     """What the values of the photographs of a data set mean. Files that cannot be read are told of where they are used.
 
     White of those of 16 bits is one for all, so that exposures stay comparable: the largest value of the fewest bits
@@ -51,7 +51,7 @@ def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = 
     Args:
         files: All photographs of the data set by name, not a part of them.
         alpha: What becomes of transparent pixels; by default they are blended, where the band is an opacity.
-        white: Whether the user has them blended over white.
+        white: Whether the user has them blended over white; None where that cannot be chosen.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         kinds = dict(zip(files, pool.map(_kind, files.values()), strict=True))
@@ -59,11 +59,6 @@ def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = 
         modes, more = _alphas(files, kinds, alpha, white, pool)
     pixels = {name: Pixels(levels.get(name, 0), modes.get(name, PLAIN.alpha)) for name in files}
     return Decided(pixels, [*said, *more])
-
-
-def masked(decided: Decided) -> set[str]:
-    """Names of the photographs of which transparent pixels are to be ignored."""
-    return {name for name, pixels in decided.pixels.items() if pixels.alpha == "mask"}
 
 
 def _kind(path: Path) -> Kind:
@@ -87,8 +82,8 @@ def _levels(
     level = white_level_of(largest) if others else 0
     said = []
     if level and level < TOP:
-        what = f"{_photographs(len(others))} of 16 bits a value, {few(others)}, use the lower {level.bit_length()} bits"
-        said.append(f"{what} by their values, all together: {level:,} is taken for white, for all alike")
+        what = f"{_photographs(len(others))} of 16 bits a value, {few(others)}, hold no value of more than"
+        said.append(f"{what} {level.bit_length()} bits: {level:,} is taken for white in all of them, not {TOP:,}")
     elif level:
         said.append(f"{_photographs(len(others))} have values of more than 16 bits: {level:,} is taken for white")
     if short := {name: value for name, value in tagged.items() if value != TOP}:
@@ -112,7 +107,11 @@ def _largest(paths: Sequence[Path], pool: ThreadPoolExecutor) -> Iterator[int]:
 
 
 def _alphas(
-    files: Mapping[str, Path], kinds: Mapping[str, Kind], alpha: Alpha | None, white: bool, pool: ThreadPoolExecutor
+    files: Mapping[str, Path],
+    kinds: Mapping[str, Kind],
+    alpha: Alpha | None,
+    white: bool | None,
+    pool: ThreadPoolExecutor,
 ) -> tuple[dict[str, Alpha], list[str]]:
     """What becomes of transparent pixels by name, of photographs that may have some; and what to say."""
     said = []
@@ -135,7 +134,7 @@ def _alphas(
         )
     rest = [name for name in having if name not in bands]
     if not white and (line := _transparent(files, rest, len(files), pool)):
-        said.append(line)
+        said.append(line if white is None else f"{line}, --white blends over white")
     return {name: "ignore" if name in set(bands) else "blend" for name in having}, said
 
 
@@ -150,8 +149,8 @@ def _transparent(files: Mapping[str, Path], having: Sequence[str], count: int, p
     among = f"{count} photographs" if whole else f"{len(chosen)} photographs that were looked at, of {count},"
     return (
         f"{len(shares)} of {among} have transparent pixels, {few(list(shares))}, "
-        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, which is learnt as "
-        "empty space; --alpha mask ignores them, --alpha ignore takes their colours as stored, --white blends over white"
+        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, which is learnt as empty "
+        "space; --alpha mask ignores them, --alpha ignore takes their colours as stored"
     )
 
 

@@ -30,6 +30,9 @@ NUMBERED = ("", "rgb", "images", "input")
 """Where MatrixCity's numbered photographs may lie, below their poses; or in a folder of the block's own name."""
 POINTS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
 """Files of sparse points that a data set need not name."""
+OFF_CENTRE, ALIKE = 1.25, 1.1
+"""A principal point that is so much farther from the corner than the middle, or nearer, along both axes alike, is one
+of a photograph of another size."""
 MOST = 1e30
 """Numbers beyond it are a mistake."""
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
@@ -108,7 +111,7 @@ def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
     if not isinstance(listed, list) or not listed or not all(isinstance(frame, dict) for frame in listed):
         raise BadInput(f"{path}: no list of frames in it; it is no transforms.json, or is damaged")
     cameras: dict[str, Any] = {}
-    shots = []
+    shots, read = [], []
     for at, frame in enumerate(listed):
         where = f"{path}: frames.{at}"
         with leaving_out():
@@ -118,9 +121,22 @@ def frames(path: Path, data: Data) -> tuple[Mapping[str, Any], list[Shot]]:
             camera = cameras.setdefault(str(camera), camera)  # one for all frames that share it
             mask = named_file(path.parent, str(frame["mask_path"])) if frame.get("mask_path") else None
             shots.append(Shot(name_below(data.path, photo), pose, camera, photo, mask))
+            read.append((frame, shots[-1]))
+    guessed = [shot.name for frame, shot in read if _size_is_guessed({**contents, **frame})]
+    if guessed:
+        text = (
+            f"{path}: neither w and h nor cx and cy for {len(guessed)} photographs, {few(guessed)}: focal lengths are"
+        )
+        emit(Warned(f"{text} taken for photographs of the size that they have now; give w and h if they were reduced"))
     if len({shot.name for shot in shots}) < len(shots):
         reject(BadInput(f"{path}: two frames have the same photograph; delete one"))
     return contents, shots
+
+
+def _size_is_guessed(values: Mapping[str, Any]) -> bool:
+    """Whether a focal length in pixels comes with nothing that tells of how many."""
+    in_pixels = "fl_x" in values or "fl_y" in values
+    return in_pixels and not ({"w", "h"} <= set(values) or {"cx", "cy"} <= set(values))
 
 
 def points(root: Path, contents: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -193,11 +209,7 @@ def _number(where: str, values: Mapping[str, Any], name: str, default: float | N
 
 def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     """The pycolmap camera that intrinsics describe."""
-    width, height = (
-        (round(_number(where, values, "w")), round(_number(where, values, "h")))
-        if "w" in values and "h" in values
-        else photo_size(photo)
-    )
+    width, height = _size(where, values, photo)
     fx, fy = _focal(where, values, width, height)
     centre = [_number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)]
     k = {n: _number(where, values, n, 0) for n in ("k1", "k2", "k3", "k4", "p1", "p2")}
@@ -213,6 +225,32 @@ def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     else:
         model, extra = "FULL_OPENCV", [k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], 0, 0, 0]
     return camera_of(where, model, (width, height), [fx, fy, *centre, *extra])
+
+
+def _size(where: str, values: Mapping[str, Any], photo: Path) -> tuple[int, int]:
+    """Width and height of a camera: those of its photograph if the file has none.
+
+    Raises:
+        BadInput: The principal point shows that the camera is one of photographs of another size.
+    """
+    given = {name: round(_number(where, values, name)) for name in ("w", "h") if name in values}
+    if len(given) == 2:
+        return given["w"], given["h"]
+    size = photo_size(photo)
+    for name, actual in zip(("w", "h"), size, strict=True):
+        if given.get(name, actual) != actual:
+            raise BadInput(f"{where}: {name} is {given[name]}, and {photo} has {size[0]} x {size[1]} px; give w and h")
+    if "cx" in values and "cy" in values:
+        centre = _number(where, values, "cx"), _number(where, values, "cy")
+        times = [2 * at / whole for at, whole in zip(centre, size, strict=True)]
+        alike = min(times) > 0 and max(times) < ALIKE * min(times) and not 1 / OFF_CENTRE < times[0] < OFF_CENTRE
+        if alike or not all(0 <= each <= 2 for each in times):
+            raise BadInput(
+                f"{where}: the principal point {centre[0]:g}, {centre[1]:g} is that of a photograph of about "
+                f"{2 * centre[0]:.0f} x {2 * centre[1]:.0f} px, and {photo} has {size[0]} x {size[1]}; give w and h, "
+                "the size that the cameras were found for"
+            )
+    return size
 
 
 def _focal(where: str, values: Mapping[str, Any], width: int, height: int) -> tuple[float, float]:

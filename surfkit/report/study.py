@@ -41,7 +41,7 @@ from surfkit.run.store import StageStore
 
 FORMS = {"md": markdown, "tex": latex, "csv": comma_separated}
 """What a table is written as beside JSON, by the ending of the file."""
-SINCE: dict[str, Any] = {"missing": "refuse"}
+SINCE: dict[str, Any] = {"missing": "refuse", "alpha": None}
 """Settings of data sets that older versions had not, and what they do by default: rows of these versions are found."""
 NO_MAPS = "there was no depth map to learn from, so the run is that of a row without"
 """Why a row has no figures although it was run."""

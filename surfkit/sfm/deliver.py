@@ -21,6 +21,7 @@ from surfkit.core.files import replacing, replacing_folder
 from surfkit.readers.placed import FILE, Placed
 from surfkit.scene.names import safe_path
 from surfkit.scene.photos import read_photo
+from surfkit.scene.pixels import Pixels
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.sources import Sources
@@ -82,7 +83,8 @@ def deliver(
                 key = _key(photos[image.name], model.cameras[image.camera_id])
                 name = file_name(image.name)
                 source = sources.path(image.name)
-                made = _write(source, scene / "images" / name, model, image, before.get(name) == key)
+                reading = photos[image.name].reading
+                made = _write(source, reading, scene / "images" / name, model, image, before.get(name) == key)
                 kept[name] = key
                 return made
 
@@ -134,14 +136,14 @@ def _pinhole(camera: Any) -> Any:
         raise BadInput(f"the lens that was found cannot be undistorted: {said}; choose another with --lens") from error
 
 
-def _write(source: Path, target: Path, model: Any, image: Any, there: bool) -> Sight:
+def _write(source: Path, reading: Pixels, target: Path, model: Any, image: Any, there: bool) -> Sight:
     """Write an undistorted photograph unless it is there, and look at it where its features are."""
     engine = load_engine()
     camera = model.cameras[image.camera_id]
     bent = np.array([spot.xy for spot in image.get_observation_points2D()], np.float64).reshape(-1, 2)
     pinhole = _pinhole(camera)
     if not (there and target.is_file()):
-        pixels = read_photo(source, (camera.width, camera.height)).permute(1, 2, 0).numpy()
+        pixels = read_photo(source, (camera.width, camera.height), pixels=reading).permute(1, 2, 0).numpy()
         bitmap = engine.Bitmap.from_array(np.ascontiguousarray(pixels))
         straight = np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
         with replacing(target) as file:

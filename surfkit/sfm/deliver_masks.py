@@ -15,7 +15,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.files import replacing
-from surfkit.readers.masks import FOLDER, read_mask
+from surfkit.readers.masks import FOLDER
 from surfkit.sfm.deliver import MOST_THREADS, file_name
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
@@ -46,14 +46,14 @@ def deliver_masks(
         before = read_json(work / RECORD, dict[str, str])
     except BadInput:
         before = {}
-    wanted: dict[str, tuple[str, Path, Any]] = {}
+    wanted: dict[str, tuple[str, str, Any]] = {}
     for model in models:
         for image in (model.image(number) for number in model.reg_image_ids()):
             if photos[image.name].mask:
                 camera = model.cameras[image.camera_id]
                 said = f"{RECIPE} {photos[image.name].mask} {camera.model.name} {list(camera.params)}"
                 key = hashlib.sha256(said.encode()).hexdigest()[:24]
-                wanted[f"{file_name(image.name)}.png"] = key, sources.masks[image.name], camera
+                wanted[f"{file_name(image.name)}.png"] = key, image.name, camera
     folder = scene / FOLDER
     if foreign := [name for name in wanted if name not in before and (folder / name).exists()]:
         raise BadInput(f"{folder / foreign[0]} is there, and this command did not make it; move {folder} away")
@@ -62,16 +62,16 @@ def deliver_masks(
     todo = {name: each for name, each in wanted.items() if before.get(name) != each[0] or not (folder / name).is_file()}
     write_json(work / RECORD, before | dict.fromkeys(todo, ""))  # what a kill leaves is ours, and made again
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
-        list(pool.map(lambda name: _write(todo[name][1], folder / name, todo[name][2]), todo))
+        list(pool.map(lambda name: _write(sources, todo[name][1], folder / name, todo[name][2]), todo))
     for name in set(before) - set(wanted):
         (folder / name).unlink(missing_ok=True)
     write_json(work / RECORD, {name: key for name, (key, _, _) in wanted.items()})
 
 
-def _write(source: Path, target: Path, camera: Any) -> None:
+def _write(sources: Sources, name: str, target: Path, camera: Any) -> None:
     """A mask as the pinhole camera would have it; what the photograph does not show is black."""
     engine = load_engine()
-    seen = read_mask(source, (camera.width, camera.height)).numpy().astype(np.uint8) * 255
+    seen = sources.read_mask(name, (camera.width, camera.height)).astype(np.uint8) * 255
     bitmap = engine.Bitmap.from_array(np.ascontiguousarray(np.repeat(seen[..., None], 3, 2)))
     straight = np.array(engine.undistort_image(engine.UndistortCameraOptions(), bitmap, camera)[0].to_array())
     with replacing(target) as file:

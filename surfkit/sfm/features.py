@@ -15,7 +15,6 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing
-from surfkit.readers.masks import read_mask
 from surfkit.scene.photos import read_photo
 from surfkit.sfm.engine import load_engine
 from surfkit.sfm.photographs import Photo
@@ -100,7 +99,7 @@ def _keep(engine: Any, photo: Photo, path: Path, sources: Sources, settings: Set
     extractor = engine.FeatureExtractor.create(options, engine.Device.auto)
     size, file = _reduced(photo.size, settings.longest), sources.path(photo.name)
     try:
-        grey = read_photo(file, size).float().mean(0).round().byte().numpy()
+        grey = read_photo(file, size, pixels=photo.reading).float().mean(0).round().byte().numpy()
     except FileNotFoundError as error:
         raise BadInput(f"{file}: was there a moment ago; give the command again") from error
     found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
@@ -108,7 +107,7 @@ def _keep(engine: Any, photo: Photo, path: Path, sources: Sources, settings: Set
     descriptors = np.array(descriptors.data, np.uint8).reshape(-1, 128)
     if photo.mask:
         column, row = np.minimum(keypoints[:, :2].astype(int), np.array(size) - 1).T
-        seen = read_mask(sources.masks[photo.name], size).numpy()[row, column]
+        seen = sources.read_mask(photo.name, size)[row, column]
         keypoints, descriptors = keypoints[seen], descriptors[seen]
     keypoints[:, :2] *= np.array(photo.size, np.float32) / size
     keypoints[:, 2] *= photo.size[0] / size[0]

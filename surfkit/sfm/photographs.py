@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +15,10 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.codec import read_json
 from surfkit.core.events import Progress, Warned, emit
+from surfkit.readers.pixels import decide
 from surfkit.scene.names import HEIF, PICTURES
-from surfkit.scene.photos import open_picture, photo_size, read_draft, require_heif
+from surfkit.scene.photos import open_header, photo_size, read_draft, require_heif
+from surfkit.scene.pixels import PLAIN, Alpha, Pixels
 from surfkit.sfm.exif import Exif, read_exif
 
 PHOTOGRAPHS = "photographs.json"
@@ -42,7 +44,7 @@ class Photo:
     Attributes:
         name: Path below the folder, with slashes.
         stamp: Size in bytes and time of the file: when they change, it is looked at again.
-        digest: Of all its bytes.
+        digest: Of all its bytes, and of how they are read where that is unusual.
         size: Width and height as stored, the rotation in EXIF not applied.
         exif: What it says of itself.
         pixels: Digest of the pixels of its draft, equal for copies.
@@ -51,6 +53,7 @@ class Photo:
         sharpness: Standard deviation of the Laplacian over the contrast, of the draft.
         problem: Why it cannot be used; None if it can.
         mask: Digest of its mask; empty without one.
+        reading: What the values of the file mean.
         edition: `EDITION` of the code that looked at it.
     """
 
@@ -65,6 +68,7 @@ class Photo:
     sharpness: float = 0.0
     problem: str | None = None
     mask: str = ""
+    reading: Pixels = PLAIN
     edition: int = 0
 
     @property
@@ -73,7 +77,13 @@ class Photo:
         return self.problem is None
 
 
-def look(folder: Path, known: Sequence[Photo] = (), without: Path | None = None, others: bool = False) -> list[Photo]:
+def look(
+    folder: Path,
+    known: Sequence[Photo] = (),
+    without: Path | None = None,
+    others: bool = False,
+    alpha: Alpha | None = None,
+) -> list[Photo]:
     """All photographs below a folder, in the order of their names.
 
     Args:
@@ -81,6 +91,7 @@ def look(folder: Path, known: Sequence[Photo] = (), without: Path | None = None,
         known: What an earlier call found; photographs that have not changed are taken from it.
         without: A folder in which no photographs are, as that of the masks.
         others: Whether there are photographs elsewhere, so that there may be none here.
+        alpha: What becomes of transparent pixels.
 
     Raises:
         BadInput: There is no such folder, or no photograph that can be used.
@@ -101,15 +112,20 @@ def look(folder: Path, known: Sequence[Photo] = (), without: Path | None = None,
             paths = [path for path in paths if path.suffix.lower() not in HEIF]
     if not paths and not others:
         raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
-    return look_at(folder, paths, known)
+    return look_at(folder, paths, known, alpha)
 
 
-def look_at(folder: Path, paths: Sequence[Path], known: Sequence[Photo] = ()) -> list[Photo]:
-    """Some photographs below a folder, in the order of `paths`; `known` as for `look`."""
+def look_at(
+    folder: Path, paths: Sequence[Path], known: Sequence[Photo] = (), alpha: Alpha | None = None
+) -> list[Photo]:
+    """Some photographs below a folder, in the order of `paths`; `known` and `alpha` as for `look`."""
     before = {photo.name: photo for photo in known}
+    decided = decide({path.relative_to(folder).as_posix(): path for path in paths}, alpha)
+    for line in decided.lines:
+        emit(Warned(line))
     found = []
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
-        for photo in pool.map(lambda path: _look_unless_known(folder, path, before), paths):
+        for photo in pool.map(lambda path: _look_unless_known(folder, path, before, decided.pixels), paths):
             found.append(photo)
             emit(Progress("looking at photographs", len(found), len(paths)))
     return _mark_copies(found)
@@ -163,7 +179,7 @@ def files_of(folder: Path, without: Path | None = None) -> list[Path]:
     return sorted(path for path in found if path.is_file() or path.is_symlink())
 
 
-def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Photo:
+def _look_unless_known(folder: Path, path: Path, known: Mapping[str, Photo], readings: Mapping[str, Pixels]) -> Photo:
     name = path.relative_to(folder).as_posix()
     try:
         stat = path.stat()
@@ -173,13 +189,14 @@ def _look_unless_known(folder: Path, path: Path, known: dict[str, Photo]) -> Pho
     if not _is_text(name):
         return Photo(name, stamp, problem="its name is not UTF-8, so that COLMAP cannot name it; rename it")
     before = known.get(name)
-    if before is not None and before.stamp == stamp and before.edition == EDITION:
+    wanted = Photo(name, stamp, reading=readings[name], edition=EDITION)
+    if before is not None and (before.stamp, before.reading, before.edition) == (stamp, wanted.reading, EDITION):
         copy = (before.problem or "").startswith("a copy of")
         return replace(before, problem=None) if copy else before
     try:
-        return _look(path, Photo(name, stamp, edition=EDITION))
+        return _look(path, wanted)
     except BadInput as error:
-        return Photo(name, stamp, problem=str(error).removeprefix(f"{path}: "), edition=EDITION)
+        return replace(wanted, problem=str(error).removeprefix(f"{path}: "))
 
 
 def _is_text(name: str) -> bool:
@@ -192,8 +209,8 @@ def _is_text(name: str) -> bool:
 
 def _look(path: Path, photo: Photo) -> Photo:
     size = photo_size(path)
-    exif = open_picture(path, lambda image: read_exif(image, size))
-    draft = read_draft(path, DRAFT_PX)
+    exif = open_header(path, lambda image: read_exif(image, size))
+    draft = read_draft(path, DRAFT_PX, photo.reading)
     grey = draft.astype(np.float32).mean(2)
     light, contrast = float(grey.mean()), float(grey.std())
     problem = None
@@ -201,7 +218,7 @@ def _look(path: Path, photo: Photo) -> Photo:
         problem = "black" if light < DARK else "of one colour"
     return replace(
         photo,
-        digest=hashlib.sha256(path.read_bytes()).hexdigest()[:32],
+        digest=hashlib.sha256(path.read_bytes() + _said(photo.reading)).hexdigest()[:32],
         size=size,
         exif=exif,
         pixels=hashlib.sha256(draft.tobytes()).hexdigest()[:32],
@@ -210,6 +227,11 @@ def _look(path: Path, photo: Photo) -> Photo:
         sharpness=_sharpness(grey) / max(contrast, FLAT),
         problem=problem,
     )
+
+
+def _said(reading: Pixels) -> bytes:
+    """What tells readings of one file apart; nothing of the usual one."""
+    return b"" if reading == PLAIN else repr(reading).encode()
 
 
 def _sharpness(grey: np.ndarray) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from surfkit.core.check import BadInput, require_within
+from surfkit.scene.pixels import Alpha
 
 WORK, REPORT = "prepare", "report.json"
 """Folder of the data set for what the stages keep, and what is told of it at the end."""
@@ -71,6 +72,11 @@ class Settings:
 
     seed: int = 0
     """Of all that is drawn at random."""
+
+    alpha: Alpha | None = None
+    """What becomes of transparent pixels of photographs: mask makes masks of them, in which no features are found
+    either; blend composites them over black, ignore takes their colours as stored. Default: blend, but ignore where a
+    fourth band of a TIFF file is no opacity."""
 
     def __post_init__(self) -> None:
         ranges = {"longest": (100, 20_000), "features": (100, 100_000), "frames": (3, 10_000), "neighbours": (1, 1000)}

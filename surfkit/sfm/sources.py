@@ -12,7 +12,7 @@ import numpy as np
 from surfkit.core.check import BadInput, few
 from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot
-from surfkit.readers.masks import ENDS, check_mask, find_masks
+from surfkit.readers.masks import ENDS, check_mask, find_masks, read_mask
 from surfkit.readers.masks import FOLDER as MASKS
 from surfkit.scene.names import PICTURES, is_video
 from surfkit.sfm.exif import Exif
@@ -43,6 +43,11 @@ class Sources:
             return self.frames / name
         return self.root / name
 
+    def read_mask(self, name: str, size: tuple[int, int]) -> np.ndarray:
+        """(H, W) bool of the mask of a photograph, at a width and height: False where it is to be ignored."""
+        mask = self.masks[name]
+        return read_mask(mask, size, mask == self.path(name)).numpy()
+
 
 def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tuple[Sources, list[Photo]]:
     """The photographs of a folder and frames of its videos, or frames of one video; each with its mask.
@@ -62,14 +67,15 @@ def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tu
         taken = {given.name: take_frames(given, folder / given.name, settings.frame_step, settings.frames)}
     else:
         root, taken = given, _taken(given, folder, settings)
-        photos = look(given, known, settings.masks, bool(taken))
+        photos = look(given, known, settings.masks, bool(taken), settings.alpha)
     sources = Sources(root, frozenset(taken), folder)
     if paths := [folder / video / name for video, found in sorted(taken.items()) for name in found.names]:
         frames = look_at(folder, paths, known)
         photos += [replace(frame, exif=Exif(camera=f"video {frame.name.rpartition('/')[0]}")) for frame in frames]
+    photos = [replace(photo, mask=_own_mask(photo)) for photo in photos]
+    sources = replace(sources, masks={photo.name: sources.path(photo.name) for photo in photos if photo.mask})
     if settings.masks is not None:
         return _with_masks(sources, photos, settings.masks)
-    photos = [replace(photo, mask="") for photo in photos]
     if inside := [photo.name for photo in photos if MASKS in photo.name.lower().split("/")[:-1]]:
         said = f"{len(inside)} files in folders called {MASKS} are taken for photographs: {few(inside)}"
         emit(Warned(f"{said}; if they are masks, give --masks FOLDER"))
@@ -116,9 +122,14 @@ def _with_masks(sources: Sources, photos: Sequence[Photo], folder: Path) -> tupl
         emit(Warned(f"--masks {folder}: {len(idle)} masks have the name of no photograph: {few(idle)}"))
     found = []
     for photo in photos:
-        digest = ""
+        digest = photo.mask
         if photo.usable and photo.name in masks:
             check_mask(masks[photo.name], photo.size)
             digest = hashlib.sha256(masks[photo.name].read_bytes()).hexdigest()[:32]
         found.append(replace(photo, mask=digest))
-    return replace(sources, masks=masks), found
+    return replace(sources, masks={**sources.masks, **masks}), found
+
+
+def _own_mask(photo: Photo) -> str:
+    """Digest of the mask that the opacity of a photograph is, where it is to be one; else nothing."""
+    return f"opacity {photo.digest}" if photo.usable and photo.reading.alpha == "mask" else ""

@@ -250,7 +250,8 @@ def bundler(folder, k1=-0.1, k2=0.04, change=lambda text: text, listed=lambda na
         lines += [row(F, k1, k2), *(row(*part) for part in turn), row(*(-turn @ centre))]
     lines += ["0 0 0"] * 5
     for at, dot in enumerate(DOTS):
-        sights = [row(view, at, *middle(name, dot[None])[0]) for view, name in enumerate(POSES)]
+        spots = enumerate(middle(name, dot[None])[0] for name in POSES)
+        sights = [row(view, at, *spot) for view, spot in spots if (np.abs(spot) < (WIDTH / 2, HEIGHT / 2)).all()]
         lines += [row(*dot), row(*COLORS[at]), f"{len(sights)} {' '.join(sights)}"]
     (folder / "bundle.out").write_text(change("\n".join(lines) + "\n"))
     (folder / "list.txt").write_text("".join(f"{listed(name)}\n" for name in [*POSES, "IMG 9.png"]))

@@ -325,3 +325,42 @@ def test_a_missing_photograph_of_opendronemap_is_skipped(tmp_path, truth):
     with pytest.raises(BadInput, match="1 of 6 photographs are missing: .*--missing skip"):
         read(Data(folder))
     assert len(read(Data(folder, test_every=0, missing="skip")).train) == 5
+
+
+def without(*names, **more):
+    def change(contents):
+        for name in names:
+            del contents[name]
+        contents.update(more)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            without("w", "h", cx=40, cy=30),
+            "principal point 40, 30 is that of a photograph of about 80 x 60 px, and .* 40 x 30",
+        ),
+        (without("w", "h", cx=10, cy=7.5), "photograph of about 20 x 15 px"),
+        (without("w", "h", cx=20, cy=31), "photograph of about 40 x 62 px"),
+        (without("h", w=80), "w is 80, and .* has 40 x 30 px; give w and h"),
+    ],
+)
+def test_a_camera_of_photographs_of_another_size(tmp_path, truth, change, words):
+    with pytest.raises(BadInput, match=words):
+        read(Data(nerfstudio(tmp_path, truth, change)))
+
+
+def test_a_camera_without_a_size_is_that_of_the_photograph(tmp_path, truth):
+    true = read(Data(nerfstudio(tmp_path / "whole", truth))).train[0].camera
+    for name, change, told in (
+        ("centre", without("w", "h"), 0),
+        ("off", without("w", "h", cx=22, cy=14), 0),
+        ("nothing", without("w", "h", "cx", "cy"), 1),
+    ):
+        with collect_notes() as notes:
+            camera = read(Data(nerfstudio(tmp_path / name, truth, change))).train[0].camera
+        assert (camera.width, camera.height, camera.fx) == (true.width, true.height, true.fx)
+        assert len([text for text in notes.texts if "neither w and h nor cx and cy" in text]) == told

@@ -551,3 +551,31 @@ def test_two_that_name_the_map_are_refused(tmp_path):
     (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "offset": [0, 0, 0]}')
     with pytest.raises(BadInput, match="delete this file"):
         read_capture(Data(tmp_path), reader_of(Data(tmp_path)))
+
+
+def resized(folder, by):
+    for path in sorted((folder / "images").iterdir()):
+        with Image.open(path) as image:
+            image.resize((round(image.width * by), round(image.height * by))).save(path)
+
+
+@pytest.mark.parametrize("by, told", [(0.5, "outside of 4 of 4 photographs"), (0.8, "outside of"), (1.0, None)])
+def test_a_bundle_file_of_photographs_of_another_size(tmp_path, by, told):
+    """The file has no sizes: marks of points that lie outside show that the photographs were larger."""
+    bundler(tmp_path)
+    resized(tmp_path, by)
+    if told is None:
+        assert len(read(Data(tmp_path, test_every=0)).train) == 4
+    else:
+        with pytest.raises(BadInput, match=f"{told}.*smaller than the photographs that the cameras were found for"):
+            read(Data(tmp_path, test_every=0))
+
+
+def test_a_bundle_file_of_photographs_that_were_enlarged(tmp_path, monkeypatch):
+    monkeypatch.setattr("surfkit.readers.bundler.MANY_MARKS", 20)
+    bundler(tmp_path)
+    for by, count in ((1.0, 0), (2.0, 1)):
+        resized(tmp_path, by)
+        with collect_notes() as notes:
+            read(Data(tmp_path, test_every=0))
+        assert len([text for text in notes.texts if "all marks of points lie in the inner" in text]) == count

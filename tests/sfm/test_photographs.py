@@ -3,6 +3,7 @@
 import os
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
@@ -105,3 +106,18 @@ def test_folders_without_photographs(tmp_path):
         look(tmp_path)
     with pytest.raises(BadInput, match="a file"):
         look(tmp_path / "a.txt")
+
+
+def test_twelve_bits_are_stretched_for_the_whole_folder(tmp_path):
+    """Nearly black as they are stored; one exposure for all, and what another photograph changes is looked at again."""
+    for name, pose in zip("ab", arc(2), strict=True):
+        grey = picture(pose)[..., 1]
+        Image.fromarray(grey.astype(np.uint16) * 4).save(tmp_path / f"{name}.tif")
+    with collect_notes() as notes:
+        before = look(tmp_path)
+    assert all(photo.usable for photo in before) and any("1,023 is taken for white" in text for text in notes.texts)
+    assert before[0].light == pytest.approx(picture(arc(2)[0])[..., 1].mean(), abs=2)
+    Image.fromarray(picture(arc(3)[2])[..., 1].astype(np.uint16) * 16).save(tmp_path / "c.tif")
+    after = look(tmp_path, before)
+    assert after[0].light == pytest.approx(before[0].light / 4, abs=1) and after[0].digest != before[0].digest
+    assert look(tmp_path, after) == after

@@ -87,6 +87,32 @@ def test_masks_go_with_the_scene_undistorted_as_its_photographs(folder, capsys):
     assert [path.name for path in (folder / "s/masks").rglob("*.png")] == ["own.png"], "ours go, those of the user stay"
 
 
+def test_what_is_transparent_is_masked_where_alpha_says_so(folder):
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[HIDDEN] = 0
+    for path in sorted((folder / "p/flight").iterdir())[:3]:
+        rgb = np.asarray(Image.open(path))
+        Image.fromarray(np.dstack([rgb, alpha])).save(path.with_suffix(".png"))
+        path.unlink()
+    settings = Settings(features=800, alpha="mask")
+    sources, photos = sources_of(folder, alpha="mask")
+    assert [bool(photo.mask) for photo in photos] == [True, True, True, False, False]
+    counts = find_features(photos[:1], sources, folder / "f", settings)
+    spots = read_features(feature_file(folder / "f", photos[0], settings)).keypoints[:, :2]
+    assert counts[photos[0].name] > 50 and not ((spots >= (60, 40)).all(1) & (spots < (150, 130)).all(1)).any()
+    with collect_notes() as notes:
+        _, plain = sources_of(folder)
+    assert not any(photo.mask for photo in plain) and plain[0].digest != photos[0].digest
+    assert any("3 of 5 photographs have transparent pixels" in text for text in notes.texts)
+    _, both = sources_of(folder, alpha="mask", masks=folder / "m")
+    assert [bool(photo.mask) for photo in both] == [True, True, True, True, False]
+    command = ["prepare", "photos", str(folder / "p"), "--out", str(folder / "s"), *QUICK, "--alpha", "mask"]
+    assert main(command) == 0
+    scene = read(Data(folder / "s", test_every=0))
+    assert len([view for view in scene.train if view.mask is not None]) == 3
+    assert 0.6 < read_mask(scene.train[0].mask, (WIDTH, HEIGHT)).float().mean() < 0.9
+
+
 def test_masks_of_the_user_in_the_scene_are_not_replaced(folder, capsys):
     words = ["prepare", "photos", str(folder / "p"), "--out", str(folder / "s"), *QUICK]
     assert main(words) == 0
