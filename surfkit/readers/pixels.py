@@ -149,7 +149,7 @@ def _transparent(files: Mapping[str, Path], having: Sequence[str], count: int, p
     among = f"{count} photographs" if whole else f"{len(chosen)} photographs that were looked at, of {count},"
     return (
         f"{len(shares)} of {among} have transparent pixels, {few(list(shares))}, "
-        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, which is learnt as empty "
+        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, learnt as empty "
         "space; --alpha mask ignores them, --alpha ignore takes their colours as stored"
     )
 
