@@ -28,7 +28,6 @@ class Notes:
         self.path: Path | None = None
         self.facts: dict[str, Any] = {}
         self.prefix = ""
-        self.known: frozenset[str] = frozenset()
 
     def begin(self, path: Path, facts: dict[str, Any], before: dict[str, Any]) -> None:
         """Keep all in a file from now on, after what a run that was interrupted had kept there `before`."""
@@ -50,8 +49,6 @@ class Notes:
     def surfkit_event(self, event: Any) -> None:
         """See one event."""
         if isinstance(event, Warned):
-            if event.text in self.known:
-                return
             if self.prefix and event.text in self.texts:
                 return  # the whole run has been warned of it
             say(f"note: {self.prefix}{event.text}")
@@ -87,19 +84,6 @@ def collect_notes() -> Iterator[Notes]:
         yield notes
     finally:
         plugins().unregister(notes)
-
-
-@contextmanager
-def told_in_training(out: Path) -> Iterator[None]:
-    """Within, warnings that the training of a run has told are not told again: they are in its run.json."""
-    notes = plugins().get_plugin(NOTES)
-    if notes is not None:
-        notes.known = frozenset(read_record(out).get("notes", []))
-    try:
-        yield
-    finally:
-        if notes is not None:
-            notes.known = frozenset()
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from surfkit.readers.made_maps import is_there, located, read_made
 from surfkit.readers.read import read
 from surfkit.recipe import Recipe
 from surfkit.run.folder import Run, read_data, read_record
-from surfkit.run.notes import Notes, told_in_training
+from surfkit.run.notes import Notes
 from surfkit.scene.scene import Frame, Scene
 
 PUT_BACK = "put them back"
@@ -183,8 +183,7 @@ def _read_compared(run: Run) -> tuple[Scene, str | None]:
         raise BadInput(
             f"{run.out}: its data set {run.data.path} is not there; put it back, or a link there to where it is now"
         )
-    with told_in_training(run.out):
-        scene = read(run.data)
+    scene = read(run.data)
     if not run.inputs.exists():
         return scene, None
     before = read_json(run.inputs, Fingerprint)

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,11 +28,9 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.partition.base import Cells, Ground
 from surfkit.partition.plan import Block, Plan
-from surfkit.pipeline import opened
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.run.notes import collect_notes
-from surfkit.run.resume import read_unchanged
 from surfkit.scene.crop import read_crop
 from surfkit.scene.scene import Frame
 from surfkit.view.film import FilmTool
@@ -487,15 +484,3 @@ def test_las_files_with_keys_of_geotiff(tmp_path, monkeypatch, number, unit):
     with collect_notes() as told:
         assert read_las(tmp_path / "a.las")[2] == {}
     assert any("needs the package pyproj" in each and "surfkit[crs]" in each for each in told.texts)
-
-
-@needs_native
-def test_what_training_has_told_is_not_told_again(run):
-    """The data set lies far from 0, as on a map: its files leave out an offset."""
-    record = json.loads((run / "run.json").read_text())
-    (told,) = [note for note in record["notes"] if "too large for files of float32" in note]
-    with collect_notes() as notes:
-        read_unchanged(opened(run))
-        assert told not in notes.texts
-        read(Data(Path(record["data"]["path"])))
-        assert told in notes.texts
