@@ -30,6 +30,7 @@ _HOME = {
     "surfkit.scene.camera": ("Camera",),
     "surfkit.scene.observations": ("Observations", "Seen"),
     "surfkit.scene.scene": ("Cloud", "Frame", "Scene", "View"),
+    "surfkit.export.axes": ("FileAxes",),
     "surfkit.export.base": ("Format",),
     "surfkit.export.table": ("SplatTable", "Tile"),
     "surfkit.readers.base": ("Reader",),

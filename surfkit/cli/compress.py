@@ -6,22 +6,24 @@ import re
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from surfkit.cli.recipes import part_of_run
+from surfkit.cli.recipes import ARGV, part_of_run
 from surfkit.cli.result import compressed_rows
 from surfkit.cli.table import print_table, tell
 from surfkit.compress.base import Compressor
 from surfkit.compress.format import model_of_file
+from surfkit.compress.packed import Packed
 from surfkit.compress.vectree import Vectree
 from surfkit.core.check import BadInput
 from surfkit.core.lock import locked
-from surfkit.core.registry import choice
+from surfkit.core.registry import choice, name_of
+from surfkit.export.axes import AxesOrAuto
 from surfkit.pipeline import loaded
 from surfkit.raster.select import Device
-from surfkit.run.compress import Target, compress_run, fitted, writing
+from surfkit.run.compress import Target, compress_run, fitted, size_with, writing
 from surfkit.run.folder import Run
 from surfkit.run.journal import record_events
 from surfkit.run.measure import measure_compressed
@@ -44,9 +46,9 @@ class Compress:
     """Folder that `surfkit train` made; or a file of splats, for compressors that need no photographs."""
 
     compress: Annotated[Compressor, choice(Compressor)] = field(
-        default_factory=partial(part_of_run, "compress", Vectree)
+        default_factory=partial(part_of_run, "compress", Packed)
     )
-    """How the model is compressed."""
+    """How the model is compressed; by default as the recipe of the run says, else packed."""
 
     target_size: str | None = None
     """Choose the scale of all errors so that the file takes at most this, such as 50MB."""
@@ -57,10 +59,18 @@ class Compress:
     out: Path | None = None
     """For a FILE: file to write, ending in .surfkit; beside it by default."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in a FILE, as SPZ names them: rdf for right, down, forward, those of a PLY file. auto: those
+    that the file names, or that its format has."""
+
     device: Device = "auto"
     """Device for rendering and for codebooks."""
 
+    _is_named: ClassVar[bool] = False
+
     def __post_init__(self) -> None:
+        is_named = any(word.startswith(("compress:", "--compress.")) for word in ARGV.get())
+        object.__setattr__(self, "_is_named", is_named)  # the words are known only while they are parsed
         if self.target_size is not None and self.target_loss is not None:
             raise BadInput("--target-size and --target-loss: give one of the two")
 
@@ -77,6 +87,8 @@ class Compress:
                 self._file(wanted)
 
     def _run(self, wanted: Target) -> None:
+        if self.axes != "auto":
+            raise BadInput(f"--axes {self.axes}: {self.target} is a run, whose axes are known; leave --axes out")
         if self.out is not None:
             raise BadInput(f"--out {self.out}: a run keeps its compressed model in its folder; leave --out out")
         with loaded(self.target, self.device) as (ctx, made):
@@ -84,12 +96,18 @@ class Compress:
             with locked(run.out), full_disk_in_one_line(run.out), record_events(run.out):
                 record = compress_run(ctx, made, self.compress, wanted)
                 metrics = measure_compressed(ctx, made) if made.draw is not None else None
+                other = None if wanted.is_set or self._is_named else other_of(self.compress)
+                size = None if other is None else size_with(ctx, made, other)
         show(run, record, metrics)
+        if size is not None:
+            share = record["bytes"] / size
+            compared = f"{share:.1f} times smaller" if share > 1 else f"{1 / share:.1f} times larger"
+            print(f"\nWith compress:{name_of(other)} it would be about {size / 1e6:.2f} MB, {compared}.")
 
     def _file(self, wanted: Target) -> None:
         if wanted.decibels is not None:
             raise BadInput("--target-loss needs a run, whose photographs tell what is lost; use --target-size")
-        model, frame = model_of_file(self.target)
+        model, frame = model_of_file(self.target, self.axes)
         path = self.out or self.target.with_suffix(".surfkit")
         if path.suffix.lower() != ".surfkit":
             raise BadInput(f"--out {path}: the name must end in .surfkit")
@@ -102,6 +120,13 @@ class Compress:
         tell(
             f"wrote {len(model):,} points to {path}: {size:,} bytes, {before / size:.1f} times fewer than {self.target}"
         )
+
+
+def other_of(compressor: Compressor) -> Compressor | None:
+    """What a default is compared with: the smallest, or that of the paper."""
+    if isinstance(compressor, Packed):
+        return Vectree()
+    return Packed() if isinstance(compressor, Vectree) else None
 
 
 def size_of(text: str) -> int:

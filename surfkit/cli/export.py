@@ -18,18 +18,21 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.lock import locked
 from surfkit.core.memory import size
 from surfkit.core.registry import choice, name_of
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.base import Format
-from surfkit.export.files import format_for, format_of, has_suffix
+from surfkit.export.files import format_for, format_of, has_suffix, read_splat_file
+from surfkit.export.page import Page
 from surfkit.export.ply import PLY
 from surfkit.export.table import SplatTable, Tile
 from surfkit.export.tiles3d import Tiles3D
 from surfkit.pipeline import loaded
 from surfkit.primitives.model import SplatModel
+from surfkit.render.path import up_of
 from surfkit.run.folder import Run, refuse_no_run
 from surfkit.run.lod import load_levels
 from surfkit.run.method import splats_of
 from surfkit.run.notes import collect_notes
-from surfkit.scene.scene import Frame
+from surfkit.scene.scene import Frame, Scene
 from surfkit.train.faults import full_disk_in_one_line
 
 
@@ -49,8 +52,9 @@ def named_format() -> Format:
 class Export:
     """Write the splats of a finished run, or of a file of another program, in a format that viewers open.
 
-    Coordinates are those of the data set. Examples: `surfkit export RUN --out scene.spz`, `surfkit export scene.sog
-    --format ply`, `surfkit export RUN format:spz --format.version 4`.
+    Coordinates are those of the data set. Examples: `surfkit export RUN --out scene.spz`, `surfkit export RUN --out
+    page.html` (one file that shows the splats in a browser), `surfkit export scene.sog --format ply`, `surfkit export
+    RUN format:spz --format.version 4`.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_OR_FILE")]
@@ -61,6 +65,10 @@ class Export:
 
     out: Path | None = None
     """File to write; by default RUN/point_cloud with the suffix of the format, or beside FILE."""
+
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in a FILE, as SPZ names them: rdf for right, down, forward, those of a PLY file. auto: those
+    that the file names, or that its format has."""
 
     strict_2dgs: bool = False
     """Leave out the third scale of surfels, as programs written for 2DGS alone expect; ply only."""
@@ -76,16 +84,23 @@ class Export:
             )
         if self.strict_2dgs and not isinstance(self.format, PLY):
             raise BadInput(f"--strict-2dgs: files of the format {name_of(self.format)} have three scales; leave it out")
+        if self.axes != "auto" and self.source.is_dir():
+            raise BadInput(f"--axes {self.axes}: {self.source} is a run, whose axes are known; leave it out")
 
     def run(self) -> None:
         """Write the file, and say what is in it."""
         form, path = self._format(), self._path()
-        with collect_notes(), self._opened() as (table, frame, tree), full_disk_in_one_line(path.parent):
+        with collect_notes(), self._opened() as (table, frame, tree, scene), full_disk_in_one_line(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
-            form.write(path, table, frame, tree)
+            if isinstance(form, Page) and scene is not None:
+                form.write_seen(path, table, frame, scene.train, up_of(scene))
+            else:
+                form.write(path, table, frame, tree)
+        table = form.kept(table)
         told = form.rounding(table)
         tell(f"wrote {len(table):,} splats to {path} ({name_of(form)}, {_size(path)}){told and ': '}{told}")
-        if any(frame.shift) and not (isinstance(form, Tiles3D) and form.georeference and frame.crs):
+        has_place = isinstance(form, Tiles3D) and form.georeference and frame.crs
+        if any(frame.shift) and not (has_place or isinstance(form, Page)):
             tell(f"coordinates leave out the offset {' '.join(f'{value:.15g}' for value in frame.shift)}")
 
     def _format(self) -> Format:
@@ -109,17 +124,20 @@ class Export:
         return path
 
     @contextmanager
-    def _opened(self) -> Iterator[tuple[SplatTable, Frame, Tile | None]]:
-        """Within, the splats in the frame of the input, that frame, and their tiles if the format wants some."""
+    def _opened(self) -> Iterator[tuple[SplatTable, Frame, Tile | None, Scene | None]]:
+        """Within, the splats in the frame of the input, that frame, their tiles if the format wants some, and the scene
+        of a run."""
         if not self.source.is_dir():
-            table = format_of(self.source).read(self.source)
-            yield table, Frame.of_positions(table.means.numpy()), one_tile(table) if self.format.wants_tree else None
+            table = read_splat_file(self.source, self.axes)
+            tree = one_tile(table) if self.format.wants_tree else None
+            yield table, Frame.of_positions(table.means.numpy()), tree, None
             return
         refuse_no_run(self.source)
         with locked(self.source) if self.out is None else nullcontext(), loaded(self.source, "cpu") as (ctx, made):
             splats, frame = splats_of(ctx.run, made), ctx.scene.frame
             table = splats.primitive.table(splats.params).in_input_frame(frame)
-            yield table, frame, self._tiles(ctx.run, splats, table, frame) if self.format.wants_tree else None
+            tree = self._tiles(ctx.run, splats, table, frame) if self.format.wants_tree else None
+            yield table, frame, tree, ctx.scene
 
     def _tiles(self, run: Run, model: SplatModel, table: SplatTable, frame: Frame) -> Tile:
         """The levels of detail of a run; all splats in one tile if it has none."""

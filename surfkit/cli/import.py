@@ -11,6 +11,7 @@ import tyro
 from surfkit.blocks.schedule import Compute
 from surfkit.cli.result import show
 from surfkit.core.registry import choice
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.models import existing_model
 from surfkit.mesh.base import Mesher
 from surfkit.mesh.tsdf import TSDF
@@ -42,6 +43,10 @@ class Import:
     out: Path | None = None
     """Run folder. Default: runs/DATA-FILE."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in the file, as SPZ names them: rdf for right, down, forward, those of a PLY file, which are
+    taken as they are. auto: those that the file or its format names, else those that fit the photographs best."""
+
     mesh: Annotated[Mesher | None, choice(Mesher, optional=True)] = field(default_factory=TSDF)
     """How the splats become triangles; none for no mesh."""
 
@@ -59,7 +64,7 @@ class Import:
         existing_model(self.file, "FILE")
         data = self.reading.of(self.data)
         out = self.out or Path("runs") / f"{data.path.resolve().name}-{self.file.resolve().stem}"
-        recipe = replace(IMPORTED, method=SplatImport(self.file), mesh=self.mesh)
+        recipe = replace(IMPORTED, method=SplatImport(self.file, self.axes), mesh=self.mesh)
         metrics = run(recipe, data, out, Compute(self.device), caches=CacheSettings(self.cache))
         show(Run(out, recipe, data), metrics)
 

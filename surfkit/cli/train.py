@@ -17,6 +17,7 @@ from surfkit.cli.length import with_usual_steps
 from surfkit.cli.prepare_photos import as_before
 from surfkit.cli.recipes import ARGV, chosen_recipe, settled
 from surfkit.cli.result import show, what_next
+from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import say
 from surfkit.core.registry import choice
@@ -192,7 +193,8 @@ class Train:
             )
             metrics = run(recipe, data, out, Compute(self.device, self.executor, self.tensorboard), intervals, caches)
         show(Run(out, recipe, data), metrics)
-        print(f"\n{what_next(Run(out, recipe, data))}")
+        print()
+        tell(what_next(Run(out, recipe, data)))
 
     def _test_every(self, out: Path) -> int:
         """Which photographs are held out where nobody says: those that the run in a folder has begun without, or as the

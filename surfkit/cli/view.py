@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 
 from surfkit.core.check import BadInput, printable
+from surfkit.export.axes import AxesOrAuto
 from surfkit.raster.select import Device
 from surfkit.run.notes import collect_notes
 from surfkit.view.page import show
@@ -49,6 +50,10 @@ class View:
     """Axis of the data set that points up. Default: what a run or a file tells; -y in a file of splats that tells
     nothing."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in a file of splats, as SPZ names them: rdf for right, down, forward, those of a PLY file.
+    auto: those that the file names, or that its format has."""
+
     host: str = LOCAL
     """Address to serve at. 0.0.0.0 lets other machines connect, if they have the token; nothing is encrypted."""
 
@@ -79,7 +84,7 @@ class View:
         """Serve until Ctrl-C."""
         require_viser()
         address = Address(self.host, self.port)
-        with collect_notes(), opened_subject(self.source, self.device) as subject:
+        with collect_notes(), opened_subject(self.source, self.device, self.axes) as subject:
             if self.up is not None:
                 direction = np.eye(3)["xyz".index(self.up[-1])]
                 subject = replace(subject, up=-direction if self.up.startswith("-") else direction)

@@ -12,8 +12,9 @@ import torch
 from surfkit.compress.container import ModelFile, write_model
 from surfkit.compress.index import MAGIC
 from surfkit.compress.packed import Packed
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.base import Format
-from surfkit.export.files import format_of
+from surfkit.export.files import format_of, read_splat_file
 from surfkit.export.table import SplatTable, Tile
 from surfkit.primitives.model import SplatModel, primitive_of
 from surfkit.scene.scene import Frame
@@ -50,14 +51,17 @@ def model_of(table: SplatTable) -> SplatModel:
     return SplatModel(primitive, params | {"means": table.means.contiguous()}, table.sh_degree)
 
 
-def model_of_file(path: Path) -> tuple[SplatModel, Frame | None]:
+def model_of_file(path: Path, axes: AxesOrAuto = "auto") -> tuple[SplatModel, Frame | None]:
     """The model in a file of splats of any format, and the frame that it lies in, if the file has one.
+
+    Args:
+        path: Of the file.
+        axes: See `read_splat_file`.
 
     Raises:
         BadInput: No such file, of no known format, or damaged.
     """
-    form = format_of(path)
-    if isinstance(form, SurfkitFile):
+    if axes == "auto" and isinstance(format_of(path), SurfkitFile):
         file = ModelFile(path)
         return file.read()[0], file.frame
-    return model_of(form.read(path)), None
+    return model_of(read_splat_file(path, axes)), None

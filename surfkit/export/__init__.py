@@ -10,6 +10,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     """What this folder offers."""
     from surfkit.export.compressed_ply import CompressedPLY
     from surfkit.export.gltf import GLTF
+    from surfkit.export.page import Page
     from surfkit.export.ply import PLY
     from surfkit.export.sog import SOG
     from surfkit.export.splat import Splat
@@ -19,6 +20,7 @@ def surfkit_components() -> Mapping[str, type[Component]]:
     return {
         "compressed-ply": CompressedPLY,
         "gltf": GLTF,
+        "page": Page,
         "ply": PLY,
         "sog": SOG,
         "splat": Splat,

@@ -46,6 +46,8 @@ class Format(Component):
     def read(self, path: Path) -> SplatTable:
         """The splats of a file, in any order, as `write` was given them but for the rounding of the format.
 
+        Where files have other axes than PLY files, they are turned to those, and `SplatTable.axes` says from which.
+
         What is allocated is in proportion to the size of the file, whatever its header says.
 
         Raises:
@@ -56,6 +58,10 @@ class Format(Component):
     def knows(self, path: Path, head: bytes) -> bool:
         """Whether a file is of this format; `head` is what it begins with, up to HEAD bytes."""
         return False
+
+    def kept(self, table: SplatTable) -> SplatTable:
+        """Those of the splats that a file gets: all, but for formats with a limit, whose `write` tells of the rest."""
+        return table
 
     def rounding(self, table: SplatTable) -> str:
         """What a file does not keep of such splats as it is, in one line for the user."""

@@ -8,6 +8,10 @@ SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0."""
 QUARTER = 0.25 / 255
 """Least opacity that a byte of 0 stands for: it becomes the same byte again, and has a logit."""
+ENDS = 0.1
+"""Share of the splats at either end of an axis that say nothing about the extent of the others."""
+OUTLYING = 4.0
+"""Extents from the middle beyond which splats are far from the others."""
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Components beside the largest."""
 
@@ -21,6 +25,16 @@ def logits(opacities: np.ndarray) -> np.ndarray:
     """Float32 logits of opacities in [0, 1] that were bytes."""
     inside = opacities.astype(np.float64).clip(QUARTER, 1 - QUARTER)
     return np.log(inside / (1 - inside)).astype(np.float32)
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def from_linear(values: np.ndarray) -> np.ndarray:
+    """sRGB values of linear ones, both in [0, 1]."""
+    return np.where(values <= 0.0031308, values * 12.92, 1.055 * values.clip(0) ** (1 / 2.4) - 0.055)
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
@@ -69,6 +83,33 @@ def morton_order(means: np.ndarray) -> np.ndarray:
     for axis in range(3):
         code |= _spread(cells[:, axis]) << np.uint64(axis)
     return np.argsort(code, kind="stable")
+
+
+def outlying_order(means: np.ndarray, shown: np.ndarray, group: int) -> np.ndarray:
+    """(N,) indices that sort (N, 3) positions as `morton_order`, with those far from the others together at the end.
+
+    Splats of a group share the range of their positions. Those that lie outside of OUTLYING times the extent of most
+    come last, octave by octave of their distance. What fills up the first group with such ones, as groups have a
+    fixed size, are those splats of which least is seen.
+
+    Args:
+        means: (N, 3).
+        shown: (N,) how much is seen of each splat.
+        group: Splats of a group.
+    """
+    if len(means) <= group:
+        return morton_order(means)
+    low, high = np.quantile(means, (ENDS, 1 - ENDS), axis=0)
+    away = np.abs(means - (low + high) / 2).max(1)
+    extent = max(float((high - low).max()), away.max() * 2.0**-40, np.finfo(float).tiny)
+    octave = np.ceil(np.log2(np.maximum(away / (OUTLYING * extent), 1))).astype(int)
+    core = np.flatnonzero(octave == 0)
+    if len(core) < len(means) and (left := len(core) % group):
+        filling = core[np.argsort(shown[core], kind="stable")[:left]]
+        octave[core] = -1
+        octave[filling] = 0
+    parts = [np.flatnonzero(octave == each) for each in np.unique(octave)]
+    return np.concatenate([part[morton_order(means[part])] for part in parts])
 
 
 def _spread(values: np.ndarray) -> np.ndarray:

@@ -2,21 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from surfkit.core.check import BadInput
+from surfkit.core.events import Warned, emit
 from surfkit.core.registry import components, name_of
+from surfkit.export.axes import Axes, AxesOrAuto, FileAxes, in_words, turn_between
 from surfkit.export.base import HEAD, Format
 from surfkit.export.table import SplatTable
+from surfkit.export.turn import turned
 
 
-def read_splat_file(path: Path) -> SplatTable:
+def read_splat_file(path: Path, axes: AxesOrAuto = "auto") -> SplatTable:
     """The splats of a file of any format, which its content tells, or its name where the content does not.
+
+    Args:
+        path: Of the file.
+        axes: Of the numbers in it. For auto, those that the file names or its format has; where it is a guess, a
+            warning says so.
 
     Raises:
         BadInput: No such file, of no known format, or damaged.
     """
-    return format_of(path).read(path)
+    table = format_of(path).read(path)
+    if axes != "auto":
+        return from_axes(table, axes)
+    if not table.axes.is_told and len(table):
+        emit(Warned(f"{untold_axes(path)}: {assumed_axes(table)}; --axes rdf takes them as those of a PLY file"))
+    return table
+
+
+def untold_axes(path: Path) -> str:
+    """How notes begin about a file whose axes are a guess."""
+    return f"{path} does not say which axes its numbers have"
+
+
+def assumed_axes(table: SplatTable) -> str:
+    """Which axes the reader of a file has assumed."""
+    return f"{table.axes.name} ({in_words(table.axes.name)}) is assumed"
+
+
+def from_axes(table: SplatTable, axes: Axes) -> SplatTable:
+    """The splats of a file whose numbers have these axes, in place of those that its reader took."""
+    turn = turn_between(axes) @ turn_between(table.axes.name).T
+    return replace(turned(table, turn), axes=FileAxes(axes))
 
 
 def format_of(path: Path) -> Format:
@@ -29,6 +59,8 @@ def format_of(path: Path) -> Format:
     head = b""
     try:
         if not path.is_dir():
+            if path.exists() and not path.is_file():  # a pipe would wait for someone to write
+                raise BadInput(f"{path}: neither a file nor a folder; name a file of splats")
             with path.open("rb") as file:
                 head = file.read(HEAD)
     except OSError as error:

@@ -17,6 +17,7 @@ import numpy as np
 from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json
 from surfkit.core.files import replacing
+from surfkit.export.bits import linear
 
 MAGIC = b"glTF"
 MOST_BYTES = (1 << 32) - 1
@@ -30,7 +31,7 @@ TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 VERTICES = 34962
 """Target of a buffer view of vertex attributes."""
-FLOAT = 5126
+FLOAT, SHORT = 5126, 5123
 
 
 @dataclass
@@ -66,6 +67,16 @@ class Blocks:
             return 0
         end = self.views[-1]["byteOffset"] + self.views[-1]["byteLength"]
         return end + -end % 4
+
+
+def linear_colors(srgb: np.ndarray) -> np.ndarray:
+    """(N, 4) uint16 for COLOR_0, opaque, of (N, 3) uint8 as they are on a screen.
+
+    glTF has linear colours there, and 8 bits of these would be too few for dark ones.
+    """
+    colors = np.full((len(srgb), 4), 65535, "<u2")
+    colors[:, :3] = np.round(65535 * linear(np.arange(256) / 255))[srgb]
+    return colors
 
 
 def write_glb(path: Path, document: dict[str, Any], blocks: Blocks) -> None:
@@ -154,6 +165,13 @@ class Document:
     def fault(self, what: str) -> BadInput:
         """An error that names the file."""
         return BadInput(f"{self.path}: {what}")
+
+    def entry(self, *keys: str) -> Any:
+        """The value at a path of keys from the root; None where there is none."""
+        found: Any = self.root
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
         """An element of one of the top-level lists, such as ("nodes", 0)."""

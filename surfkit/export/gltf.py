@@ -20,12 +20,14 @@ import numpy as np
 import torch
 
 from surfkit.core.version import own_version
+from surfkit.export.axes import turn_between
 from surfkit.export.base import Format
 from surfkit.export.bits import SH_C0, to_bytes, unit
 from surfkit.export.glb import MAGIC, VERTICES, Blocks, write_glb
 from surfkit.export.gltf_reader import COMPRESSED, LEAST, SPLATS, UPS, harmonics, read_splats
 from surfkit.export.spz import SPZ, spz_bytes, spz_table
 from surfkit.export.table import SplatTable, Tile
+from surfkit.export.turn import turned
 from surfkit.scene.scene import FAR, Frame
 
 Compress = Literal["none", "spz"]
@@ -61,10 +63,10 @@ class GLTF(Format):
         write_splats(path, table, UPS[up], self.compress, notes)
 
     def read(self, path: Path) -> SplatTable:
-        """See `Format.read`. Files of other programs stay in the axes of glTF, y up."""
+        """See `Format.read`."""
         table = read_splats(path)
         table.refuse_unsound(path)
-        return table
+        return turned(table, turn_between(table.axes.name))
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""

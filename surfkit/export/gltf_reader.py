@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from surfkit.core.check import BadInput
+from surfkit.export.axes import Axes, FileAxes, turn_between
 from surfkit.export.bits import unit
 from surfkit.export.glb import Document, read_glb
-from surfkit.export.spz import spz_table
+from surfkit.export.spz import SPZ_ROUNDING, spz_table
 from surfkit.export.table import COLUMNS, SplatTable
 from surfkit.export.turn import parts_of, turned
 
@@ -30,8 +31,11 @@ UPS = {
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
 """Rotations from an input whose vertical axis is this to that of glTF, which is y."""
-LUF = np.diag([-1.0, 1.0, -1.0])
-"""From right-up-back to left-up-front."""
+GLTF_AXES: Axes = "luf"
+"""Axes of glTF as SPZ names them: y is up, and models face z."""
+WRITERS = ("splat-transform ",)
+"""How `asset.generator` begins in files of programs that turn PLY files by half a turn about z, to these axes."""
+LUF = turn_between("rub", GLTF_AXES)
 BEST = 1 - 2.0**-24
 """Largest float32 below 1: opacities of 1 have no logit."""
 LEAST = float(np.finfo(np.float32).tiny)
@@ -45,7 +49,8 @@ ROUNDING = 1e-5
 def read_splats(path: Path) -> SplatTable:
     """The splats of a GLB file, all nodes of its scene together.
 
-    Files of surfkit give the splats in the frame that they were written from; others in world coordinates, y up.
+    Files of surfkit give the splats in the frame that they were written from; others in world coordinates, whose axes
+    are GLTF_AXES, which those programs are known to keep that are in WRITERS.
 
     Raises:
         BadInput: Not such a file, damaged, or with something that splats cannot follow, such as a node that mirrors.
@@ -67,7 +72,9 @@ def read_splats(path: Path) -> SplatTable:
         raise document.fault(f"no file of splats: no primitive of its scene has the extension {SPLATS}")
     table = _joined(tables, notes.get("sh_degree", 0))
     if not notes:
-        return table.as_surfels_if_thin(ROUNDING)
+        axes = FileAxes(GLTF_AXES, str(document.entry("asset", "generator")).startswith(WRITERS))
+        is_coarse = COMPRESSED in _list(document, document.root, "extensionsUsed")
+        return replace(table.as_surfels_if_thin(*(SPZ_ROUNDING if is_coarse else (ROUNDING,))), axes=axes)
     table = replace(table, antialias=notes["antialias"])
     return table.as_surfels() if notes["kind"] == "surfel" else table
 
@@ -82,9 +89,7 @@ def _placed(document: Document, table: SplatTable, matrix: np.ndarray) -> SplatT
 
 def _notes(document: Document) -> dict[str, Any]:
     """What surfkit wrote for itself; nothing in a file of another program."""
-    found: Any = document.root
-    for key in ("asset", "extras", "surfkit"):
-        found = found.get(key) if isinstance(found, dict) else None
+    found = document.entry("asset", "extras", "surfkit")
     if not isinstance(found, dict):
         return {}
     offset = document.numbers(found.get("offset", [0, 0, 0]), 3, "asset.extras.surfkit.offset")

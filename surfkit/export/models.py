@@ -12,7 +12,7 @@ from torch import Tensor
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
-from surfkit.export.files import read_splat_file
+from surfkit.export.files import format_of
 from surfkit.export.table import SplatTable
 from surfkit.scene.scene import Frame, Scene, View
 
@@ -40,19 +40,25 @@ def existing_model(path: Path | None, setting: str) -> Path:
     return found
 
 
-def read_local(path: Path, frame: Frame) -> SplatTable:
-    """The splats of a file in the local frame, all float32.
-
-    Files hold coordinates of the data set. Some formats have no place for the offset of survey coordinates: where the
-    splats lie nearer to the scene with the offset of the data set than without, it is added.
+def read_sound(path: Path) -> SplatTable:
+    """The splats of a file as it has them.
 
     Raises:
         BadInput: No file of splats, or one without splats, or with values that cannot be drawn.
     """
-    table = read_splat_file(path)
+    table = format_of(path).read(path)
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
+    return table
+
+
+def in_scene(table: SplatTable, frame: Frame) -> SplatTable:
+    """The splats of a file in the local frame of a data set, all float32.
+
+    Files hold coordinates of the data set. Some formats have no place for the offset of survey coordinates: where the
+    splats lie nearer to the scene with the offset of the data set than without, it is added.
+    """
     table = replace(table, means=table.means.double() + _lacking_offset(table.means, frame))
     return table.in_local_frame(frame)
 

@@ -35,6 +35,8 @@ TYPES = {
 Elements = dict[str, np.ndarray]
 """Record arrays of the elements of a file, by name."""
 
+SMOOTHED = "filter_3D"
+"""Property of Mip-Splatting and Gaussian Opacity Fields: by how much the scales are to be smoothed."""
 NEEDED = (
     "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3",
 )  # fmt: skip
@@ -147,6 +149,10 @@ def read_splats(path: Path) -> SplatTable:
     def gathered(*wanted: str) -> Tensor:
         return torch.from_numpy(columns_of(rows, wanted))
 
+    log_scales = gathered("scale_0", "scale_1", *([] if surfel else ["scale_2"]))
+    opacity_logits = gathered("opacity")[:, 0]
+    if SMOOTHED in names:
+        log_scales, opacity_logits = smoothed(log_scales, opacity_logits, gathered(SMOOTHED))
     interleaved = [ordered[at + channel * (rest // 3)] for at in range(rest // 3) for channel in range(3)]
     return SplatTable(
         kind="surfel" if surfel else "gaussian",
@@ -154,12 +160,31 @@ def read_splats(path: Path) -> SplatTable:
             shifted(path, np.stack([rows[axis].astype(rows["x"].dtype.newbyteorder("=")) for axis in "xyz"], 1), tags)
         ),
         quats=gathered("rot_0", "rot_1", "rot_2", "rot_3"),
-        log_scales=gathered("scale_0", "scale_1", *([] if surfel else ["scale_2"])),
-        opacity_logits=gathered("opacity")[:, 0],
+        log_scales=log_scales,
+        opacity_logits=opacity_logits,
         sh0=gathered("f_dc_0", "f_dc_1", "f_dc_2"),
         sh_rest=gathered(*interleaved).reshape(len(rows), rest // 3, 3),
         antialias=mode == "mip",
     )
+
+
+def smoothed(log_scales: Tensor, opacity_logits: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales and opacities of splats after the 3D smoothing filter of Mip-Splatting (Yu et al. 2024, section 5.1).
+
+    The variance along each axis grows by that of the filter, and the opacity falls as the volume grows.
+
+    Args:
+        log_scales: (N, 2 or 3).
+        opacity_logits: (N,).
+        deviation: (N, 1) standard deviation of the filter, the unit of the scales.
+    """
+    scales = log_scales.double()
+    wider = torch.logaddexp(2 * scales, 2 * deviation.double().abs().log()) / 2
+    shrunk = (scales - wider).sum(1)
+    log_opacity = torch.nn.functional.logsigmoid(opacity_logits.double()) + shrunk
+    logits = log_opacity - torch.log1p(-log_opacity.exp())
+    kept = (deviation == 0).all(1)
+    return wider.float(), torch.where(kept, opacity_logits.double(), logits).float()
 
 
 def columns_of(rows: np.ndarray, names: Sequence[str]) -> np.ndarray:

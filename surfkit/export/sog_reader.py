@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import stat
 import struct
 import warnings
 import zipfile
@@ -19,10 +21,14 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import from_json
 from surfkit.export.bits import from_smallest_three, logits
 from surfkit.export.table import SplatTable
-from surfkit.export.unpack import refuse_implausible
+from surfkit.export.unpack import SMALL, refuse_implausible
 
 SIDE = 16_383
 """Most pixels of a WebP image along a side."""
+HEAD = 30
+"""Bytes of a WebP image in which its size stands."""
+MOST_JSON = 1 << 26
+"""Bytes of a meta.json that are read."""
 GROWTH = 16
 """Times that files of the archive may grow: images are compressed already."""
 MODELS = {"2dgs": "surfel", "antialiased": "gaussian", "default": "gaussian"}
@@ -39,7 +45,7 @@ def read_sog(path: Path) -> SplatTable:
     """See `Format.read`."""
     try:
         if path.name == "meta.json":
-            return _decoded(path, lambda name: (path.parent / name).read_bytes())
+            return _decoded(path, lambda name: _beside(path, name))
         with zipfile.ZipFile(path) as archive:
             return _decoded(path, lambda name: _member(path, archive, name))
     except OSError as error:
@@ -58,6 +64,27 @@ def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
         raise BadInput(f"{path}: damaged or cut off: {name} would be larger than the file; copy it again")
     refuse_implausible(path, entry.compress_size, entry.file_size, GROWTH)
     return archive.read(entry)
+
+
+def _beside(path: Path, name: str) -> bytes:
+    """A file of an unpacked archive: a regular one in the folder of meta.json, no larger than what it can be of use."""
+    folder, where = path.parent.resolve(), (path.parent / name).resolve(strict=True)
+    if folder not in where.parents:
+        raise BadInput(f"{path}: {name} is a link out of the folder; copy the file itself there")
+    # a pipe would wait for someone to write
+    descriptor = os.open(where, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    with os.fdopen(descriptor, "rb") as file:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode):
+            raise BadInput(f"{path}: {name} is no regular file; copy the files of the archive there again")
+        head = file.read(HEAD)
+        most = MOST_JSON
+        if name != "meta.json":
+            width, height = _size(path, name, head)
+            most = 4 * width * height + SMALL
+        if found.st_size > most:
+            raise BadInput(f"{path}: {name} has {found.st_size:,} bytes, more than it can be of use; copy it again")
+        return head + file.read(most)
 
 
 def _decoded(path: Path, member: Callable[[str], bytes]) -> SplatTable:
@@ -193,7 +220,7 @@ def _pixels(path: Path, name: str, data: bytes) -> np.ndarray:
 
 def _size(path: Path, name: str, data: bytes) -> tuple[int, int]:
     """Width and height in the header of a WebP image."""
-    if len(data) >= 30 and data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if len(data) >= HEAD and data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         if data[12:16] == b"VP8L":
             bits = struct.unpack_from("<I", data, 21)[0]
             return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1

@@ -4,7 +4,8 @@ All values of one attribute follow one another: positions as fixed-point numbers
 as bytes of 255 (0.15 f + 1/2), scales as bytes of 16 (log s + 10), rotations xyzw as the index of the largest component
 in 2 bits and the others in a sign and 9 bits each (version 2: x, y, z in a byte each), coefficients of higher degree as
 bytes of 128 f + 128. Versions 1 to 3 are one gzip stream with a header of 16 bytes; version 4 is a header of 32 bytes,
-a table of sizes and a zstd stream for each attribute. Source: README.md and src/cc/load-spz.cc of nianticlabs/spz.
+a table of sizes and a zstd stream for each attribute. Records of extensions stand before that table, and in the older
+versions behind the attributes. Source: README.md, extensions/README.md and src/cc/load-spz.cc of nianticlabs/spz.
 """
 
 from __future__ import annotations
@@ -25,30 +26,26 @@ from torch import Tensor
 from surfkit.core.check import BadInput, require_within
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import replacing
+from surfkit.export.axes import NAMES, PLY_AXES, FileAxes, turn_between
 from surfkit.export.base import Format
-from surfkit.export.bits import from_smallest_three, logits, morton_order, sigmoid, smallest_three, to_bytes, unit
+from surfkit.export.bits import morton_order, sigmoid, smallest_three, to_bytes, unit
 from surfkit.export.ply import CHUNK
+from surfkit.export.spz_reader import AXES_RECORD, COLOR, EXTENDED, HEADER, LARGEST, MAGIC, SMALLEST, STEP, decoded
 from surfkit.export.table import SplatTable, Tile
-from surfkit.export.unpack import inflated, unpacked_zstd
+from surfkit.export.turn import turned
 from surfkit.scene.scene import Frame
 
-MAGIC = b"NGSP"
-COLOR = 0.15
-"""What a coefficient of degree 0 is multiplied by: colours beyond [0, 1] have a place too."""
-SMALLEST, LARGEST = -10.0, 255 / 16 - 10
-"""Logarithms of the smallest and largest scale."""
-STEP = 1 / 16
-"""Between logarithms of scales."""
 FINE = 64
 """Positions are rounded to no less than this share of the median scale: finer bits are noise that takes space."""
 COARSE = 4
 """A share of the median scale by which positions may be rounded without a warning."""
 TURNED = [(-1) ** ((m < 0) + (degree - abs(m)) % 2) for degree in (1, 2, 3) for m in range(-degree, degree + 1)]
 """Signs of spherical harmonics after half a turn about x: orders m < 0 are odd in y, odd degree - |m| is odd in z."""
-HEADER = 32
-"""Bytes of the header of version 4."""
 LEVEL = 12
 """Of zstd, as in the library of Niantic."""
+
+SPZ_ROUNDING = (STEP / 2 + 1e-4, SMALLEST)
+"""Of logarithms of scales, and the smallest of them, for `as_surfels_if_thin`."""
 
 Encode = Callable[[np.ndarray], np.ndarray]
 """Makes the bytes of an attribute from rows of its column."""
@@ -75,7 +72,8 @@ class SPZ(Format):
 
     axes: Literal["rub", "same"] = "rub"
     """rub follows the specification, right-up-back: half a turn about x from the axes of PLY files. same keeps the axes
-    of PLY files, as splat-transform and SuperSplat do. Files do not tell which; reading turns back."""
+    of PLY files, as splat-transform 3 and SuperSplat do; files of version 4 say so. Reading turns back by what the file
+    says, or else by this."""
 
     def __post_init__(self) -> None:
         require_within({"sh1_bits": (1, 8), "sh_rest_bits": (1, 8)}, self)
@@ -96,10 +94,14 @@ class SPZ(Format):
     def _packed(self, table: SplatTable, bits: int) -> Iterator[bytes]:
         """A file, part by part."""
         order = torch.from_numpy(morton_order(table.means.double().numpy()))
-        head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, int(table.antialias))
+        record = b""
+        if self.version == 4 and self.axes == "same":
+            record = struct.pack("<III", AXES_RECORD, 4, NAMES.index(PLY_AXES) + 1)
+        flags = int(table.antialias) | EXTENDED * bool(record)
+        head = struct.pack("<4sIIBBB", MAGIC, self.version, len(table), table.sh_degree, bits, flags)
         streams = [_parts(column, order, encode) for column, encode in self._attributes(table, bits)]
         if self.version == 4:
-            yield _container(head, streams, len(table))
+            yield _container(head, record, streams, len(table))
             return
         squeeze = zlib.compressobj(6, zlib.DEFLATED, 31)
         yield squeeze.compress(head + b"\0")
@@ -143,11 +145,12 @@ class SPZ(Format):
             data = Path(path).read_bytes()
         except OSError as error:
             raise BadInput(f"{path}: cannot be read: {error.strerror}") from error
-        table = _decoded(path, *_streams(path, data))
+        table, named = decoded(path, data)
         table.refuse_unsound(path)
-        if self.axes == "rub":
-            table = half_turn(table)
-        return table.as_surfels_if_thin(STEP / 2 + 1e-4, SMALLEST)
+        axes = FileAxes(named or ("rub" if self.axes == "rub" else PLY_AXES), named is not None)
+        table = half_turn(table) if axes.name == "rub" else turned(table, turn_between(axes.name))
+        table = replace(table, axes=axes)
+        return table.as_surfels_if_thin(*SPZ_ROUNDING)
 
     def knows(self, path: Path, head: bytes) -> bool:
         """See `Format.knows`."""
@@ -188,7 +191,7 @@ def spz_table(data: bytes, where: Path) -> SplatTable:
     Raises:
         BadInput: No such data, or damaged.
     """
-    return _decoded(where, *_streams(where, data))
+    return decoded(where, data)[0]
 
 
 def half_turn(table: SplatTable) -> SplatTable:
@@ -209,8 +212,8 @@ def _parts(column: Tensor, order: Tensor, encode: Encode) -> Iterator[bytes]:
         yield encode(column[order[start : start + CHUNK]].numpy()).tobytes()
 
 
-def _container(head: bytes, streams: list[Iterator[bytes]], count: int) -> bytes:
-    """A file of version 4."""
+def _container(head: bytes, record: bytes, streams: list[Iterator[bytes]], count: int) -> bytes:
+    """A file of version 4, with a record of an extension or none."""
     packed, sizes = [], []
     for stream in streams if count else ():
         squeeze, size, pieces = zstandard.ZstdCompressor(level=LEVEL).compressobj(), 0, []
@@ -219,7 +222,7 @@ def _container(head: bytes, streams: list[Iterator[bytes]], count: int) -> bytes
             pieces.append(squeeze.compress(part))
         packed.append(b"".join([*pieces, squeeze.flush()]))
         sizes.append(struct.pack("<QQ", len(packed[-1]), size))
-    start = head + struct.pack("<BI12x", len(packed), HEADER)
+    start = head + struct.pack("<BI12x", len(packed), HEADER + len(record)) + record
     return b"".join([start, *sizes, *packed])
 
 
@@ -250,112 +253,3 @@ def _harmonics(rest: np.ndarray, first: int, others: int) -> np.ndarray:
     whole = np.rint(rest.clip(-2, 2) * np.float32(128)).astype(np.int16) + np.int16(128)
     step = np.where(np.arange(whole.shape[1]) < 3, 2 ** (8 - first), 2 ** (8 - others)).astype(np.int16)[:, None]
     return ((whole + step // 2) & -step).clip(0, 255).astype(np.uint8)
-
-
-@dataclass(frozen=True)
-class Header:
-    """What the header of a file says."""
-
-    version: int
-    count: int
-    degree: int
-    bits: int
-    antialias: bool
-
-    @property
-    def widths(self) -> list[int]:
-        """Bytes of each attribute of one splat, those of none left out."""
-        widths = [6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version > 2 else 3]
-        return widths + [3 * ((self.degree + 1) ** 2 - 1)] * (self.degree > 0)
-
-    @property
-    def sizes(self) -> list[int]:
-        """Bytes of each attribute."""
-        return [width * self.count for width in self.widths]
-
-
-def _streams(path: Path, data: bytes) -> tuple[Header, list[bytes]]:
-    """The header of a file, and the bytes of each attribute."""
-    if data.startswith(MAGIC):
-        header = _header(path, data, (4,))
-        return header, _unpacked(path, data, header)
-    if not data.startswith(b"\x1f\x8b"):
-        raise BadInput(f"{path}: no .spz file: it begins neither as gzip nor with {MAGIC.decode()}")
-    header = _header(path, inflated(path, data, 16, part=True), (1, 2, 3))
-    body, streams, at = inflated(path, data, 16 + sum(header.sizes)), [], 16
-    for size in header.sizes:
-        streams.append(body[at : at + size])
-        at += size
-    return header, streams
-
-
-def _header(path: Path, data: bytes, versions: tuple[int, ...]) -> Header:
-    if len(data) < 16 or not data.startswith(MAGIC):
-        raise BadInput(f"{path}: no .spz file, or cut off: it has no header")
-    version, count, degree, bits, flags = struct.unpack_from("<IIBBB", data, 4)
-    if version not in versions:
-        raise BadInput(f"{path}: version {version} of .spz; versions 1 to 4 are read")
-    if degree > 4 or bits > 30:
-        raise BadInput(f"{path}: damaged: degree {degree} of spherical harmonics, {bits} fractional bits")
-    return Header(version, count, degree, bits, bool(flags & 1))
-
-
-def _unpacked(path: Path, data: bytes, header: Header) -> list[bytes]:
-    """The attributes of a file of version 4."""
-    if len(data) < HEADER:
-        raise BadInput(f"{path}: cut off within the header; write or copy it again")
-    number, table = struct.unpack_from("<BI", data, 15)
-    sizes = header.sizes if header.count else []
-    at = table + 16 * number
-    if number != len(sizes) or table < HEADER or at > len(data):
-        raise BadInput(f"{path}: damaged: {number} attributes, {len(sizes)} expected; write or copy it again")
-    streams = []
-    for i, wanted in enumerate(sizes):
-        packed, size = struct.unpack_from("<QQ", data, table + 16 * i)
-        if size != wanted or packed > len(data) - at:
-            raise BadInput(f"{path}: damaged or cut off: attribute {i + 1} of {number} has another size than it should")
-        streams.append(unpacked_zstd(path, data[at : at + packed], size))
-        at += packed
-    return streams or [b""] * len(header.sizes)
-
-
-def _decoded(path: Path, header: Header, streams: list[bytes]) -> SplatTable:
-    """The splats of the attributes; harmonics of degree 4 are left out."""
-    raw = [
-        np.frombuffer(stream, np.uint8).reshape(header.count, width)
-        for stream, width in zip(streams, header.widths, strict=True)
-    ]
-    means, alphas, colors, scales, turns = raw[:5]
-    rest = raw[5] if header.degree else np.zeros((header.count, 0), np.uint8)
-    coefficients = rest.reshape(header.count, (header.degree + 1) ** 2 - 1, 3)[:, :15]
-    return SplatTable(
-        kind="gaussian",
-        means=torch.from_numpy(_decoded_positions(means, header)),
-        quats=torch.from_numpy(_decoded_rotations(turns, header)),
-        log_scales=torch.from_numpy(scales.astype(np.float32) * STEP + SMALLEST),
-        opacity_logits=torch.from_numpy(logits(alphas.reshape(-1) / 255)),
-        sh0=torch.from_numpy((colors.astype(np.float32) / 255 - 0.5) / COLOR),
-        sh_rest=torch.from_numpy((coefficients.astype(np.float32) - 128) / 128),
-        antialias=header.antialias,
-    )
-
-
-def _decoded_positions(raw: np.ndarray, header: Header) -> np.ndarray:
-    """(N, 3) float32 of halves or of numbers of 24 bits."""
-    if header.version == 1:
-        return np.ascontiguousarray(raw).view("<f2").reshape(-1, 3).astype(np.float32)
-    wide = np.zeros((header.count, 3, 4), np.uint8)
-    wide[..., 1:] = raw.reshape(-1, 3, 3)
-    return ((wide.view("<i4")[..., 0] >> 8) / 2.0**header.bits).astype(np.float32)
-
-
-def _decoded_rotations(raw: np.ndarray, header: Header) -> np.ndarray:
-    """(N, 4) float32 wxyz."""
-    if header.version < 3:
-        xyz = raw.reshape(-1, 3) / 127.5 - 1
-        w = np.sqrt((1 - (xyz**2).sum(1, keepdims=True)).clip(0))
-        return np.concatenate([w, xyz], 1).astype(np.float32)
-    word = np.ascontiguousarray(raw).view("<u4").reshape(-1)
-    fields = np.stack([word >> shift & 1023 for shift in (20, 10, 0)], 1)
-    three = np.where(fields & 512, -1.0, 1.0) * (fields & 511) / 511
-    return np.roll(from_smallest_three(word >> 30, three), 1, 1)

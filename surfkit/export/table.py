@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from surfkit.core.check import BadInput, expect
+from surfkit.export.axes import PLY_AXES, FileAxes
 from surfkit.scene.scene import Frame
 
 THINNESS = 1e-3
@@ -41,6 +42,7 @@ class SplatTable:
         sh0: (N, 3) coefficients of degree 0.
         sh_rest: (N, K - 1, 3) coefficients of degrees 1 to 3, K in {1, 4, 9, 16}.
         antialias: Gaussians only: to be drawn dimmed by what the blur of the rasterizer adds to them (Mip-Splatting).
+        axes: Of the numbers in the file that the splats were read from; the reader has turned them to PLY_AXES.
     """
 
     kind: Literal["surfel", "gaussian"]
@@ -51,6 +53,7 @@ class SplatTable:
     sh0: Tensor
     sh_rest: Tensor
     antialias: bool = False
+    axes: FileAxes = FileAxes(PLY_AXES)
 
     def __post_init__(self) -> None:
         sizes = expect("means", self.means, ("N", 3))
@@ -86,7 +89,7 @@ class SplatTable:
         return self if self.kind == "surfel" else replace(self, kind="surfel", log_scales=self.log_scales[:, :2])
 
     def as_surfels_if_thin(self, rounding: float, least: float = -math.inf) -> SplatTable:
-        """As surfels, if that is what `ellipsoid_log_scales` made all of them from; ellipsoids otherwise.
+        """As surfels, if all are as flat as `ellipsoid_log_scales` makes them, or flatter; ellipsoids otherwise.
 
         Args:
             rounding: Largest difference between a scale in the file and what was written, in logarithms.
@@ -96,7 +99,7 @@ class SplatTable:
             return self
         smaller, third = self.log_scales[:, :2].amin(1), self.log_scales[:, 2]
         expected = (smaller + math.log(THINNESS)).clamp_min(least)
-        thin = (third - expected).abs().max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
+        thin = (third - expected).max() <= 2 * rounding and (smaller - third).median() >= math.log(THIN)
         return self.as_surfels() if thin else self
 
     def without_infinities(self) -> SplatTable:
@@ -128,6 +131,11 @@ class SplatTable:
                 row = int((~(column.abs() <= LARGEST)).nonzero()[0, 0])
                 what = f"{name} of splat {row} of {len(self)} has NaN, Inf or a value beyond {LARGEST:g}"
                 raise BadInput(f"{where}: {what}; remove such splats first")
+
+    def shown(self) -> Tensor:
+        """(N,) about how much is seen of each splat: opacity times the product of its two larger radii."""
+        larger = self.log_scales.detach().double().topk(2, dim=1).values.sum(1)
+        return larger.exp() * torch.sigmoid(self.opacity_logits.detach().double())
 
     def median_scale(self) -> float:
         """Median radius in the plane of surfels, or along the first two axes of ellipsoids; 1 without splats."""

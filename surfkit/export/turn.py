@@ -22,19 +22,20 @@ DIRECTIONS = 64
 def turned(table: SplatTable, turn: np.ndarray, scale: float = 1.0, move: np.ndarray | None = None) -> SplatTable:
     """The same splats in another frame: new = scale * turn @ old + move.
 
-    What does not change keeps its bits; positions become float64 otherwise.
+    What does not change keeps its bits; positions become float64 otherwise, except where axes only change places.
 
     Args:
         table: N splats.
-        turn: (3, 3) rotation.
+        turn: (3, 3) rotation, or one that mirrors too: ellipsoids have no hand.
         scale: New units per old unit, above 0.
         move: (3,) new units; None for none.
     """
     turn = np.asarray(turn, np.float64)
     if not np.array_equal(turn, np.eye(3)):
+        means = table.means.detach().cpu().double() @ torch.from_numpy(turn.T.copy())
         table = replace(
             table,
-            means=table.means.detach().cpu().double() @ torch.from_numpy(turn.T.copy()),
+            means=means.to(table.means.dtype) if np.isin(turn, (-1, 0, 1)).all() else means,
             quats=_turned_quats(table.quats.detach().cpu(), turn),
             sh_rest=_turned_harmonics(table.sh_rest.detach().cpu(), turn),
         )
@@ -103,7 +104,7 @@ def _turned_harmonics(rest: Tensor, turn: np.ndarray) -> Tensor:
 
 
 def _turned_quats(quats: Tensor, turn: np.ndarray) -> Tensor:
-    """(N, 4) wxyz of the same lengths."""
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    """(N, 4) wxyz of the same lengths; a mirrored ellipsoid is the one turned by the opposite matrix."""
+    x, y, z, w = Rotation.from_matrix(turn * np.sign(np.linalg.det(turn))).as_quat()
     product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
     return (quats.double() @ product.T).to(quats.dtype)

@@ -24,13 +24,14 @@ def refuse_implausible(path: Path, packed: int, size: int, most: int = MOST) -> 
 
 
 def inflated(path: Path, data: bytes, size: int, part: bool = False) -> bytes:
-    """The first `size` bytes of a gzip stream; `part` leaves out the check of its end."""
+    """The `size` bytes of a gzip stream, with up to BEHIND that follow them; with `part` the first ones alone, whatever
+    comes then."""
     refuse_implausible(path, len(data), size)
     stream = zlib.decompressobj(31)
     try:
         found = stream.decompress(data, size)
         if not part and not stream.eof:
-            stream.decompress(stream.unconsumed_tail, BEHIND)
+            found += stream.decompress(stream.unconsumed_tail, BEHIND)
     except zlib.error as error:
         raise BadInput(f"{path}: damaged: {error}; write or copy it again") from error
     if len(found) < size or not (part or stream.eof):

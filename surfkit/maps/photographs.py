@@ -11,6 +11,7 @@ from surfkit.maps.geotiff import Sheet
 from surfkit.maps.zbuffer import NONE, ZBuffer, barycentric
 from surfkit.scene.scene import Frame
 from surfkit.texture.deliver import Textured
+from surfkit.texture.exposure import exposed, levelled
 from surfkit.texture.photographs import by_photograph
 
 NEAR = 3.0
@@ -71,8 +72,7 @@ class FromPhotographs:
         places = (paint.mesh.vertices[paint.mesh.faces[face]].astype(np.float64) * shares[:, :, None]).sum(1)
         x, y, _ = paint.photos.views[number].camera.project(torch.from_numpy(places)).numpy().T
         added = (paint.levels.value[paint.levels.corner[face]] * shares[:, :, None]).sum(1)
-        shown = between(paint.photos(number), x, y) * paint.gains[number] + 255 * added
-        return np.rint(shown).clip(0, 255).astype(np.uint8)
+        return levelled(exposed(between(paint.photos(number), x, y) / 255, paint.gains[number]), added)
 
 
 def between(photo: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from surfkit.core.check import BadInput
 from surfkit.core.codec import write_json
 from surfkit.core.files import replacing
 from surfkit.core.version import own_version
-from surfkit.export.glb import MOST_BYTES
+from surfkit.export.glb import MOST_BYTES, SHORT, linear_colors
 from surfkit.mesh.base import Mesh
 from surfkit.scene.scene import Frame
 
@@ -77,7 +77,8 @@ def write_obj(file: BinaryIO, mesh: Mesh, frame: Frame) -> None:
 
 
 def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
-    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input.
+    """GLB about an origin of its own, as it only has floats; NAME.glb.json says where that lies in the input. Colours
+    are linear, as glTF has them.
 
     Raises:
         BadInput: More than 4 GiB.
@@ -93,10 +94,9 @@ def write_glb(path: Path, mesh: Mesh, frame: Frame) -> list[Path]:
     ]
     counts, attributes = [len(places), mesh.faces.size], {"POSITION": 0}
     if mesh.colors is not None:
-        opaque = np.full((len(places), 1), 255, np.uint8)
-        parts.append(np.concatenate([mesh.colors, opaque], axis=1).tobytes())
-        views.append({"target": 34962, "byteStride": 4})
-        accessors.append({"componentType": 5121, "normalized": True, "type": "VEC4"})
+        parts.append(linear_colors(mesh.colors).tobytes())
+        views.append({"target": 34962, "byteStride": 8})
+        accessors.append({"componentType": SHORT, "normalized": True, "type": "VEC4"})
         counts.append(len(places))
         attributes["COLOR_0"] = 2
     starts = np.cumsum([0, *map(len, parts)]).tolist()

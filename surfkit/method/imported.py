@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
+from surfkit.export.axes import AxesOrAuto
+from surfkit.export.models import existing_model, model_file, read_sound, warn_of_no_fit
 from surfkit.method.base import Method, MethodInput, Reconstruction
 from surfkit.primitives.model import SplatModel, primitive_of
+from surfkit.start.axes import read_in_scene
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,10 @@ class SplatImport(Method):
     file: Path | None = None
     """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in the file, as SPZ names them: rdf for right, down, forward, those of a PLY file, which are
+    taken as they are. auto: those that the file or its format names, else those that fit the photographs best."""
+
     def __post_init__(self) -> None:
         if self.file is not None:  # a run may be resumed from another working folder
             object.__setattr__(self, "file", self.file.resolve())
@@ -35,16 +41,16 @@ class SplatImport(Method):
         """See `Method.refuse_unfit`."""
         if given.folder.exists():
             return  # begun: the run has its own copy, or reads the file now
-        path = existing_model(self.file, "method.file")
-        warn_of_no_fit(path, read_local(path, given.scene.frame), given.scene)
+        read_sound(existing_model(self.file, "method.file"))
 
     def reconstruct(self, given: MethodInput) -> Reconstruction:
         """See `Method.reconstruct`."""
         path = existing_model(self.file, "method.file")
-        table = read_local(path, given.scene.frame)
+        table = read_in_scene(path, given.scene, self.axes)
+        warn_of_no_fit(path, table, given.scene)
         primitive = primitive_of(table)
         params = primitive.from_table(table, given.generator)
         return Reconstruction(
             splats=SplatModel(primitive, params, table.sh_degree),
-            facts={"file": str(path), "kind": table.kind, "sh_degree": table.sh_degree},
+            facts={"file": str(path), "kind": table.kind, "sh_degree": table.sh_degree, "axes": table.axes.name},
         )

@@ -108,9 +108,10 @@ def photographs(data: Data, names: Sequence[str]) -> dict[str, Path]:
             BadInput(f"{data.path}: {few(twice)} stand for two photographs each; give photographs names of their own")
         )
     found = find_files(folder, list(dict.fromkeys(names)))
-    if missing := [name for name in names if name not in found]:
-        text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}"
-        reject(BadInput(f"{text}; put them into {data.path / 'images'}, or name their folder with --images"))
+    missing = [name for name in names if name not in found]
+    data.lack(
+        folder, missing, len(names), f"; put them into {data.path / 'images'}, or name their folder with --images"
+    )
     return found
 
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from surfkit.core.check import BadInput, few, reject
+from surfkit.core.check import BadInput, reject
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot, Tracks, load_pycolmap
@@ -49,7 +49,8 @@ class COLMAP(Reader):
             )
         images, xyz, rgb, groups = _model(folder)
         paths = _photographs(data.path, data, [image.name for image in images])
-        shots = [Shot(image.name, image.pose, image.camera, path) for image, path in zip(images, paths, strict=True)]
+        pairs = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
+        shots = [Shot(image.name, image.pose, image.camera, path) for image, path in pairs]
         capture = Capture(shots, xyz, rgb, groups=groups, numbered=True)
         placed = _placed(data.path, folder)
         return capture if placed is None else on_the_map(capture, placed)
@@ -184,6 +185,8 @@ def _reconstruction(folder: Path) -> Any:
         model = pycolmap.Reconstruction(str(folder))
         for image in model.images.values():
             image.name  # noqa: B018 (is decoded here)
+        if not binary:
+            _name_whole(folder / "images.txt", model)
     except UnicodeDecodeError as error:
         raise BadInput(
             f"{folder}: the name of an image is not UTF-8 ({error.object!r}); rename the photograph, also in the model"
@@ -200,6 +203,25 @@ def _reconstruction(folder: Path) -> Any:
     if binary and (folder / "cameras.bin").stat().st_size < 8 + cameras:
         raise cut_off(folder / "cameras.bin")
     return model
+
+
+def _name_whole(path: Path, model: Any) -> None:
+    """Give images their names with blanks: pycolmap ends names in text files at the first blank.
+
+    A line is IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; the next one has observations, and may be empty.
+    """
+    with path.open(encoding="utf-8", newline="\n") as file:
+        lines = iter(file)
+        for line in lines:
+            words = line.split(None, 9)
+            if not words or words[0].startswith("#"):
+                continue
+            next(lines, None)
+            number = int(words[0])
+            if len(words) == 10 and number in model.images:
+                name = words[9].rstrip("\r\n").rstrip()
+                if model.images[number].name != name:
+                    model.image(number).name = name
 
 
 def _shots(folder: Path, model: Any) -> list[Image]:
@@ -219,8 +241,8 @@ def _shots(folder: Path, model: Any) -> list[Image]:
     return shots
 
 
-def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:
-    """File of every photograph; where one that is missing should be."""
+def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path | None]:
+    """File of every photograph; where one that is missing should be, or None if it is to be skipped."""
     folder = root / (data.images or "images")
     if not folder.is_dir():
         other = next((path.name for path in sorted(root.glob("images_*")) if path.is_dir()), None)
@@ -230,7 +252,9 @@ def _photographs(root: Path, data: Data, names: Sequence[str]) -> list[Path]:
         return [folder / name for name in names]
     found = find_files(folder, names)
     if missing := [name for name in names if name not in found]:
-        there = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]
-        text = f"{folder}: {len(missing)} of {len(names)} photographs of the model are missing: {few(missing)}"
-        reject(BadInput(f"{text}{nearest(missing[0], there) or '; put them there, or delete them from the model'}"))
-    return [found.get(name, folder / name) for name in names]
+        used = set(found.values())
+        spare = [path for path in sorted(folder.rglob("*")) if path.is_file() and path not in used]
+        near = nearest(missing[0], [path.relative_to(folder).as_posix() for path in spare])
+        data.lack(folder, missing, len(names), near or "; put them there, or delete them from the model")
+    lost = None if data.missing == "skip" and found else folder
+    return [found.get(name, lost and lost / name) for name in names]

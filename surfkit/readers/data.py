@@ -6,11 +6,12 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, few, reject
+from surfkit.core.events import Warned, emit
 from surfkit.core.registry import choice, name_of
 from surfkit.readers.capture import Capture
 from surfkit.readers.depth_layout import DepthLayout
@@ -43,6 +44,9 @@ class Reading:
 
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
+
+    missing: Literal["refuse", "skip"] = "refuse"
+    """What to do where photographs of the model are not there: refuse the data set, or skip them and use the others."""
 
     masks: Path | None = None
     """Folder of the masks, if it is not called masks; relative to the data set. Black pixels are ignored."""
@@ -88,6 +92,24 @@ class Reading:
             raise BadInput(f"--metres-per-unit {self.metres_per_unit:g}: it must be more than 0")
         if self.test_every is not None and self.test_every < 0:
             raise BadInput(f"--test-every {self.test_every}: it must be 0 (hold out none) or more")
+
+    def lack(self, folder: Path, missing: Sequence[str], count: int, remedy: str = "") -> None:
+        """Tell of photographs that are missing, where they are skipped; else, or if it is all of them, reject them.
+
+        Args:
+            folder: Where they should be.
+            missing: Their names; none is fine.
+            count: Of all photographs of the model.
+            remedy: What to do instead of skipping them, to follow the names.
+        """
+        if not missing:
+            return
+        text = f"{folder}: {len(missing)} of {count} photographs are missing"
+        if self.missing == "skip" and len(missing) < count:
+            emit(Warned(f"{text} and are skipped: {few(missing)}"))
+        else:
+            skip = "; --missing skip uses the others" if len(missing) < count else ""
+            reject(BadInput(f"{text}: {few(missing)}{remedy}{skip}"))
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height to use, for a photograph of `width` x `height` pixels; never larger than it is."""

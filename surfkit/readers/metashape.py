@@ -45,7 +45,8 @@ class Metashape(Reader):
         path = one_file(data.path, _files(data.path), "XML file of Metashape's cameras; export them as Agisoft XML")
         chunk = _chunk(path)
         cameras = _cameras(path, chunk)
-        found = photographs(data, [camera.get("label", "") for camera in cameras])
+        names = _names(chunk, cameras)
+        found = photographs(data, names)
         sensors = {sensor.get("id"): sensor for sensor in chunk.findall("sensors/sensor")}
         lenses, known = Lenses(path), {}
         for number in dict.fromkeys(camera.get("sensor_id") for camera in cameras):
@@ -54,12 +55,12 @@ class Metashape(Reader):
                 known[number] = lenses.camera(where, _lens(where, sensors.get(number)))
         lenses.tell()
         shots = []
-        for camera in cameras:
-            label, number = camera.get("label", ""), camera.get("sensor_id")
-            if label in found and number in known:
+        for camera, name in zip(cameras, names, strict=True):
+            number = camera.get("sensor_id")
+            if name in found and number in known:
                 with leaving_out():
-                    pose = _pose(f"{path}: camera {label!r}", camera)
-                    shots.append(Shot(label, pose, known[number], found[label]))
+                    pose = _pose(f"{path}: camera {name!r}", camera)
+                    shots.append(Shot(name, pose, known[number], found[name]))
         return _placed(path, chunk, cameras[0].get("component_id"), Capture(shots, *points(data.path, {})))
 
 
@@ -115,6 +116,22 @@ def _cameras(path: Path, chunk: ElementTree.Element) -> list[ElementTree.Element
     largest = Counter(camera.get("component_id") for camera in posed).most_common(1)[0][0]
     why = "are in another component, not aligned with the largest"
     return keep(posed, lambda camera: camera.get("component_id") == largest, why)
+
+
+def _names(chunk: ElementTree.Element, cameras: list[ElementTree.Element]) -> list[str]:
+    """Names of the photographs of cameras: their labels; where several share one, with the label of their group before
+    it, which is that of the folder that they were added from."""
+    groups = {
+        camera: group.get("label", "")
+        for group in chunk.findall("cameras//group")
+        for camera in group.findall("camera")
+    }
+    labels = [camera.get("label", "") for camera in cameras]
+    count = Counter(labels)
+    return [
+        f"{groups[camera]}/{label}" if count[label] > 1 and groups.get(camera) else label
+        for camera, label in zip(cameras, labels, strict=True)
+    ]
 
 
 def _pose(where: str, camera: ElementTree.Element) -> np.ndarray:

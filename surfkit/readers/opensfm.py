@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput, few, leaving_out, reject
+from surfkit.core.check import BadInput, leaving_out
 from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
@@ -26,15 +26,22 @@ PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.jso
 second, by an affine map that no pose can follow: cameras and points no longer fit. So the topocentric one is moved."""
 TRACKS = "tracks.csv"
 """Beside the reconstruction: which photograph shows which point where."""
+WHOLE, FISHEYE = "FULL_OPENCV", "OPENCV_FISHEYE"
 LENSES = {
     "perspective": ("RADIAL", ("k1", "k2")),
     "simple_radial": ("SIMPLE_RADIAL", ("k1",)),
     "radial": ("RADIAL", ("k1", "k2")),
-    "brown": ("FULL_OPENCV", ("k1", "k2", "p1", "p2", "k3", "", "", "")),
+    "brown": (WHOLE, ("k1", "k2", "p1", "p2", "k3", "", "", "")),
     "fisheye": ("RADIAL_FISHEYE", ("k1", "k2")),
-    "fisheye_opencv": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
+    "fisheye_opencv": (FISHEYE, ("k1", "k2", "k3", "k4")),
 }
 """COLMAP's name of each projection, and the coefficients that it takes."""
+STRETCHED = {
+    "RADIAL": (WHOLE, ("k1", "k2", *[""] * 6)),
+    "SIMPLE_RADIAL": (WHOLE, ("k1", *[""] * 7)),
+    "RADIAL_FISHEYE": (FISHEYE, ("k1", "k2", "", "")),
+}
+"""The same for those of one focal length, where a camera has two."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +67,8 @@ def _read(data: Data) -> tuple[Capture, dict[str, int], Path]:
     names = sorted(model["shots"])
     folder = data.path / (data.images or "images")
     found = find_files(folder, names)
-    if missing := [name for name in names if name not in found]:
-        text = f"{folder}: {len(missing)} of {len(names)} photographs are missing: {few(missing)}; put them there"
-        reject(BadInput(text))
+    data.lack(folder, [name for name in names if name not in found], len(names), "; put them there")
+    names = [name for name in names if name in found or data.missing == "refuse"]
     try:
         cameras = {name: _camera(f"{path}: camera {name!r}", lens) for name, lens in model["cameras"].items()}
         shots = []
@@ -149,11 +155,11 @@ def _camera(where: str, lens: Mapping[str, Any]) -> Any:
     longer = max(width, height)
     focal = [float(lens[f"focal_{axis}"] if f"focal_{axis}" in lens else lens["focal"]) * longer for axis in "xy"]
     centre = [float(lens.get("c_x", 0)) * longer + width / 2, float(lens.get("c_y", 0)) * longer + height / 2]
-    extra = [float(lens.get(name, 0)) for name in names]
-    if model not in ("FULL_OPENCV", "OPENCV_FISHEYE"):  # of one focal length
-        if abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
-            raise BadInput(f"{where}: projection {kind} with two focal lengths; convert the camera to brown")
+    if model in STRETCHED and abs(focal[0] - focal[1]) > 1e-6 * abs(focal[0]):
+        model, names = STRETCHED[model]
+    elif model in STRETCHED:
         focal = focal[:1]
+    extra = [float(lens.get(name, 0)) for name in names]
     return camera_of(where, model, (width, height), [*focal, *centre, *extra])
 
 

@@ -41,6 +41,8 @@ from surfkit.run.store import StageStore
 
 FORMS = {"md": markdown, "tex": latex, "csv": comma_separated}
 """What a table is written as beside JSON, by the ending of the file."""
+SINCE: dict[str, Any] = {"missing": "refuse", "alpha": None}
+"""Settings of data sets that older versions had not, and what they do by default: rows of these versions are found."""
 NO_MAPS = "there was no depth map to learn from, so the run is that of a row without"
 """Why a row has no figures although it was run."""
 STORE = "stages"
@@ -274,9 +276,10 @@ def fingerprint(recipe: Recipe, data: Data, code: Mapping[str, str]) -> str:
         data: What it was done with.
         code: Versions of the packages that did it: surfkit, and the plugins whose parts are in the recipe.
     """
+    since = {name for name, usual in SINCE.items() if getattr(data, name) == usual}
     parts = {
         "recipe": {name: it for name, it in dump(replace(recipe, about="")).items() if name != "test_every"},
-        "data": dump(replace(data, path=data.path.resolve())),
+        "data": {name: it for name, it in dump(replace(data, path=data.path.resolve())).items() if name not in since},
         "versions": dict(code),
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:12]

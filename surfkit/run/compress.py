@@ -99,6 +99,22 @@ def compress_run(
     return dump(record)
 
 
+def size_with(ctx: RunContext, made: Reconstruction, compressor: Compressor) -> int | None:
+    """About how many bytes the model of a run would take with another compressor; None where that cannot take it.
+
+    It is written into a temporary folder. Which points matter to the photographs is not looked at, as the size hardly
+    depends on it.
+    """
+    model, seed = on_cpu(splats_of(ctx.run, made)), ctx.run.recipe.seed
+    importance = torch.rand(len(model), generator=torch.Generator().manual_seed(seed))
+    write = writing(model, importance, ctx.scene.frame, seed, ctx.rasterizer.where())
+    with TemporaryDirectory() as folder:
+        try:
+            return write(Path(folder) / "other.surfkit", compressor)
+        except BadInput:
+            return None
+
+
 def forget_compressed(run: Run) -> None:
     """Delete what says of an earlier file how it was made, and what was measured and made of it."""
     for path in (run.compressed_record, *(run.compressed / name for name in ("metrics.json", "mesh.json"))):

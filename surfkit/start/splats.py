@@ -10,12 +10,13 @@ import torch
 
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
-from surfkit.export.files import read_splat_file
-from surfkit.export.models import existing_model, model_file, read_local, warn_of_no_fit
+from surfkit.export.axes import AxesOrAuto
+from surfkit.export.models import existing_model, model_file, read_sound, warn_of_no_fit
 from surfkit.export.table import THIN, SplatTable
 from surfkit.primitives.base import Primitive
 from surfkit.primitives.raw import cloud_of
 from surfkit.scene.scene import Cloud, Scene
+from surfkit.start.axes import read_in_scene
 from surfkit.start.base import InitialModel, Start, StartInput
 
 
@@ -29,6 +30,10 @@ class SplatStart(Start):
     file: Path | None = None
     """File of splats, or the folder of a finished run, whose point_cloud.ply is read."""
 
+    axes: AxesOrAuto = "auto"
+    """Axes of the numbers in the file, as SPZ names them: rdf for right, down, forward, those of a PLY file, which are
+    taken as they are. auto: those that the file or its format names, else those that fit the photographs best."""
+
     def __post_init__(self) -> None:
         if self.file is not None:  # a run may be resumed from another working folder
             object.__setattr__(self, "file", self.file.resolve())
@@ -40,9 +45,8 @@ class SplatStart(Start):
     def refuse_unfit(self, primitive: Primitive, scene: Scene) -> None:
         """See `Start.refuse_unfit`."""
         path = existing_model(self.file, "start.file")
-        table = read_local(path, scene.frame)
+        table = read_sound(path)
         params = primitive.from_table(table.take(slice(0, 1)), torch.Generator().manual_seed(0))
-        warn_of_no_fit(path, table, scene)
         splats = primitive.activate(params, 0)
         what, name = f"{path}: its {table.kind}s", f"primitive:{name_of(primitive)}"
         flatter = table.log_scales.shape[1] == 3 and params["scales"].shape[1] == 2
@@ -63,6 +67,7 @@ class SplatStart(Start):
     def model(self, primitive: Primitive, known: StartInput, generator: torch.Generator) -> InitialModel:
         """See `Start.model`."""
         table = self._table(known.scene)
+        warn_of_no_fit(existing_model(self.file, "start.file"), table, known.scene)
         return InitialModel(primitive.from_table(table, generator), min(table.sh_degree, primitive.sh_degree))
 
     def cloud(self, known: StartInput) -> Cloud:
@@ -76,11 +81,11 @@ class SplatStart(Start):
 
     def expected(self, sparse: int, pixels: int) -> int:
         """See `Start.expected`."""
-        return len(read_splat_file(existing_model(self.file, "start.file")))
+        return len(read_sound(existing_model(self.file, "start.file")))
 
     def _table(self, scene: Scene) -> SplatTable:
         path = existing_model(self.file, "start.file")
-        return read_local(path, scene.frame)
+        return read_in_scene(path, scene, self.axes, "--start.axes")
 
 
 def is_thin(table: SplatTable) -> bool:

@@ -14,6 +14,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.texture.candidates import NONE
 from surfkit.texture.charts import PATCH, Atlas, Page
+from surfkit.texture.exposure import exposed, levelled
 from surfkit.texture.level import Levels
 from surfkit.texture.photographs import Photographs, by_photograph
 
@@ -90,7 +91,7 @@ def _colors(
     mine = owner.reshape(-1)[texel]
     x, y = (np.stack([column, row], axis=1) - what.atlas.move[what.atlas.chart[faces[mine]]]).T
     x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
-    shown = picture[:, y, x].T * (what.gains[number] / 255)
+    shown = exposed(picture[:, y, x].T / 255, what.gains[number])
     a, b, c = corners[mine].transpose(1, 0, 2).astype(np.float64)
     p, ahead, across = np.stack([column + 0.5, row + 0.5], axis=1) - a, b - a, c - a
     area = ahead[:, 0] * across[:, 1] - across[:, 0] * ahead[:, 1]
@@ -100,8 +101,7 @@ def _colors(
     shares = np.stack([1 - second - third, second, third], axis=1)
     shares = np.where(np.isfinite(shares).all(1, keepdims=True), shares, 1 / 3).clip(0, 1)
     value = what.levels.value[what.levels.corner[faces[mine]]]
-    shown += (value * shares[:, :, None]).sum(1) / shares.sum(1, keepdims=True)
-    return np.rint(shown * 255).clip(0, 255).astype(np.uint8)
+    return levelled(shown, (value * shares[:, :, None]).sum(1) / shares.sum(1, keepdims=True))
 
 
 def _patch(what: Paint, image: np.ndarray, owner: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> None:

@@ -15,6 +15,7 @@ from scipy.sparse.linalg import cg
 
 from surfkit.core.events import Progress, emit
 from surfkit.texture.candidates import NONE
+from surfkit.texture.exposure import exposed
 from surfkit.texture.photographs import Photographs, by_photograph
 from surfkit.texture.topology import NONE as NO_FACE
 
@@ -22,9 +23,9 @@ SAMPLES = 5
 """Along each edge of a seam."""
 SMOOTH = 0.3
 """Weight of the change along an edge within a part, to that of the difference at a seam."""
-SMALL = 0.01
+SMALL = 0.003
 """Weight of the values themselves: far from seams they go back to 0."""
-STEP = 0.05
+STEP = 0.1
 """Difference at a seam from which it counts little: light does not make it, but photographs that do not fit."""
 MOST = 0.25
 """Largest value that is added."""
@@ -96,7 +97,7 @@ def _seam_colors(
         for share in (np.arange(SAMPLES) + 0.5) / SAMPLES:
             x, y = np.floor(begin + share * (end - begin)).T.astype(np.int64)
             x, y = x.clip(0, picture.shape[2] - 1), y.clip(0, picture.shape[1] - 1)
-            shown = picture[:, y, x].T / 255 * gains[number]
+            shown = exposed(picture[:, y, x].T / 255, gains[number])
             for at, weight in ((corner[f, e], 1 - share), (corner[f, (e + 1) % 3], share)):
                 np.add.at(sums, at, weight * shown)
                 np.add.at(weights, at, weight)

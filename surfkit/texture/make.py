@@ -26,10 +26,11 @@ from surfkit.mesh.simplify import require_simplification, simplify_to
 from surfkit.scene.crop import Axis
 from surfkit.scene.lengths import Length, unit_of
 from surfkit.scene.scene import Frame, View
-from surfkit.texture.candidates import NONE, Candidates, exposure_gains
+from surfkit.texture.candidates import NONE, Candidates
 from surfkit.texture.charts import FULL, Atlas, make_atlas, texels_of
 from surfkit.texture.choose import choose_views
 from surfkit.texture.deliver import NAME, TILES, Delivery, Textured, deliver
+from surfkit.texture.exposure import exposure_gains
 from surfkit.texture.fill import Paint, Pictures
 from surfkit.texture.keep import Arrays, Kept, identity, seen
 from surfkit.texture.level import Levels, level
@@ -345,7 +346,8 @@ def look_at_all(
             saved = time.perf_counter()
             spent = saved - now
         emit(Progress("looking at photographs", number + 1, count))
-    gains = exposure_gains(found, count)
+    gains = exposure_gains(found.view, found.color, count)
+    found.shun_clipped()
     return found, gains, found.refuse_outliers(gains)
 
 

@@ -7,24 +7,20 @@ import struct
 
 import numpy as np
 
+from surfkit.export.glb import FLOAT, SHORT, VERTICES, linear_colors
 from surfkit.mesh.base import Mesh
 
-VERTICES, CORNERS = 34962, 34963
-FLOAT, SHORT, INT = 5126, 5123, 5125
+CORNERS = 34963
+INT = 5125
 """Numbers of glTF: targets of buffers, and types of values."""
 UNLIT = "KHR_materials_unlit"
 
 
 def unlit_glb(mesh: Mesh) -> bytes:
-    """A mesh with colours; they are photographs' and have their light in them.
-
-    glTF has linear colours, and 8 bits of these would be too few for dark ones.
-    """
+    """A mesh with colours; they are photographs' and have their light in them."""
     assert mesh.colors is not None
     places = np.ascontiguousarray(mesh.vertices, "<f4")
-    colors = np.full((len(places), 4), 65535, "<u2")
-    colors[:, :3] = np.round(65535 * linear(np.arange(256) / 255))[mesh.colors]
-    parts = [places.tobytes(), colors.tobytes(), np.ascontiguousarray(mesh.faces, "<u4").tobytes()]
+    parts = [places.tobytes(), linear_colors(mesh.colors).tobytes(), np.ascontiguousarray(mesh.faces, "<u4").tobytes()]
     starts = np.cumsum([0, *map(len, parts)]).tolist()
     views = [{"target": VERTICES}, {"target": VERTICES}, {"target": CORNERS}]
     accessors = [
@@ -55,8 +51,3 @@ def unlit_glb(mesh: Mesh) -> bytes:
     return b"".join(
         [head, struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", starts[-1], b"BIN\0"), *parts]
     )
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -13,7 +13,11 @@ from surfkit.core.events import Warned, emit
 from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.place import Place, place_of, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.export.bits import from_linear
 
+SRGB_WRITERS = ("surfkit ", "https://github.com/mikedh/trimesh")
+"""How `asset.generator` begins in files of programs that write bytes of sRGB to COLOR_0, as surfkit once did."""
+BYTE = 5121
 MESHES = (".glb", ".gltf", ".obj", ".off", ".stl")
 
 
@@ -52,13 +56,18 @@ def other_mesh(path: Path) -> tuple[Surface, np.ndarray | None, Place, Textured 
     """A mesh that is no PLY file, in the frame of the input, with the (V, 3) uint8 colours of its vertices."""
     surface = read_surface(path)  # which says what is wrong with a file, before it is looked at more closely
     root = root_of(path)
-    place, colors = place_of(path, root), vertex_colors(path)
+    place, colors = place_of(path, root), vertex_colors(path, root)
     colors = colors if colors is not None and len(colors) == len(surface) else None
     return surface, colors, place, textured(path, root)
 
 
-def vertex_colors(path: Path) -> np.ndarray | None:
-    """(V, 3) uint8 of a file with one mesh that trimesh reads; None where it has none, or several parts."""
+def vertex_colors(path: Path, root: dict[str, Any]) -> np.ndarray | None:
+    """(V, 3) uint8 of a file with one mesh that trimesh reads; None where it has none, or several parts.
+
+    Args:
+        path: Of the file.
+        root: JSON of a GLB file, whose colours are linear; empty for others.
+    """
     with needed("trimesh", f"{path}: a file that is not binary PLY"):
         import trimesh
     found: Any = trimesh.load(path, process=False)
@@ -73,17 +82,33 @@ def vertex_colors(path: Path) -> np.ndarray | None:
         emit(Warned(f"{path}: the mesh is shown without its picture: {missing[0]!r} is not beside it"))
         return None
     if visual.kind == "vertex":
-        return np.asarray(visual.vertex_colors)[:, :3]
+        return _on_screen(np.asarray(visual.vertex_colors), root)
     if visual.kind != "texture":
         return None
     if "color" in visual.vertex_attributes:  # of a GLB with a material
-        colors = np.asarray(visual.vertex_attributes["color"])[:, :3]
-        whole = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
-        return np.round(colors / whole * 255).astype(np.uint8)
+        return _on_screen(np.asarray(visual.vertex_attributes["color"]), root)
     if visual.uv is None:
         return None
     picture = getattr(visual.material, "image", getattr(visual.material, "baseColorTexture", None))
     return None if picture is None else np.asarray(visual.to_color().vertex_colors)[:, :3]
+
+
+def _on_screen(colors: np.ndarray, root: dict[str, Any]) -> np.ndarray:
+    """(V, 3) uint8 sRGB of the colours of a file, (V, 3) or (V, 4) whole numbers or floats."""
+    colors = colors[:, :3] / (np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1)
+    if root and not _has_srgb_bytes(root):
+        colors = from_linear(colors)
+    return np.round(255 * colors.clip(0, 1)).astype(np.uint8)
+
+
+def _has_srgb_bytes(root: dict[str, Any]) -> bool:
+    """Whether a GLB file is of a program that writes bytes of sRGB where glTF has linear colours."""
+    try:
+        colors = root["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
+        is_bytes = root["accessors"][colors]["componentType"] == BYTE
+        return is_bytes and str(root["asset"].get("generator")).startswith(SRGB_WRITERS)
+    except (AttributeError, LookupError, TypeError):
+        return False
 
 
 def missing_pictures(path: Path) -> list[str]:

@@ -16,6 +16,7 @@ from surfkit.core.events import Warned, emit
 from surfkit.evaluate.geometry.las import CLOUDS, read_las
 from surfkit.evaluate.geometry.place import Y_UP, Z_UP, notes_in, own_notes, root_of
 from surfkit.evaluate.geometry.surface import Surface, read_surface
+from surfkit.export.axes import AxesOrAuto
 from surfkit.export.files import read_splat_file
 from surfkit.export.gltf_reader import UPS
 from surfkit.export.models import refuse_unsound
@@ -99,23 +100,26 @@ class Subject:
 
 
 @contextmanager
-def opened_subject(path: Path, device: Device) -> Iterator[Subject]:
+def opened_subject(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Iterator[Subject]:
     """Within, what a run folder or a file holds.
 
     Args:
         path: Folder of a finished run, or a file of splats, of a mesh or of points.
         device: That draws.
+        axes: Of the numbers in a file of splats.
 
     Raises:
         BadInput: It is neither, damaged, or there is nothing in it to look at.
     """
-    if path.is_dir() and not (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
+    if path.is_dir() and (path / "meta.json").exists():  # that is a folder of splats, unpacked SOG
+        path /= "meta.json"
+    if path.is_dir():
         with loaded(path, device, read_data=read_noting_changes) as (ctx, made):
             yield of_run(ctx, made)
         return
     if not path.exists():
         raise BadInput(f"{path}: there is no such run or file")
-    yield of_file(path, device)
+    yield of_file(path, device, axes)
 
 
 def of_run(ctx: RunContext, made: Reconstruction) -> Subject:
@@ -160,7 +164,7 @@ def textured_mesh(out: Path) -> Textured | None:
         return None
 
 
-def of_file(path: Path, device: Device) -> Subject:
+def of_file(path: Path, device: Device, axes: AxesOrAuto = "auto") -> Subject:
     """What a file holds."""
     if path.suffix.lower() in CLOUDS:
         xyz, rgb, notes = read_las(path, MOST_POINTS)
@@ -168,7 +172,7 @@ def of_file(path: Path, device: Device) -> Subject:
         frame = frame_of(xyz, notes)
         return Subject(path, frame, Z_UP, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
     if holds_splats(path):
-        return of_splats(path, device)
+        return of_splats(path, device, axes)
     pictures, up = None, Z_UP
     if path.suffix.lower() in MESHES:
         surface, colors, place, pictures = other_mesh(path)
@@ -187,9 +191,9 @@ def of_file(path: Path, device: Device) -> Subject:
     return Subject(path, frame, up, points=Points(frame.to_local(xyz).astype(np.float32), rgb))
 
 
-def of_splats(path: Path, device: Device) -> Subject:
+def of_splats(path: Path, device: Device, axes: AxesOrAuto) -> Subject:
     """What a file of splats holds."""
-    table = read_splat_file(path)
+    table = read_splat_file(path, axes)
     if not len(table):
         raise BadInput(f"{path}: there are no splats in it; write it again, or name another file")
     refuse_unsound(path, table)
@@ -203,25 +207,23 @@ def of_splats(path: Path, device: Device) -> Subject:
 
 
 def splats_place(path: Path) -> tuple[dict[str, str], np.ndarray]:
-    """What a file of splats says of its coordinates, and its (3,) up: z on a map, y in glTF, else -y.
+    """What a file of splats says of its coordinates, and its (3,) up: z on a map, what a GLB of surfkit says, else -y.
 
-    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it.
+    The last is what programs that show splats take for up, as the cameras of COLMAP mostly have it, and what the y of
+    glTF and of SPZ becomes.
     """
     notes = coordinates_of(path)
     if "crs" in notes:
         return notes, Z_UP
-    root = root_of(path)
-    if not root:
+    told = own_notes(root_of(path))
+    if not told:
         return notes, -Y_UP
-    told = own_notes(root) or {}
     unit = {"metres per unit": told.get("metres_per_unit"), "crs": told.get("crs")}
-    return {name: str(value) for name, value in unit.items() if value}, UPS[told.get("up", "y")].T @ Y_UP
+    return {name: str(value) for name, value in unit.items() if value}, UPS[told["up"]].T @ Y_UP
 
 
 def holds_splats(path: Path) -> bool:
     """Whether a file is one of splats: what is neither a mesh nor a cloud is left to the readers of splats."""
-    if path.is_dir():
-        return True
     head = head_of(path)
     if head.startswith(b"ply"):
         return b"\nelement chunk " in head or b" f_dc_0" in head
@@ -239,8 +241,6 @@ def head_of(path: Path) -> bytes:
 
 def coordinates_of(path: Path) -> dict[str, str]:
     """What the header of a PLY file says of its coordinates, by name."""
-    if path.is_dir():
-        return {}
     text = head_of(path).decode("ascii", "replace")
     return notes_in(text) if text[:3] == "ply" else {}
 

@@ -48,7 +48,7 @@ def test_a_driver_that_goes_while_no_step_is_made(block, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setenv(DRIVER, str(os.getppid()))
     with pytest.raises(KeyboardInterrupt), heartbeats(block):
-        monkeypatch.setattr(os, "getppid", lambda: 1)
+        monkeypatch.setattr(os, "getppid", lambda: -1)
         while True:
             time.sleep(3600)
     assert signal.getsignal(signal.SIGTERM) == before

@@ -78,7 +78,7 @@ def test_help(capsys):
     assert main(["ablate", "--help"]) == 0
     out = capsys.readouterr().out
     for name, table in TABLES.items():
-        assert re.search(rf"table:{name} +{' '.join(table.about.split()[:3])}", out)
+        assert re.search(rf"table:{name}[ │\n]+{' '.join(table.about.split()[:3])}", out)
     for flag in ("--data", "--steps", "--seeds", "--rows", "--scale", "--longest", "--test-every", "--images", "--out"):
         assert flag in out
 

@@ -50,6 +50,24 @@ def test_a_format_lands_beside_the_file(ply, capsys):
     assert type(format_of(ply.with_name("scene.sog"))).__name__ == "SOG"
 
 
+def test_axes_that_are_given(ply, tmp_path, capsys):
+    SPZ(axes="same").write(tmp_path / "a.spz", read_splat_file(ply))
+    status, _, errors = said(capsys, tmp_path / "a.spz", "--out", tmp_path / "turned.ply")
+    assert status == 0 and len(errors) == 1 and "rub (right-up-back) is assumed; --axes rdf" in errors[0]
+    status, _, errors = said(capsys, tmp_path / "a.spz", "--axes", "rdf", "--out", tmp_path / "same.ply")
+    assert (status, errors) == (0, [])
+    same, turned = read_splats(tmp_path / "same.ply").means, read_splats(tmp_path / "turned.ply").means
+    assert torch.equal(same, turned * torch.tensor([1, -1, -1]))
+    assert torch.cdist(read_splats(ply).means, same).min(1).values.max() < 2e-3
+
+
+def test_a_page_of_a_file(ply, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    status, lines, errors = said(capsys, ply, "--out", out, "--format.max-splats", "30")
+    assert status == 0 and lines[0].startswith(f"wrote 30 splats to {out} (page, 0.0") and len(lines) == 1
+    assert len(errors) == 1 and "the 30 of 40 splats are kept of which most is seen" in errors[0]
+
+
 def test_two_scales_are_for_ply_alone(ply, tmp_path, capsys):
     assert said(capsys, ply, "--strict-2dgs", "--out", tmp_path / "two.ply")[0] == 0
     assert b"scale_2" not in (tmp_path / "two.ply").read_bytes()
@@ -89,6 +107,9 @@ def test_survey_coordinates_keep_their_digits(tmp_path, capsys):
         ("{here}/scene.ply --out {here}/folder.spz", "a folder; name a file"),
         ("{here}/scene.ply --format spz --geoid 40", "--geoid: files of the format spz keep heights as they are"),
         ("{here}/scene.ply --format tiles3d --geoid 40", "--geoid 40: the data set has no coordinate reference system"),
+        ("{here} --axes rub --out {here}/a.spz", "is a run, whose axes are known; leave it out"),
+        ("{here}/scene.ply --axes rux --out {here}/a.spz", "--axes"),
+        ("{here}/scene.ply --out {here}/a.html --format.max-splats 0", "max_splats is 0"),
     ],
 )
 def test_mistakes_are_one_line(ply, tmp_path, capsys, words, message):
@@ -108,7 +129,7 @@ def test_tiles_on_earth_leave_out_nothing(ply, tmp_path, capsys, monkeypatch):
 
     @contextmanager
     def opened(self):
-        yield near, frame, one_tile(near)
+        yield near, frame, one_tile(near), None
 
     monkeypatch.setattr(Export, "_opened", opened)
     status, lines, _ = said(capsys, ply, "format:tiles3d", "--out", tmp_path / "tiles")

@@ -1,6 +1,7 @@
 """`surfkit import`: a file becomes a run folder on which the other commands work."""
 
 import json
+import re
 import shutil
 
 import pytest
@@ -9,6 +10,8 @@ from models import data_set, like_3dgs
 
 from surfkit.cli import main
 from surfkit.export.ply import read_splats, write_splats
+from surfkit.export.spz import SPZ
+from surfkit.pipeline import loaded
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 
@@ -47,6 +50,7 @@ def test_a_file_becomes_a_run_folder(given, here, capsys):
     assert json.loads((out / "recipe.json").read_text())["method"] == {
         "use": "import",
         "file": str(here / "splats.ply"),
+        "axes": "auto",
     }
     (here / "splats.ply").unlink()
     for words in (
@@ -57,12 +61,28 @@ def test_a_file_becomes_a_run_folder(given, here, capsys):
     ):
         assert main([str(word) for word in words]) == 0, words
     torch.testing.assert_close(read_splats(here / "again.ply").means, read_splats(path).means, rtol=1e-5, atol=1e-4)
+    assert main(["export", str(out), "--out", "page.html"]) == 0
+    facts = re.search(r'id="facts">(.*?)</script>', (here / "page.html").read_text()).group(1)
+    with loaded(out, "cpu") as (ctx, _):
+        assert [view["name"] for view in json.loads(facts)["views"]] == [view.name for view in ctx.scene.train]
     assert main(["compress", str(out), "compress:packed"]) == 0
     (compressed,) = out.rglob("*.surfkit")
     words = ["train", "recipe:3dgs", "start:splats", "--start.file", compressed, "--data", data, "--steps", 2]
     words += ["pretrain.densify:none", "--out", "more"]
     assert main([str(word) for word in words]) == 0
     assert json.loads((here / "more" / "metrics.json").read_text())["points"] == 250
+
+
+def test_axes_that_are_given(given, here, capsys):
+    data, path = given
+    SPZ(axes="same").write(here / "a.spz", read_splats(path))
+    for axes, means in (("rdf", read_splats(path).means), ("rub", read_splats(path).means * torch.tensor([1, -1, -1]))):
+        words = ["import", "a.spz", "--data", str(data), "--axes", axes, "mesh:none", "--out", axes]
+        assert main(words) == 0
+        found = read_splats(here / axes / "point_cloud.ply").means
+        assert torch.cdist(means, found).min(1).values.max() < 0.05
+        assert "axes" not in capsys.readouterr().err
+        assert json.loads((here / axes / "metrics.json").read_text())["method"]["axes"] == axes
 
 
 def test_the_recipe_is_the_same(given, here):

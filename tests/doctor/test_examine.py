@@ -181,7 +181,7 @@ def shifted_far(folder):
 FAULTS = {
     "no-model": (lambda f: shutil.rmtree(f / "sparse"), "data-set", "error", "no COLMAP model"),
     "half-model": (lambda f: (f / POINTS).unlink(), "data-set", "error", "the COLMAP model lacks points3D.txt"),
-    "missing": (gone("view_003.png"), "data-set", "error", "1 of 16 photographs of the model are missing: 'view_003"),
+    "missing": (gone("view_003.png"), "data-set", "error", "1 of 16 photographs are missing: 'view_003"),
     "no-images": (lambda f: (f / "images").rename(f / "photos"), "data-set", "error", "no such folder of photographs"),
     "cut": (cut("view_003.png"), "damaged-photographs", "error", "'view_003.png': not a whole picture: image file is"),
     "empty": (cut("view_003.png", 0), "damaged-photographs", "error", "'view_003.png': not a whole picture: cannot"),

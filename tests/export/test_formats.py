@@ -1,7 +1,10 @@
 """Every format there and back, within the bounds that its bits give."""
 
 import math
+import os
 import re
+import shutil
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -224,11 +227,52 @@ def test_infinities_of_other_programs(tmp_path):
 
 
 def test_sog_outside_of_an_archive(tmp_path):
-    import zipfile
+    folder = unpacked_sog(tmp_path)
+    assert same(read_splat_file(folder / "meta.json"), read_splat_file(tmp_path / "a.sog"))
+    (folder / "inner").mkdir()
+    (folder / "quats.webp").rename(folder / "inner" / "kept.webp")
+    (folder / "quats.webp").symlink_to("inner/kept.webp")
+    (tmp_path / "link").symlink_to(folder)
+    for where in (folder, tmp_path / "link"):
+        assert same(read_splat_file(where / "meta.json"), read_splat_file(tmp_path / "a.sog"))
 
-    SOG().write(tmp_path / "a.sog", table(count=30, degree=1))
-    zipfile.ZipFile(tmp_path / "a.sog").extractall(tmp_path / "there")
-    assert same(read_splat_file(tmp_path / "there" / "meta.json"), read_splat_file(tmp_path / "a.sog"))
+
+def unpacked_sog(folder):
+    SOG().write(folder / "a.sog", table(count=30, degree=1))
+    zipfile.ZipFile(folder / "a.sog").extractall(folder / "there")
+    return folder / "there"
+
+
+@pytest.mark.parametrize("name", ["meta.json", "means_l.webp", "shN_labels.webp"])
+def test_members_of_an_unpacked_sog_are_regular_files_of_the_folder_and_bounded(tmp_path, name):
+    folder = unpacked_sog(tmp_path)
+    member, kept = folder / name, tmp_path / "kept"
+    member.rename(kept)
+
+    def refused(text):
+        with pytest.raises(BadInput, match=text) as error:
+            SOG().read(folder / "meta.json")
+        assert str(error.value).count("\n") == 0
+        member.unlink()
+
+    os.mkfifo(member)
+    refused(f"{name} is no regular file")
+    member.symlink_to(kept)
+    refused(f"{name} is a link out of the folder")
+    member.symlink_to("/dev/zero")
+    refused(f"{name} is a link out of the folder")
+    member.symlink_to(name)
+    refused("cannot be read|damaged: Symlink loop")  # by the version of Python
+    shutil.copy(kept, member)
+    os.truncate(member, 1 << 40)  # a hole, which takes no place on disk
+    refused(f"{name} has 1,099,511,627,776 bytes, more than it can be of use")
+
+
+def test_a_pipe_is_no_file_of_splats(tmp_path):
+    for name in ("meta.json", "a.ply"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(BadInput, match="neither a file nor a folder"):
+            read_splat_file(tmp_path / name)
 
 
 def test_versions_of_before_colours_had_bounds(tmp_path):

@@ -242,6 +242,22 @@ def test_files_of_other_programs_are_read_with_their_nodes(tmp_path):
     np.testing.assert_allclose(found.sh_rest, torch.stack([x, z, -y], 1), atol=1e-6)
 
 
+@pytest.mark.parametrize("third", [0.0, 1e-9, 0.5])
+def test_flat_splats_of_other_programs_are_surfels(tmp_path, third):
+    table = splat_table(count=20, degree=0)
+    table.log_scales[:, 2] = np.log(third) if third else -torch.inf
+    found = GLTF().read(glb(tmp_path / "a.glb", *foreign(table)))
+    assert found.kind == ("gaussian" if third == 0.5 else "surfel")
+    np.testing.assert_allclose(found.log_scales[:, :2], table.log_scales[:, :2] + np.log(2), atol=1e-5)
+
+
+def test_flat_splats_in_compressed_files_of_other_programs_are_surfels(tmp_path):
+    GLTF(compress="spz").write(tmp_path / "a.glb", splat_table("surfel", count=30))
+    document, data = parsed(tmp_path / "a.glb")
+    del document["asset"]["extras"]
+    assert GLTF().read(glb(tmp_path / "b.glb", document, data)).kind == "surfel"
+
+
 def test_trimesh_finds_the_same_points(tmp_path):
     trimesh = needs("trimesh")
     table = splat_table(count=300, degree=2)

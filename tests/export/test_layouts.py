@@ -61,10 +61,11 @@ def test_spz(tmp_path, version):
         assert raw[:16] == b"NGSP" + struct.pack("<IIBBBB", version, 2, 1, 12, 0, 0)
         body = raw[16:]
     else:
-        assert raw[:32] == b"NGSP" + struct.pack("<IIBBBBI", 4, 2, 1, 12, 0, 6, 32) + bytes(12)
-        at, body = 32 + 6 * 16, b""
+        assert raw[:32] == b"NGSP" + struct.pack("<IIBBBBI", 4, 2, 1, 12, 2, 6, 44) + bytes(12)
+        assert raw[32:44] == struct.pack("<III", 0xADBE0003, 4, 6), "right-down-forward"
+        at, body = 44 + 6 * 16, b""
         for i in range(6):
-            packed, size = struct.unpack_from("<QQ", raw, 32 + 16 * i)
+            packed, size = struct.unpack_from("<QQ", raw, 44 + 16 * i)
             part = zstandard.ZstdDecompressor().decompress(raw[at : at + packed], max_output_size=size)
             assert len(part) == size
             at, body = at + packed, body + part

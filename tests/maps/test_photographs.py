@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from needs import needs
+from PIL import Image
 from town import BOX, HALF, HIDDEN, YELLOW, town, truth
 
 from surfkit.maps.make import MapSettings, make_maps
@@ -76,3 +77,19 @@ def test_colors_between_pixels_are_linear():
     photo = np.stack([3 * column + 5 * row, column, 100 + row]).astype(np.float64)
     x, y = np.random.default_rng(0).uniform((0.5, 0.5), (7.5, 5.5), (50, 2)).T
     assert np.allclose(between(photo, x, y), np.stack([3 * x + 5 * y, x, 100 + y], 1))
+
+
+@pytest.mark.parametrize("odd", [0.6, 1.5])
+def test_colors_are_those_of_the_median_exposure_and_not_clipped(tmp_path, odd):
+    """A third of the photographs is much darker, or much brighter and clipped, than the others."""
+    exposures = np.where(np.arange(12) % 3 == 1, odd, 1.0)
+    scene = town(tmp_path, exposures=exposures)
+    _, colors, _, places = orthophoto(scene, tmp_path / "maps")
+    inner = (np.abs(places[..., :2]) < HALF - 0.3).all(-1) & (on_roof(places, 0.3) == on_roof(places, -0.3))
+    clear = inner & (np.abs(colors - HIDDEN).max(-1) > 2)
+    true = exact(places)[clear]
+    ratio = (colors[clear] / true)[(true > 60) & (true < 200)]
+    assert abs(np.median(ratio) - 1) < 0.02 and np.percentile(np.abs(ratio - 1), 95) < 0.06
+    photographs = [np.asarray(Image.open(view.path)) for view in scene.views]
+    white = np.mean([(photo >= 250).any(-1).mean() for photo in photographs])
+    assert (colors[clear] >= 250).any(-1).mean() <= white + 0.005

@@ -61,7 +61,7 @@ def test_a_run_that_is_written_and_read_again_draws_the_same(data, trained, tmp_
     torch.testing.assert_close(first.means, second.means, rtol=0, atol=1e-5)
     with loaded(tmp_path / "again", "cpu") as (_, made):
         assert made.splats.primitive == Surfel2D(sh_degree=3)
-        assert made.facts == {"file": str(out / "point_cloud.ply"), "kind": "surfel", "sh_degree": 3}
+        assert made.facts == {"file": str(out / "point_cloud.ply"), "kind": "surfel", "sh_degree": 3, "axes": "rdf"}
 
 
 def test_the_folder_of_a_run_is_its_points(data, trained, tmp_path):

@@ -19,6 +19,7 @@ from surfkit.core.tree import evolve
 from surfkit.depth.plane_sweep import PlaneSweep
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.export.ply import read_splats
+from surfkit.mesh.fusion import TILES
 from surfkit.mesh.stereo import Stereo
 from surfkit.mesh.tsdf import TSDF
 from surfkit.method.stereo import StereoFusion
@@ -355,7 +356,7 @@ def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys, monkeypat
     splats = evolve(Recipe(depth=SWEEP, pretrain=replace(Recipe().pretrain, steps=1), mesh=mesher), "seed", 0)
     run(splats, data, tmp_path / "splats")
     alone = Recipe(depth=SWEEP, method=StereoFusion(mesher=mesher))
-    left = tmp_path / "alone" / "method" / ".tiles-killed"
+    left = tmp_path / "alone" / "method" / TILES.replace("*", "killed")
 
     def killed(self, given):
         left.mkdir(parents=True)

@@ -1,6 +1,7 @@
 """The compressed model of a run: made with other results or by a command, measured, read wherever a model is."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -134,6 +135,30 @@ def test_the_command_makes_it_again(copy, capsys):
     assert "times smaller" in capsys.readouterr().out
     assert main(["compress", str(copy)]) == 0
     assert record_of(copy)["compressor"]["use"] == "vectree", "that of the recipe"
+
+
+def told_size(text):
+    """Compressor and MB of the line about the other one."""
+    (found,) = re.findall(r"With compress:(\w+) it would be about ([\d.]+) MB, ([\d.]+) times (smaller|larger)\.", text)
+    return found
+
+
+def test_without_a_recipe_that_names_one_it_is_packed_and_the_other_is_told(copy, capsys):
+    recipe = json.loads((copy / "recipe.json").read_text())
+    (copy / "recipe.json").write_text(json.dumps(recipe | {"compress": None}))
+    assert main(["compress", str(copy)]) == 0
+    packed, told = record_of(copy), told_size(capsys.readouterr().out)
+    assert packed["compressor"] == {"use": "packed"} | vars(Packed())
+    assert main(["compress", str(copy), "compress:vectree"]) == 0
+    vectree, text = record_of(copy), capsys.readouterr().out
+    assert "it would be" not in text, "who names one knows"
+    assert told[0] == "vectree" and float(told[1]) == pytest.approx(vectree["bytes"] / 1e6, rel=0.1, abs=0.005)
+    assert told[3] == "larger" and float(told[2]) == pytest.approx(vectree["bytes"] / packed["bytes"], rel=0.1)
+    (copy / "recipe.json").write_text(json.dumps(recipe))
+    assert main(["compress", str(copy)]) == 0
+    name, megabytes, _, change = told_size(capsys.readouterr().out)
+    assert (name, change) == ("packed", "smaller")
+    assert float(megabytes) == pytest.approx(packed["bytes"] / 1e6, abs=0.005), "by the same encoding"
 
 
 def test_a_size_and_a_loss_can_be_wished_for(copy):

@@ -147,4 +147,4 @@ def test_rows_of_a_table_hold_out_the_same(folder):
         with_changes(table, row, table.base)
     data = Reading().of(folder)
     assert data.test_every == 8, "also where the recipe of a row is for a surface"
-    assert fingerprint(replace(table.base, test_every=8), data) == fingerprint(table.base, data)
+    assert fingerprint(replace(table.base, test_every=8), data, {}) == fingerprint(table.base, data, {})

@@ -271,7 +271,10 @@ def no_focal(farm):
         (no_images, "images: no such folder of photographs"),
         (no_model, "no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0"),
         (half_a_model, "the COLMAP model lacks points3D.txt"),
-        (missing, "1 of 5 photographs of the model are missing: 'view_003.png'; did you mean '"),
+        (
+            missing,
+            "1 of 5 photographs are missing: 'view_003.png'; put them there, or delete them from the model; --missing",
+        ),
         (other_size, "view_002.png: 40 x 20 px, but its camera 1 has 40 x 30"),
         (turned, "view_002.png: 30 x 40 px (turned by 90 degrees), but"),
         (no_picture, "view_002.png: not a whole picture"),
@@ -349,3 +352,45 @@ def test_simple_pinhole_has_one_focal_length(farm):
     (farm / "sparse/0/cameras.txt").write_text("1 SIMPLE_PINHOLE 40 30 36 21.5 14\n")
     camera = read(Data(farm)).train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (36, 36, 21.5, 14)
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+@pytest.mark.parametrize("gap", [" ", "\t"])
+def test_names_with_blanks_in_text_files(farm, ends, gap):
+    """The name is the rest of the line."""
+    names = {f"view_{at:03d}.png": f"A DJI {at}  map ({at}).png" for at in range(5)}
+    for old, new in names.items():
+        (farm / "images" / old).rename(farm / "images" / new)
+    path = farm / "sparse/0/images.txt"
+    lines = path.read_text().split("\n")
+    for at, line in enumerate(lines):
+        if line.endswith(".png"):
+            *numbers, name = line.split(" ")
+            lines[at] = gap.join([*numbers, names[name]])
+    path.write_bytes(ends.join(lines).encode())
+    scene = read(Data(farm, test_every=0))
+    assert [view.name for view in scene.train] == sorted(names.values())
+    assert all(view.path.is_file() for view in scene.train)
+
+
+def test_missing_photographs_are_skipped_where_that_is_asked_for(farm):
+    whole = read(Data(farm, test_every=0))
+    (farm / "images/view_003.png").unlink()
+    with collect_notes() as kept:
+        scene = read(Data(farm, test_every=0, missing="skip"))
+    assert [view.name for view in scene.train] == [f"view_00{at}.png" for at in (0, 1, 2, 4)]
+    assert any("1 of 5 photographs are missing and are skipped: 'view_003.png'" in note for note in kept.texts)
+    far = scene.frame.input_pose(scene.train[3].camera.world_to_camera)
+    assert np.allclose(far, whole.frame.input_pose(whole.train[4].camera.world_to_camera), atol=1e-6)
+    for path in (farm / "images").iterdir():
+        path.unlink()
+    complaint("5 of 5 photographs are missing", lambda: read(Data(farm, missing="skip")))
+
+
+def test_no_photograph_of_the_model_is_proposed_for_a_missing_one(farm):
+    (farm / "images/view_003.png").unlink()
+    with pytest.raises(BadInput) as caught:
+        read(Data(farm))
+    assert "did you mean" not in str(caught.value)
+    (farm / "images/view_0o3.png").write_bytes((farm / "images/view_001.png").read_bytes())
+    complaint("did you mean 'view_0o3.png'?", lambda: read(Data(farm)))

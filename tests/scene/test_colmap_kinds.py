@@ -119,7 +119,7 @@ def test_a_spelling_that_fits_two_files_is_none(farm):
         (images / side).mkdir()
         shutil.copy(images / "view_002.png", images / side)
     (images / "view_002.png").unlink()
-    with pytest.raises(BadInput, match="1 of 5 photographs of the model are missing: 'view_002.png'"):
+    with pytest.raises(BadInput, match="1 of 5 photographs are missing: 'view_002.png'"):
         read(Data(farm))
 
 

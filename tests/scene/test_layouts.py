@@ -9,7 +9,7 @@ import torch
 
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
-from surfkit.readers.read import RANDOM_POINTS, observations, read, reader_of
+from surfkit.readers.read import RANDOM_POINTS, observations, read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
 from surfkit.testing.synthetic import photograph
@@ -296,6 +296,35 @@ def test_a_list_of_tests_may_have_backslashes(tmp_path, truth):
     (tmp_path / "list.txt").write_text("images\\view_001.png\n")
     scene = read(Data(nerfstudio(tmp_path / "data", truth), test_list=tmp_path / "list.txt"))
     assert [view.name for view in scene.held_out] == ["images/view_001.png"]
+
+
+@pytest.mark.parametrize("kind", ["perspective", "simple_radial", "radial", "brown", "fisheye", "fisheye_opencv"])
+def test_two_focal_lengths_of_opensfm(tmp_path, truth, kind):
+    """OpenSfM's camera models (opensfm/io.py): focal_x and focal_y, shares of the longer side."""
+    path = odm(tmp_path, truth) / "opensfm/reconstruction.json"
+    models, k = json.loads(path.read_text()), 0.02
+    for model in models:
+        for camera in model.get("cameras", {}).values():
+            camera.pop("focal", None)
+            camera.update({"projection_type": kind, "focal_x": 0.9, "focal_y": 0.95, "k1": k})
+    path.write_text(json.dumps(models))
+    data = Data(tmp_path, test_every=0)
+    camera = read_capture(data, reader_of(data)).shots[0].camera
+    at = np.array([0.2, -0.3, 1.0])
+    r = float(np.hypot(*at[:2]))
+    bent = np.arctan(r) * (1 + k * np.arctan(r) ** 2) / r if "fisheye" in kind else 1 + k * r**2
+    longer = max(camera.width, camera.height)
+    centre = np.array(camera.principal_point_x), np.array(camera.principal_point_y)
+    wanted = np.array([0.9, 0.95]) * longer * bent * at[:2] + centre
+    assert np.allclose(np.ravel(camera.img_from_cam(at[None])), wanted, atol=1e-9)
+
+
+def test_a_missing_photograph_of_opendronemap_is_skipped(tmp_path, truth):
+    folder = odm(tmp_path, truth)
+    sorted((folder / "images").iterdir())[1].unlink()
+    with pytest.raises(BadInput, match="1 of 6 photographs are missing: .*--missing skip"):
+        read(Data(folder))
+    assert len(read(Data(folder, test_every=0, missing="skip")).train) == 5
 
 
 def without(*names, **more):

@@ -296,6 +296,41 @@ def test_cameras_of_metashape_that_are_left_out(tmp_path):
         assert any(text in note for note in kept.texts), text
 
 
+def test_groups_of_metashape_name_the_folders_of_equal_labels(tmp_path):
+    """A camera that numbers its photographs anew in each folder."""
+
+    def change(text):
+        text = text.replace('label="IMG 3"', 'label="IMG 1"').replace('label="IMG 4"', 'label="IMG 2"')
+        before, _, after = text.partition("</cameras>")
+        head, *cameras = re.split(r"(?=<camera )", before)
+        groups = {"100MEDIA": cameras[:2], "101MEDIA": cameras[2:4]}
+        told = [f'<group label="{label}" type="folder">{"".join(each)}</group>' for label, each in groups.items()]
+        return "".join([head, *told, *cameras[4:], "</cameras>", after])
+
+    metashape(tmp_path, change=change)
+    files = {path.stem: path for path in (tmp_path / "images").iterdir()}
+    names = ["100MEDIA/IMG 1", "100MEDIA/IMG 2", "101MEDIA/IMG 1", "101MEDIA/IMG 2"]
+    for at, name in enumerate(names, 1):
+        place = tmp_path / "images" / f"{name}{files[f'IMG {at}'].suffix}"
+        place.parent.mkdir(exist_ok=True)
+        files[f"IMG {at}"].rename(place)
+    scene = read(Data(tmp_path, test_every=0))
+    assert [view.name for view in scene.train] == names
+    assert [view.path.parent.name for view in scene.train] == ["100MEDIA", "100MEDIA", "101MEDIA", "101MEDIA"]
+
+
+@pytest.mark.parametrize("program", [metashape, bundler])
+def test_missing_photographs_of_other_programs_are_skipped(tmp_path, program):
+    program(tmp_path)
+    sorted(path for path in tmp_path.rglob("*") if path.suffix.lower() in (".jpg", ".png"))[1].unlink()
+    with pytest.raises(BadInput, match=r"1 of 4 photographs are missing: .*; --missing skip uses the others"):
+        read(Data(tmp_path))
+    with collect_notes() as kept:
+        scene = read(Data(tmp_path, test_every=0, missing="skip"))
+    told = "1 of 4 photographs are missing and are skipped"
+    assert len(scene.train) == 3 and any(told in text for text in kept.texts)
+
+
 def test_terms_that_colmap_has_not(tmp_path):
     metashape(tmp_path, k4=0.02, b2=-0.4, k1=-0.1)
     with collect_notes() as kept:
@@ -344,7 +379,7 @@ def entry(*path, value):
             "camera 'IMG 1': '1 .*, where 16 finite numbers",
         ),
         (partial(metashape, change=words("<transform>", "<transform>9")), "camera 'IMG 1': the pose is not a rotation"),
-        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "'IMG 1' stand for two photographs each"),
+        (partial(metashape, change=words('label="IMG 2"', 'label="IMG 1"')), "IMG 1' stand for two photographs each"),
         (partial(metashape, change=words('label="IMG 2"', 'label="IMG 5"')), "1 of 4 photographs are missing: 'IMG 5'"),
         (partial(metashape, change=lambda t: t.replace("transform", "nothing")), "all 5 photographs have no pose"),
         (partial(metashape, tail="<transform><scale>0</scale></transform>"), "transform of the chunk: its scale is 0"),

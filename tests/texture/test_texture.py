@@ -20,11 +20,12 @@ from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
 from surfkit.scene.scene import Frame
-from surfkit.texture import candidates, make, pieces
+from surfkit.texture import exposure, make, pieces
 from surfkit.texture import level as leveling
-from surfkit.texture.candidates import NONE, Candidates, exposure_gains
+from surfkit.texture.candidates import NONE, Candidates
 from surfkit.texture.charts import make_atlas, packed, texels_of
 from surfkit.texture.choose import choose_views
+from surfkit.texture.exposure import exposure_gains
 from surfkit.texture.fill import paint
 from surfkit.texture.look import look, look_in_numpy, project, sight
 from surfkit.texture.make import Subject, TextureSettings, lay_out, local_mesh, look_at_all, make_texture, textured
@@ -221,9 +222,11 @@ def test_corrections_are_linear_between_vertices(tmp_path):
     x, y = np.floor((atlas.texels(page) * shares[:, :, None]).sum(1)).astype(int).T
     wanted = 255 * (mesh.vertices[mesh.faces[page]][:, :, 0] * shares).sum(1) / 3
     told = (after - before)[y, x]
-    usable = seen[page] & ((after[y, x] > 0) & (after[y, x] < 255)).all(1)
-    assert usable.mean() > 0.8 and wanted[usable].std() > 10
-    assert np.percentile(np.abs(told - wanted[:, None])[usable], 95) < 2.5
+    usable = seen[page, None] & (after[y, x] > 0) & (after[y, x] < 255)
+    usable &= (before[y, x] > 13) & (before[y, x] < 204)  # nearer to black and white, less is added
+    wanted = np.broadcast_to(wanted[:, None], told.shape)
+    assert usable.mean() > 0.6 and wanted[usable].std() > 10
+    assert np.percentile(np.abs(told - wanted)[usable], 95) < 2.5
 
 
 @needs_native
@@ -247,7 +250,7 @@ def test_exposures_are_found_and_seams_levelled(tmp_path):
     scene = town(tmp_path, exposures=exposures)
     mesh, photos = local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8)
     found, gains, _ = look_at_all(mesh, photos, 1000)
-    wanted = 1 / exposures / np.exp(-np.log(exposures).mean())
+    wanted = np.median(exposures) / exposures
     assert np.abs(gains / wanted[:, None] - 1).max() < 0.02
     beyond, edge = neighbours(mesh.faces)
     atlas, _ = lay_out(mesh, scene.views, choose_views(found, beyond, edge), beyond, 1024)
@@ -421,8 +424,8 @@ def test_a_part_of_the_triangles_is_enough_for_gains(tmp_path, monkeypatch):
     exposures = np.random.default_rng(2).uniform(0.75, 1.15, 12)
     scene = town(tmp_path, exposures=exposures, cell=0.25)
     found, gains, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(scene.views, 10**8), 1000)
-    monkeypatch.setattr(candidates, "ENOUGH", len(found.view) // 3)
-    some = exposure_gains(found, 12)
+    monkeypatch.setattr(exposure, "ENOUGH", len(found.view) // 3)
+    some = exposure_gains(found.view, found.color, 12)
     assert not np.array_equal(some, gains) and np.abs(some / gains - 1).max() < 0.02
 
 
@@ -443,7 +446,7 @@ def test_photographs_of_one_level_at_a_time_are_in_memory(tmp_path, monkeypatch)
 def test_gains_of_photographs_that_share_nothing_stay_one():
     found = Candidates(100)
     found.view[:50, 0], found.view[50:, 0], found.color[:] = 0, 1, 128
-    assert np.allclose(exposure_gains(found, 3), 1)
+    assert np.allclose(exposure_gains(found.view, found.color, 3), 1)
 
 
 def test_regions_weigh_no_more_than_asked():

@@ -1,6 +1,7 @@
 """Meshes of GLB and OBJ files: their coordinates, what is up, and their pictures on the page."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from surfkit.core.check import BadInput
 from surfkit.evaluate.geometry.place import place_of, root_of
 from surfkit.evaluate.geometry.surface import read_surface
 from surfkit.export.gltf_reader import UPS
+from surfkit.export.sog import SOG
 from surfkit.mesh.base import Mesh
 from surfkit.mesh.files import write_mesh
 from surfkit.run.notes import collect_notes
 from surfkit.scene.scene import Frame
 from surfkit.scene.up_direction import map_axes
+from surfkit.testing.files import splat_table
 from surfkit.texture.files import Part, write_obj, write_textured_glb
 from surfkit.view.mesh_files import textured
 from surfkit.view.page import show
@@ -89,6 +92,51 @@ def test_y_is_up_in_files_of_others(tmp_path):
     with opened_subject(tmp_path / "a.glb", "cpu") as subject:
         assert subject.up.tolist() == [0, 1, 0] and subject.textured is None
         assert np.allclose(subject.frame.to_input(subject.mesh.vertices), CORNERS, atol=1e-5)
+
+
+GREYS = np.array([[0, 128, 255], [10, 20, 30], [1, 2, 3], [200, 100, 50]], np.uint8)
+
+
+def with_attribute(path, generator, kind, values):
+    """A GLB like that of `write_mesh`, whose COLOR_0 is replaced by other values, of the end of the file."""
+    raw = path.read_bytes()
+    size = int.from_bytes(raw[12:16], "little")
+    root, data = json.loads(raw[20 : 20 + size]), raw[28 + size :]
+    accessor = root["accessors"][2]
+    view = root["bufferViews"][accessor["bufferView"]]
+    data = data[: view["byteOffset"]] + values.tobytes()
+    accessor["componentType"], view["byteStride"], view["byteLength"] = kind, values[0].nbytes, values.nbytes
+    root["asset"]["generator"], root["buffers"][0]["byteLength"] = generator, len(data)
+    text = json.dumps(root).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = len(text).to_bytes(4, "little") + b"JSON" + text + len(data).to_bytes(4, "little") + b"BIN\0" + data
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+
+
+@pytest.mark.parametrize("case", ["surfkit", "surfkit 0.1", "others, bytes", "others, float"])
+def test_vertex_colours_of_glb_are_shown_as_they_were(tmp_path, case):
+    """Linear ones by glTF, but bytes of sRGB in files of earlier versions."""
+    path = tmp_path / "a.glb"
+    write_mesh(path, Mesh(CORNERS, MESH.faces, GREYS), LOCAL)
+    opaque = np.full((4, 1), 255, np.uint8)
+    share = GREYS / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    if case == "surfkit 0.1":
+        with_attribute(path, "surfkit 0.1.0", 5121, np.concatenate([GREYS, opaque], 1))
+    elif case == "others, bytes":
+        with_attribute(path, "other", 5121, np.concatenate([np.round(255 * linear).astype(np.uint8), opaque], 1))
+    elif case == "others, float":
+        with_attribute(path, "other", 5126, np.concatenate([linear, opaque / 255], 1).astype("<f4"))
+    with opened_subject(path, "cpu") as subject:
+        apart = np.abs(subject.mesh.colors.astype(int) - GREYS)
+    assert apart.max() <= (7 if case == "others, bytes" else 0), "8 bits of linear values are few for dark ones"
+
+
+def test_bytes_of_trimesh_are_shown_as_they_were(tmp_path):
+    trimesh = needs("trimesh")
+    trimesh.Trimesh(CORNERS, MESH.faces, vertex_colors=GREYS, process=False).export(tmp_path / "a.glb")
+    with opened_subject(tmp_path / "a.glb", "cpu") as subject:
+        assert np.array_equal(subject.mesh.colors, GREYS)
 
 
 def test_the_texture_of_a_run(tmp_path):
@@ -168,3 +216,11 @@ def test_an_obj_without_its_picture_is_shown_without(tmp_path, missing):
     with collect_notes() as notes, opened_subject(tmp_path / "a.obj", "cpu") as subject:
         assert subject.mesh.colors is None and len(subject.mesh.faces) == 1
     assert len(notes.texts) == 1 and repr(missing) in notes.texts[0]
+
+
+def test_a_folder_of_unpacked_sog_is_shown(tmp_path):
+    SOG().write(tmp_path / "a.sog", splat_table(count=20))
+    zipfile.ZipFile(tmp_path / "a.sog").extractall(tmp_path / "there")
+    for path in (tmp_path / "there", tmp_path / "there" / "meta.json"):
+        with opened_subject(path, "cpu") as subject:
+            assert len(subject.splats) == 20
