@@ -25,6 +25,14 @@ from surfkit.scene.pixels import (
 )
 
 THREADS = 4
+OPTIONS = ("--alpha", "--white")
+"""What users choose by what becomes of transparent pixels."""
+WAYS = (
+    ("--alpha", "--alpha mask ignores them"),
+    ("--alpha", "--alpha ignore takes their colours as stored"),
+    ("--white", "--white blends them over white"),
+)
+"""What to say of each, with the option that it is."""
 LOOKED_AT = 16
 """Photographs with an opacity of which all pixels are looked at, to say how much is transparent."""
 
@@ -42,7 +50,9 @@ class Decided:
     lines: Sequence[str]
 
 
-def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool | None = None) -> Decided:
+def decide(
+    files: Mapping[str, Path], alpha: Alpha | None = None, white: bool = False, options: Sequence[str] = OPTIONS
+) -> Decided:
     """What the values of the photographs of a data set mean. Files that cannot be read are told of where they are used.
 
     White of those of 16 bits is one for all, so that exposures stay comparable: the largest value of the fewest bits
@@ -51,12 +61,13 @@ def decide(files: Mapping[str, Path], alpha: Alpha | None = None, white: bool | 
     Args:
         files: All photographs of the data set by name, not a part of them.
         alpha: What becomes of transparent pixels; by default they are blended, where the band is an opacity.
-        white: Whether the user has them blended over white; None where that cannot be chosen.
+        white: Whether the user has them blended over white.
+        options: Which of `OPTIONS` the command has, to be named where they may help.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         kinds = dict(zip(files, pool.map(_kind, files.values()), strict=True))
         levels, said = _levels(files, {name: kind for name, kind in kinds.items() if kind.wide}, pool)
-        modes, more = _alphas(files, kinds, alpha, white, pool)
+        modes, more = _alphas(files, kinds, alpha, white, options, pool)
     pixels = {name: Pixels(levels.get(name, 0), modes.get(name, PLAIN.alpha)) for name in files}
     return Decided(pixels, [*said, *more])
 
@@ -98,7 +109,7 @@ def _largest(paths: Sequence[Path], pool: ThreadPoolExecutor) -> Iterator[int]:
 
     def look(path: Path) -> int:
         try:
-            return open_picture(path, lambda image: largest_of(image, path))
+            return open_picture(path, largest_of)
         except BadInput:
             return 0
 
@@ -110,7 +121,8 @@ def _alphas(
     files: Mapping[str, Path],
     kinds: Mapping[str, Kind],
     alpha: Alpha | None,
-    white: bool | None,
+    white: bool,
+    options: Sequence[str],
     pool: ThreadPoolExecutor,
 ) -> tuple[dict[str, Alpha], list[str]]:
     """What becomes of transparent pixels by name, of photographs that may have some; and what to say."""
@@ -130,11 +142,12 @@ def _alphas(
     if bands := [name for name, look in looks.items() if look is not None and not look.is_opacity]:
         said.append(
             f"the fourth band of {_photographs(len(bands))}, {few(bands)}, is no opacity by its values (infrared?), "
-            "and is not used; --alpha blend takes it for an opacity"
+            "and is not used" + "; --alpha blend takes it for an opacity" * ("--alpha" in options)
         )
     rest = [name for name in having if name not in bands]
     if not white and (line := _transparent(files, rest, len(files), pool)):
-        said.append(line if white is None else f"{line}, --white blends over white")
+        ways = [way for option, way in WAYS if option in options]
+        said.append("; ".join([line, *([", ".join(ways)] if ways else [])]))
     return {name: "ignore" if name in set(bands) else "blend" for name in having}, said
 
 
@@ -149,8 +162,8 @@ def _transparent(files: Mapping[str, Path], having: Sequence[str], count: int, p
     among = f"{count} photographs" if whole else f"{len(chosen)} photographs that were looked at, of {count},"
     return (
         f"{len(shares)} of {among} have transparent pixels, {few(list(shares))}, "
-        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, learnt as empty "
-        "space; --alpha mask ignores them, --alpha ignore takes their colours as stored"
+        f"{np.mean(list(shares.values())):.1%} of each on average: they are blended over black, which is learnt as "
+        "empty space"
     )
 
 

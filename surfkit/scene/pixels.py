@@ -115,7 +115,7 @@ def is_opacity(values: np.ndarray) -> bool:
     return bool(top and np.mean((values == 0) | (values == 255)) >= EXTREME)
 
 
-def largest_of(image: Image.Image, path: Path) -> int:
+def largest_of(image: Image.Image) -> int:
     """The largest value in an open picture of more than 8 bits; of colours as exact as its number of bits."""
     if image.mode.startswith("I"):
         return int(np.asarray(as_stored(image)).max(initial=0))

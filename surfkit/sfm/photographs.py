@@ -112,15 +112,20 @@ def look(
             paths = [path for path in paths if path.suffix.lower() not in HEIF]
     if not paths and not others:
         raise BadInput(f"{folder}: no photographs ({', '.join(sorted(PICTURES))}) in it or in folders inside")
-    return look_at(folder, paths, known, alpha)
+    return look_at(folder, paths, known, alpha, ("--alpha",))
 
 
 def look_at(
-    folder: Path, paths: Sequence[Path], known: Sequence[Photo] = (), alpha: Alpha | None = None
+    folder: Path,
+    paths: Sequence[Path],
+    known: Sequence[Photo] = (),
+    alpha: Alpha | None = None,
+    options: Sequence[str] = (),
 ) -> list[Photo]:
-    """Some photographs below a folder, in the order of `paths`; `known` and `alpha` as for `look`."""
+    """Some photographs below a folder, in the order of `paths`; `known` and `alpha` as for `look`, `options` as for
+    `decide`."""
     before = {photo.name: photo for photo in known}
-    decided = decide({path.relative_to(folder).as_posix(): path for path in paths}, alpha)
+    decided = decide({path.relative_to(folder).as_posix(): path for path in paths}, alpha, options=options)
     for line in decided.lines:
         emit(Warned(line))
     found = []

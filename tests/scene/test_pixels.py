@@ -61,7 +61,7 @@ def test_twelve_bits_of_colour_are_read_whole(tmp_path, kind):
     assert np.abs(got - values * (255 / 4095)).max() <= 0.501
     assert read_photo(path, SIZE).max() <= 16, "as the file is 16 bits, and nothing says that white is 4,095"
     assert open_picture(path, kind_of).wide
-    assert white_level_of(open_picture(path, lambda image: largest_of(image, path))) == 4095
+    assert white_level_of(open_picture(path, largest_of)) == 4095
     assert np.abs(read_draft(path, 10, Pixels(4095)).mean() - got.mean()) < 2
 
 

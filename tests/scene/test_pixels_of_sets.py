@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.core.codec import dump, load
 from surfkit.readers import extract, pixels
 from surfkit.readers.data import Data
 from surfkit.readers.masks import read_mask, view_mask
@@ -222,3 +223,18 @@ def test_a_mask_with_an_alpha_channel_goes_by_what_is_opaque(tmp_path):
             assert torch.equal(read_mask(path, (40, 30)), wanted)
     Image.fromarray(np.dstack([half, np.full_like(alpha, 255)])).save(tmp_path / "opaque.png")
     assert torch.equal(read_mask(tmp_path / "opaque.png", (40, 30)), torch.from_numpy(half[..., 0] > 0))
+
+
+def test_options_that_a_command_lacks_are_not_named(tmp_path):
+    Image.fromarray(left_clear(0, np.full((4, 40, 3), 9, np.uint8))).save(tmp_path / "a.png")
+    files = {"a.png": tmp_path / "a.png"}
+    assert "--alpha mask" in decide(files).lines[0] and "--white" in decide(files).lines[0]
+    assert "--white" not in decide(files, options=("--alpha",)).lines[0]
+    assert decide(files, options=()).lines[0].endswith("empty space")
+
+
+def test_the_choice_is_kept_and_runs_of_before_have_none():
+    known = dump(Data(Path("a"), alpha="mask"))
+    assert load(Data, known).alpha == "mask"
+    del known["alpha"]
+    assert load(Data, known).alpha is None
