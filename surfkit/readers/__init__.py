@@ -5,6 +5,7 @@ from surfkit.core.registry import hookimpl
 
 @hookimpl
 def surfkit_components():
+    from surfkit.readers.blocks_exchange import BlocksExchange
     from surfkit.readers.bundler import Bundler
     from surfkit.readers.colmap import COLMAP
     from surfkit.readers.depth_layouts import EstimatedDepths, HierarchicalDepths, MatrixCityDepths, NerfstudioDepths
@@ -18,6 +19,7 @@ def surfkit_components():
 
     readers = {
         "blender": Blender,
+        "blocks-exchange": BlocksExchange,
         "bundler": Bundler,
         "colmap": COLMAP,
         "matrixcity": MatrixCity,

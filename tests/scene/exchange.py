@@ -1,0 +1,88 @@
+"""The flight of `programs` in formats for exchange and of scanning apps, each by its own formula of projection.
+
+The formulas are written here from the documentation of the formats, and share nothing with the readers.
+"""
+
+import numpy as np
+
+from .programs import COLORS, DOTS, HEIGHT, POSES, WIDTH, F, photographs, seen_from
+
+IMAGE_AXES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
+
+
+def angles(turn):
+    """Omega, phi, kappa in degrees of a photogrammetric M = R3(kappa) R2(phi) R1(omega)."""
+    return np.degrees([np.arctan2(-turn[2, 1], turn[2, 2]), np.arcsin(turn[2, 0]), np.arctan2(-turn[1, 0], turn[0, 0])])
+
+
+def elements(**values):
+    return "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
+
+
+def blocks_exchange(
+    folder,
+    axes="XRightYDown",
+    degrees=False,
+    millimetres=False,
+    system=None,
+    origin=(0, 0, 0),
+    paths=lambda name: f"D:\\flight one\\{name}",
+    change=lambda text: text,
+    **given,
+):
+    """Bentley's sample file: pixels from the centre of the first one; rotation of the world to the axes of the camera.
+
+    Distortion as Wikipedia has Brown's: x r(r) + P1 (r^2 + 2 x^2) + 2 P2 x y.
+    """
+    c = {**dict.fromkeys(("K1", "K2", "K3", "P1", "P2"), 0.0), "x": WIDTH / 2 + 2.5, "y": HEIGHT / 2 - 1.75, **given}
+
+    def pixels(name, points):
+        X, Y, Z = seen_from(name, points).T
+        x, y = X / Z, Y / Z
+        r2 = x * x + y * y
+        radial = 1 + c["K1"] * r2 + c["K2"] * r2**2 + c["K3"] * r2**3
+        a = x * radial + c["P1"] * (r2 + 2 * x * x) + 2 * c["P2"] * x * y
+        b = y * radial + c["P2"] * (r2 + 2 * y * y) + 2 * c["P1"] * x * y
+        return np.stack([F * a + c["x"], F * b + c["y"]], 1)
+
+    x, _, y = axes.removeprefix("X").partition("Y")
+    frame = np.array([IMAGE_AXES[x], IMAGE_AXES[y], np.cross(IMAGE_AXES[x], IMAGE_AXES[y])])
+    pixel = 0.004
+    point = elements(x=c["x"], y=c["y"])
+    if millimetres:  # from the middle of the sensor, along the axes of the camera
+        off = frame @ np.array([c["x"] - (WIDTH - 1) / 2, c["y"] - (HEIGHT - 1) / 2, 0]) * pixel
+        point = elements(xmm=float(off[0]), ymm=float(off[1]))
+    focal = elements(SensorSize=WIDTH * pixel, FocalLength=F * pixel) if millimetres else elements(FocalLengthPixels=F)
+    photos = ""
+    for at, (name, (turn, centre)) in enumerate(POSES.items()):
+        turned = frame @ turn
+        if degrees:
+            rotation = elements(**dict(zip(("Omega", "Phi", "Kappa"), map(float, angles(turned)), strict=True)))
+        else:
+            rotation = elements(**{f"M_{i}{j}": float(turned[i, j]) for i in range(3) for j in range(3)})
+        place = elements(**dict(zip("xyz", map(float, centre + origin), strict=True)))
+        photos += f"<Photo><Id>{at + 5}</Id><ImagePath>{paths(name)}</ImagePath><Component>1</Component>"
+        photos += f"<Pose><Rotation>{rotation}</Rotation><Center>{place}</Center></Pose></Photo>\n"
+    photos += "<Photo><Id>77</Id><ImagePath>D:/lost/IMG 9.png</ImagePath></Photo>"
+    ties = ""
+    for dot, color in zip(DOTS, COLORS, strict=True):
+        ties += f"<TiePoint><Position>{elements(**dict(zip('xyz', map(float, dot + origin), strict=True)))}</Position>"
+        shade = dict(zip(("Red", "Green", "Blue"), (color / 255).tolist(), strict=True))
+        ties += f"<Color>{elements(**shade)}</Color>"
+        for at, name in enumerate(POSES):
+            u, v = pixels(name, dot[None])[0].tolist()
+            ties += f"<Measurement><PhotoId>{at + 5}</PhotoId>{elements(x=u, y=v)}</Measurement>"
+        ties += "</TiePoint>\n"
+    definition = f"<SRS><Id>3</Id><Name>map</Name><Definition>{system}</Definition></SRS>" if system else ""
+    text = (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<BlocksExchange version="3.2">\n<SpatialReferenceSystems>{definition}'
+        f"</SpatialReferenceSystems>\n<Block><Name>AT</Name>{'<SRSId>3</SRSId>' if system else ''}<Photogroups>"
+        f"<Photogroup><Name>Group 1</Name><ImageDimensions>{elements(Width=WIDTH, Height=HEIGHT)}</ImageDimensions>"
+        f"<CameraModelType>Perspective</CameraModelType>{focal}<CameraOrientation>{axes}</CameraOrientation>"
+        f"<PrincipalPoint>{point}</PrincipalPoint><Distortion>"
+        f"{elements(**{key: c[key] for key in ('K1', 'K2', 'K3', 'P1', 'P2')})}</Distortion>"
+        f"<AspectRatio>1</AspectRatio><Skew>0</Skew>\n{photos}</Photogroup></Photogroups>"
+        f"<TiePoints>\n{ties}</TiePoints></Block></BlocksExchange>\n"
+    )
+    (folder / "BlocksExchangeAT.xml").write_text(change(text), encoding="utf-8")
+    return photographs(folder / "images", lambda name, points: pixels(name, points) + 0.5)
