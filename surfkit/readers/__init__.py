@@ -13,9 +13,11 @@ def surfkit_components():
     from surfkit.readers.openmvg import OpenMVG
     from surfkit.readers.opensfm import ODM
     from surfkit.readers.pix4d import Pix4D
+    from surfkit.readers.polycam import Polycam, PolycamDepths
     from surfkit.readers.realitycapture import RealityCapture
     from surfkit.readers.split import GauUScene
     from surfkit.readers.transforms import Blender, MatrixCity, Nerfstudio
+    from surfkit.readers.xmp_sidecars import XmpSidecars
 
     readers = {
         "blender": Blender,
@@ -28,12 +30,15 @@ def surfkit_components():
         "odm": ODM,
         "openmvg": OpenMVG,
         "pix4d": Pix4D,
+        "polycam": Polycam,
         "realitycapture": RealityCapture,
+        "xmp-sidecars": XmpSidecars,
     }
     depths = {
         "estimated-depths": EstimatedDepths,
         "hierarchical-3dgs": HierarchicalDepths,
         "matrixcity-depths": MatrixCityDepths,
         "nerfstudio-depths": NerfstudioDepths,
+        "polycam-depths": PolycamDepths,
     }
     return readers | depths | {"gauu-scene": GauUScene}

@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
-from urllib.parse import unquote
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -32,10 +31,8 @@ from surfkit.readers.camera_files import (
 )
 from surfkit.readers.capture import Capture, Shot, Tracks
 from surfkit.readers.data import Data
-from surfkit.readers.geocentric import GEOGRAPHIC, LOCAL
+from surfkit.readers.exchanged import map_system, photo_names
 from surfkit.readers.transforms import points
-from surfkit.readers.wkt import parse_wkt
-from surfkit.scene.crs import axes_of
 
 HEAD = 4096
 """Bytes of a file that are looked at to recognise it."""
@@ -144,7 +141,7 @@ class _Block:
             raise BadInput(f"{path}: no Block in it; export the block again")
         block = max(blocks, key=lambda one: len(one.findall("Photogroups/Photogroup/Photo")))
         photos = _photos(path, block)
-        names = _names([_text(photo, "ImagePath") for photo, _ in photos])
+        names = photo_names([_text(photo, "ImagePath") for photo, _ in photos])
         systems = {
             _text(each, "Id"): _text(each, "Definition") for each in root.iterfind("SpatialReferenceSystems/SRS")
         }
@@ -202,7 +199,7 @@ class _Block:
         """The coordinate reference system, and metres per unit of it; None where it is local."""
         number = _text(self.block, "SRSId")
         text = " ".join(self.systems.get(number, "").split())
-        return _system(f"{self.path}: coordinate reference system {text[:40]!r}", text) if text else (None, None)
+        return map_system(f"{self.path}: coordinate reference system {text[:40]!r}", text) if text else (None, None)
 
     def _lens(self, where: str, group: ElementTree.Element, axes: np.ndarray) -> Brown:
         """The lens of a photogroup; `axes` are those of its cameras."""
@@ -286,21 +283,6 @@ def _photos(path: Path, block: ElementTree.Element) -> list[tuple[ElementTree.El
     return [pair for pair, part in zip(posed, parts, strict=True) if part == largest]
 
 
-def _names(paths: Sequence[str]) -> list[str]:
-    """Of photographs by their paths or file URLs on any machine: the last part, or what follows the common folders."""
-    split = []
-    for path in paths:
-        path = unquote(path.removeprefix("file:")) if path.startswith("file:") else path
-        split.append([part for part in path.replace("\\", "/").split("/") if part not in ("", ".")] or [""])
-    last = [parts[-1] for parts in split]
-    if len(set(last)) == len(last):
-        return last
-    common = 0
-    while all(len(parts) > common + 1 and parts[common] == split[0][common] for parts in split):
-        common += 1
-    return [str(PurePosixPath(*parts[common:])) for parts in split]
-
-
 def _axes(where: str, group: ElementTree.Element) -> np.ndarray:
     """(3, 3) axes of the cameras of a group, a row each, in a frame with x right, y down, z forward."""
     text = _text(group, "CameraOrientation") or "XRightYDown"
@@ -331,41 +313,6 @@ def _from_angles(degrees: Sequence[float]) -> np.ndarray:
     about_y = np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]])
     about_z = np.array([[ck, sk, 0], [-sk, ck, 0], [0, 0, 1]])
     return about_z @ about_y @ about_x
-
-
-def _system(where: str, text: str) -> tuple[str | None, float | None]:
-    """The coordinate reference system of a definition, and metres per unit of it.
-
-    Raises:
-        BadInput: It is in degrees, in which a rotation says nothing, or about the Earth's centre.
-    """
-    degrees = f"{where} is in degrees; export the block in a projected or a local coordinate system"
-    if text.startswith("ENU:"):
-        origin = text.removeprefix("ENU:").split(",")
-        latitude, longitude, height = numbers(where, [*origin, "0"][:3], 3).tolist()
-        return f"+proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}", 1.0
-    if text.upper().startswith("EPSG:"):
-        flat, _, up = text.upper().replace(" ", "").partition("+")
-        if up:
-            emit(Warned(f"{where}: heights are those of {up}; what is written names {flat} alone"))
-        try:
-            return flat, axes_of(flat).metres
-        except BadInput as error:
-            raise BadInput(f"{where}: {error}; or export the block in local coordinates") from error
-    if "[" in text:
-        node = parse_wkt(where, text)
-        flat_node = node if node.keyword in ("PROJCS", "PROJCRS") else node.child("PROJCS", "PROJCRS")
-        if flat_node is not None:
-            unit = flat_node.child("UNIT", "LENGTHUNIT")
-            return flat_node.code or text, unit.number(1) if unit is not None else None
-        if node.keyword in GEOGRAPHIC or node.child(*GEOGRAPHIC) is not None or node.keyword not in LOCAL:
-            raise BadInput(degrees)
-        return None, None
-    if text.upper().replace(" ", "") in ("WGS84", "WGS1984"):
-        raise BadInput(degrees)
-    if "local" not in text.lower():
-        emit(Warned(f"{where} is not understood: coordinates are those of the file"))
-    return None, None
 
 
 def _text(element: ElementTree.Element, path: str) -> str:

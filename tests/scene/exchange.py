@@ -3,7 +3,10 @@
 The formulas are written here from the documentation of the formats, and share nothing with the readers.
 """
 
+import json
+
 import numpy as np
+from PIL import Image
 
 from .programs import COLORS, DOTS, HEIGHT, POSES, WIDTH, F, photographs, seen_from
 
@@ -86,3 +89,81 @@ def blocks_exchange(
     )
     (folder / "BlocksExchangeAT.xml").write_text(change(text), encoding="utf-8")
     return photographs(folder / "images", lambda name, points: pixels(name, points) + 0.5)
+
+
+def polycam(folder, kind="corrected_", change=lambda number, values: None, depth=True):
+    """ARKit: camera to world by rows, x right, y up, z backward; the world has y up. No distortion.
+
+    The world of the dots has z up: its x, y, z are ARKit's x, -z, y.
+    """
+    names = {name: f"keyframes/{kind}images/{at}00.jpg" for at, name in enumerate(POSES, 1)}
+    back = {place: name for name, place in names.items()}
+    fx, fy, cx, cy = F, F + 1.5, WIDTH / 2 + 3, HEIGHT / 2 - 2
+
+    def project(place, points):
+        X, Y, Z = seen_from(back[place], points).T
+        return np.stack([fx * X / Z + cx, fy * Y / Z + cy], 1)
+
+    cameras = folder / f"keyframes/{kind}cameras"
+    cameras.mkdir(parents=True)
+    photographs(folder / "made", lambda name, points: project(names[name], points))
+    (folder / f"keyframes/{kind}images").mkdir()
+    for name, (turn, centre) in POSES.items():
+        right, down, ahead = turn
+        columns = [right, -down, -ahead, centre]
+        values = {}
+        for column, (x, y, z) in enumerate(columns):
+            values |= {f"t_0{column}": float(x), f"t_1{column}": float(z), f"t_2{column}": float(-y)}
+        values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH, "height": HEIGHT, "blur_score": 90.0}
+        number = names[name].rpartition("/")[2].removesuffix(".jpg")
+        change(number, values)
+        (cameras / f"{number}.json").write_text(json.dumps(values))
+        Image.open(folder / "made" / name).save(folder / names[name])
+        (folder / "made" / name).unlink()
+        if depth:
+            (folder / "keyframes/depth").mkdir(exist_ok=True)
+            map_mm = np.full((HEIGHT // 4, WIDTH // 4), 1250, np.uint16)
+            Image.fromarray(map_mm).save(folder / f"keyframes/depth/{number}.png")
+    (folder / "made").rmdir()
+    return project
+
+
+def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text: text, **given):
+    """RealityCapture XMP camera math: x = R (X - Position); f and shares of the longer side, 36 mm."""
+    c = {**dict.fromkeys(("k1", "k2", "k3", "k4", "t1", "t2", "u", "v", "skew"), 0.0), "aspect": 1.0, **given}
+
+    def project(name, points):
+        X, Y, Z = seen_from(name, points).T
+        x, y = X / Z, Y / Z
+        r2 = x * x + y * y
+        radial = 1 + c["k1"] * r2 + c["k2"] * r2**2 + c["k3"] * r2**3 + c["k4"] * r2**4
+        a = x * radial + c["t1"] * (r2 + 2 * x * x) + 2 * c["t2"] * x * y
+        b = y * radial + c["t2"] * (r2 + 2 * y * y) + 2 * c["t1"] * x * y
+        longer = max(WIDTH, HEIGHT)
+        return np.stack(
+            [
+                F * a + c["skew"] * longer * b + c["u"] * longer + WIDTH / 2,
+                F * c["aspect"] * b + c["v"] * longer + HEIGHT / 2,
+            ],
+            1,
+        )
+
+    photographs(folder / "images", project)
+    for name, (turn, centre) in POSES.items():
+        row = {
+            "Rotation": " ".join(map(repr, map(float, turn.ravel()))),
+            "Position": " ".join(map(repr, map(float, centre))),
+            "DistortionCoeficients": " ".join(repr(c[key]) for key in ("k1", "k2", "k3", "k4", "t1", "t2")),
+        }
+        inner = "".join(f"<xcr:{key}>{value}</xcr:{key}>" for key, value in row.items()) if elements else ""
+        outer = "" if elements else " ".join(f'xcr:{key}="{value}"' for key, value in row.items())
+        text = (
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+            '<rdf:Description xcr:Version="3" xcr:PosePrior="exact" xcr:Coordinates="absolute" '
+            f'xcr:DistortionModel="{model}" xcr:FocalLength35mm="{F / max(WIDTH, HEIGHT) * 36!r}" '
+            f'xcr:Skew="{c["skew"]!r}" xcr:AspectRatio="{c["aspect"]!r}" xcr:PrincipalPointU="{c["u"]!r}" '
+            f'xcr:PrincipalPointV="{c["v"]!r}" {outer} xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#">\n'
+            f"{inner}</rdf:Description>\n</rdf:RDF>\n</x:xmpmeta>\n"
+        )
+        (folder / "images" / name).with_suffix(".xmp").write_text(change(name, text))
+    return project

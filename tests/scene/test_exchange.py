@@ -4,13 +4,15 @@ from functools import partial
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.readers.data import Data
+from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 
-from .exchange import blocks_exchange
+from .exchange import blocks_exchange, polycam, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
@@ -21,6 +23,12 @@ CASES = {
     "blocks in degrees, x right, y up": partial(blocks_exchange, degrees=True, axes="XRightYUp"),
     "blocks in millimetres": partial(blocks_exchange, millimetres=True),
     **{f"blocks {axes}": partial(blocks_exchange, axes=axes, millimetres=True) for axes in AXES},
+    "polycam": polycam,
+    "polycam without corrections": partial(polycam, kind=""),
+    "xmp": partial(xmp_sidecars, k1=-0.09, k2=0.06, k3=-0.03, u=0.02, v=-0.015),
+    "xmp with tangential terms": partial(xmp_sidecars, model="brown4t2", k1=-0.09, t1=0.003, t2=-0.002),
+    "xmp in attributes": partial(xmp_sidecars, model="perspective", elements=False, u=0.01, aspect=1.004),
+    "xmp without distortion": partial(xmp_sidecars, model="division"),
 }
 
 
@@ -29,9 +37,8 @@ def test_dots_lie_where_the_format_puts_them(tmp_path, case):
     project = CASES[case](tmp_path)
     data = Data(tmp_path, test_every=0)
     shots = read_capture(data, reader_of(data)).shots
-    assert [shot.name for shot in shots] == list(POSES)
-    for shot in shots:
-        turn, centre = POSES[shot.name]
+    assert len(shots) == len(POSES) and (case.startswith("polycam") or [shot.name for shot in shots] == list(POSES))
+    for shot, (turn, centre) in zip(shots, POSES.values(), strict=True):
         np.testing.assert_allclose(shot.pose[:3, :3], turn, atol=1e-9)
         np.testing.assert_allclose(-shot.pose[:3, :3].T @ shot.pose[:3, 3], centre, atol=1e-9)
         local = DOTS @ shot.pose[:3, :3].T + shot.pose[:3, 3]
@@ -65,7 +72,7 @@ ENU = "+proj=topocentric +ellps=WGS84 +lat_0=39.97523 +lon_0=-83.00678 +h_0=0.0"
         ("EPSG:32632+5773", "EPSG:32632", 1.0),
         ("ENU:39.97523,-83.00678", ENU, 1.0),
         (FEET, FEET, 0.3048006096),
-        (LOCAL_CS, None, None),
+        (LOCAL_CS, None, 1.0),
         ("Local Coordinates", None, None),
         (None, None, None),
     ],
@@ -137,3 +144,77 @@ def test_blocks_that_are_refused(tmp_path, given, said):
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_depths_of_polycam_are_millimetres(tmp_path):
+    polycam(tmp_path)
+    capture = read_capture(Data(tmp_path), reader_of(Data(tmp_path)))
+    maps = find_maps(DepthQuery(tmp_path, [shot.name for shot in capture.shots], tmp_path, capture.metres))
+    assert capture.metres == 1.0 and maps.keys() == {shot.name for shot in capture.shots}
+    for each in maps.values():
+        assert each.aligned and each.metric
+        np.testing.assert_allclose(each.read(), 1 / 1.25, rtol=1e-6)
+
+
+def test_depths_of_polycam_end_at_the_reach_of_the_lidar_and_have_a_confidence(tmp_path):
+    polycam(tmp_path)
+    depth, sure = np.full((4, 6), 1250, np.uint16), np.full((4, 6), 255, np.uint8)
+    depth[0, 0], sure[1], sure[2] = 5001, 127, 0
+    for folder, values in (("depth", depth), ("confidence", sure)):
+        (tmp_path / "keyframes" / folder).mkdir(exist_ok=True)
+        Image.fromarray(values).save(tmp_path / f"keyframes/{folder}/100.png")
+    (found,) = find_maps(DepthQuery(tmp_path, ["keyframes/corrected_images/100.jpg"], tmp_path)).values()
+    expected = np.full((4, 6), 0.8)
+    expected[0, 0] = np.nan
+    np.testing.assert_allclose(found.read(), expected, rtol=1e-6)
+    np.testing.assert_array_equal(found.read_confidence()[:, 0], [1, 0.5, 0, 1])
+
+
+def test_raw_data_of_polycam_without_corrections_is_told(tmp_path):
+    polycam(tmp_path, kind="")
+    with collect_notes() as kept:
+        read(Data(tmp_path))
+    assert any("no corrected_images and corrected_cameras: poses are those of ARKit" in text for text in kept.texts)
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (partial(polycam, change=lambda number, values: values.pop("t_12")), "100.json: it lacks t_12"),
+        (partial(polycam, change=lambda number, values: values.update(t_00=9)), "the pose is not a rotation"),
+        (partial(polycam, change=lambda number, values: values.update(fx="wide")), "where 6 finite numbers belong"),
+        (partial(polycam, change=lambda number, values: values.update(fx=0)), "no lens has size"),
+        (partial(xmp_sidecars, model="division", k1=0.1), "distortion model 'division' with 6 coefficients; known: "),
+        (partial(xmp_sidecars, change=lambda name, text: f"<!DOCTYPE a>{text}"), "has definitions of its own"),
+        (partial(xmp_sidecars, change=lambda name, text: text[:-9]), "not XML"),
+        (
+            partial(xmp_sidecars, change=lambda name, text: text.replace("FocalLength35mm", "F")),
+            "no xcr:FocalLength35mm",
+        ),
+        (partial(xmp_sidecars, change=lambda name, text: text.replace("Rotation>", "R>")), "have no pose in their XMP"),
+        (partial(xmp_sidecars, skew=0.1), "no camera model of COLMAP has its skew"),
+    ],
+)
+def test_scans_and_sidecars_that_are_refused(tmp_path, write, said):
+    write(tmp_path)
+    with pytest.raises(BadInput) as caught:
+        read(Data(tmp_path))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_photograph_without_a_pose_in_its_xmp_is_left_out(tmp_path):
+    xmp_sidecars(tmp_path, change=lambda name, text: text.replace("Position>", "P>") if name == "IMG 2.png" else text)
+    with collect_notes() as kept:
+        scene = read(Data(tmp_path, test_every=0))
+    assert [view.name for view in scene.train] == ["IMG 1.png", "IMG 3.png", "IMG 4.png"]
+    assert any("1 of 4 photographs are left out, which have no pose in their XMP: 'IMG 2.xmp'" in t for t in kept.texts)
+
+
+def test_sidecars_in_the_folder_of_the_data_set(tmp_path):
+    xmp_sidecars(tmp_path)
+    (tmp_path / "images/IMG 1.xmp").write_text(
+        '<x xmlns:lr="http://ns.adobe.com/lightroom/1.0/"/>'
+    )  # of another program
+    for name in ("IMG 2", "IMG 3", "IMG 4"):
+        (tmp_path / f"images/{name}.xmp").rename(tmp_path / f"{name}.xmp")
+    assert [view.name for view in read(Data(tmp_path, test_every=0)).train] == ["IMG 2.png", "IMG 3.png", "IMG 4.png"]
