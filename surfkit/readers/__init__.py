@@ -12,6 +12,7 @@ def surfkit_components():
     from surfkit.readers.metashape import Metashape
     from surfkit.readers.openmvg import OpenMVG
     from surfkit.readers.opensfm import ODM
+    from surfkit.readers.opf import OPF
     from surfkit.readers.pix4d import Pix4D
     from surfkit.readers.polycam import Polycam, PolycamDepths
     from surfkit.readers.realitycapture import RealityCapture
@@ -29,6 +30,7 @@ def surfkit_components():
         "nerfstudio": Nerfstudio,
         "odm": ODM,
         "openmvg": OpenMVG,
+        "opf": OPF,
         "pix4d": Pix4D,
         "polycam": Polycam,
         "realitycapture": RealityCapture,

@@ -40,7 +40,7 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
     Raises:
         BadInput: It is in degrees, in which a rotation says nothing, or about the Earth's centre.
     """
-    degrees = f"{where} is in degrees; export the block in a projected or a local coordinate system"
+    degrees = f"{where} is in degrees; export in a projected or a local coordinate system"
     if text.startswith("ENU:"):
         origin = text.removeprefix("ENU:").split(",")
         latitude, longitude, height = numbers(where, [*origin, "0"][:3], 3).tolist()
@@ -52,7 +52,7 @@ def map_system(where: str, text: str) -> tuple[str | None, float | None]:
         try:
             return flat, axes_of(flat).metres
         except BadInput as error:
-            raise BadInput(f"{where}: {error}; or export the block in local coordinates") from error
+            raise BadInput(f"{where}: {error}; or export in local coordinates") from error
     if "[" in text:
         node = parse_wkt(where, text)
         flat_node = node if node.keyword in PROJECTED else node.child(*PROJECTED)

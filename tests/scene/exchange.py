@@ -167,3 +167,50 @@ def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text
         )
         (folder / "images" / name).with_suffix(".xmp").write_text(change(name, text))
     return project
+
+
+def opf(folder, shift=(0, 0, 0), scale=(1, 1, 1), definition=None, swap=False, change=lambda files: None, **given):
+    """OPF: Rx(omega) Ry(phi) Rz(kappa) from a camera (x right, y up, z backward); canonical = map + shift."""
+    c = {**dict.fromkeys(("R1", "R2", "R3", "T1", "T2"), 0.0), "cx": WIDTH / 2 + 3.0, "cy": HEIGHT / 2 - 2.0, **given}
+
+    def project(name, points):
+        X, Y, Z = seen_from(name, points).T
+        x, y = X / Z, Y / Z
+        r2 = x * x + y * y
+        radial = 1 + c["R1"] * r2 + c["R2"] * r2**2 + c["R3"] * r2**3
+        a = x * radial + 2 * c["T1"] * x * y + c["T2"] * (r2 + 2 * x * x)
+        b = y * radial + 2 * c["T2"] * x * y + c["T1"] * (r2 + 2 * y * y)
+        return np.stack([F * a + c["cx"], F * b + c["cy"]], 1)
+
+    def entry(kind, name):
+        resource = {"uri": name.replace(" ", "%20"), "format": f"application/opf-{kind}+json"}
+        return {"id": kind, "type": kind, "resources": [resource], "sources": []}
+
+    numbers = {name: 2**63 + 5 + at for at, name in enumerate(POSES)}
+    cameras = []
+    for name, (turn, centre) in POSES.items():
+        matrix = (np.diag([1, -1, -1]) @ turn).T  # columns: right, up and backward in the world
+        omega, phi = np.arctan2(-matrix[1, 2], matrix[2, 2]), np.arcsin(matrix[0, 2])
+        kappa = np.arctan2(-matrix[0, 1], matrix[0, 0])
+        place = {"position": centre.tolist(), "orientation_deg": np.degrees([omega, phi, kappa]).tolist()}
+        cameras.append({"id": numbers[name], "sensor_id": 7, **place})
+    inner = {"type": "perspective", "focal_length_px": F, "principal_point_px": [c["cx"], c["cy"]]}
+    inner |= {"radial_distortion": [c["R1"], c["R2"], c["R3"]], "tangential_distortion": [c["T1"], c["T2"]]}
+    listed = [{"id": number, "uri": f"../photos/{name}".replace(" ", "%20")} for name, number in numbers.items()]
+    listed += [{"id": 3, "uri": "file:///c:/data/IMG%209.png#page=0"}, {"id": 4, "uri": "DepthMap_1.tiff"}]
+    captures = [{"id": each["id"], "cameras": [{"id": each["id"], "sensor_id": 7}]} for each in listed[:-1]]
+    frame = {"shift": list(shift), "scale": list(scale), "swap_xy": swap}
+    files = {
+        "camera list.json": {"cameras": listed},
+        "input.json": {"sensors": [{"id": 7, "image_size_px": [WIDTH, HEIGHT]}], "captures": captures},
+        "calibrated.json": {"sensors": [{"id": 7, "internals": inner}], "cameras": cameras},
+        "frame.json": {"crs": {"definition": definition}, "base_to_canonical": frame},
+    }
+    kinds = ("camera-list", "input-cameras", "calibrated-cameras", "scene-reference-frame")
+    items = [entry(kind, f"parts/{name}") for kind, name in zip(kinds, files, strict=True)]
+    files["../survey.opf"] = {"format": "application/opf-project+json", "items": items if definition else items[:-1]}
+    change(files)
+    (folder / "parts").mkdir()
+    for name, contents in files.items():
+        (folder / "parts" / name).write_text(json.dumps(contents))
+    return photographs(folder / "images", project)

@@ -12,7 +12,7 @@ from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 
-from .exchange import blocks_exchange, polycam, xmp_sidecars
+from .exchange import blocks_exchange, opf, polycam, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
@@ -23,6 +23,7 @@ CASES = {
     "blocks in degrees, x right, y up": partial(blocks_exchange, degrees=True, axes="XRightYUp"),
     "blocks in millimetres": partial(blocks_exchange, millimetres=True),
     **{f"blocks {axes}": partial(blocks_exchange, axes=axes, millimetres=True) for axes in AXES},
+    "opf": partial(opf, R1=-0.1, R2=0.07, R3=-0.02, T1=0.003, T2=-0.002),
     "polycam": polycam,
     "polycam without corrections": partial(polycam, kind=""),
     "xmp": partial(xmp_sidecars, k1=-0.09, k2=0.06, k3=-0.03, u=0.02, v=-0.015),
@@ -125,7 +126,7 @@ def words(old, new):
     ("given", "said"),
     [
         ({"system": "EPSG:4326"}, "in degrees"),
-        ({"system": "WGS84"}, "in degrees; export the block in a projected or a local coordinate system"),
+        ({"system": "WGS84"}, "in degrees; export in a projected or a local coordinate system"),
         ({"change": words("<Block>", "")}, "not XML, or cut off"),
         ({"change": words("<BlocksExchange", '<!DOCTYPE a [<!ENTITY b "c">]>\n<BlocksExchange')}, "definitions"),
         ({"change": words("Perspective", "Fisheye")}, "photogroup 'Group 1': its cameras are of type Fisheye"),
@@ -218,3 +219,63 @@ def test_sidecars_in_the_folder_of_the_data_set(tmp_path):
     for name in ("IMG 2", "IMG 3", "IMG 4"):
         (tmp_path / f"images/{name}.xmp").rename(tmp_path / f"{name}.xmp")
     assert [view.name for view in read(Data(tmp_path, test_every=0)).train] == ["IMG 2.png", "IMG 3.png", "IMG 4.png"]
+
+
+UTM16 = (  # as the specification has it
+    'PROJCRS["WGS 84 / UTM zone 16N",\n BASEGEOGCRS["WGS 84",ENSEMBLE["World Geodetic System 1984 ensemble",\n'
+    'ELLIPSOID["WGS 84",6378137,298.257223563,LENGTHUNIT["metre",1]],ENSEMBLEACCURACY[2.0]],ID["EPSG",4326]],\n'
+    'CONVERSION["UTM zone 16N",METHOD["Transverse Mercator",ID["EPSG",9807]]],CS[Cartesian,2],'
+    'AXIS["(E)",east,ORDER[1],LENGTHUNIT["metre",1]],AXIS["(N)",north,ORDER[2],LENGTHUNIT["metre",1]],ID["EPSG",32616]]'
+)
+
+
+@pytest.mark.parametrize(
+    ("given", "crs", "metres"),
+    [
+        ({"definition": UTM16}, "EPSG:32616", 1.0),
+        ({"definition": "EPSG:32616+EPSG:5773"}, "EPSG:32616", 1.0),
+        ({"definition": UTM16, "scale": (3.0, 3.0, 1.0)}, None, 1 / 3),
+        ({"definition": 'ENGINEERINGCRS["Site",AXIS["x",north],LENGTHUNIT["metre",1.0]]', "swap": True}, None, 1.0),
+    ],
+)
+def test_opf_on_the_map(tmp_path, given, crs, metres):
+    origin = np.array([746308.125, 3714810.5, 268.75])
+    opf(tmp_path, shift=-origin, **given)
+    with collect_notes() as kept:
+        scene = read(Data(tmp_path, test_every=0))
+    assert (scene.frame.crs, scene.frame.metres, scene.frame.shift) == (crs, metres, tuple(origin))
+    poses = [scene.frame.input_pose(view.camera.world_to_camera) for view in scene.train]
+    places = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
+    np.testing.assert_allclose(places, [origin + centre for _, centre in POSES.values()], atol=1e-6)
+    assert any("1 of 5 photographs are left out, which are not calibrated: 'IMG 9.png'" in t for t in kept.texts)
+    assert any("lengths are 3 times those of the map" in text for text in kept.texts) == ("scale" in given)
+
+
+def at(name, *path, value):
+    def change(files):
+        place = files[name]
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (at("calibrated.json", "sensors", 0, "internals", "type", value="fisheye"), "sensor 7: of type 'fisheye'"),
+        (at("calibrated.json", "sensors", 0, "id", value=8), "the input cameras do not have it"),
+        (at("calibrated.json", "cameras", value=[]), "no camera in it"),
+        (at("calibrated.json", "cameras", value=3), "cameras is no list of objects"),
+        (at("calibrated.json", "cameras", 0, "position", value=[1, 2]), "position: [1, 2], where 3 finite numbers"),
+        (at("../survey.opf", "items", 2, "resources", value=[]), "names no file of calibrated-cameras"),
+        (at("../survey.opf", "items", 2, "resources", 0, "uri", value="https://a/b.json"), "is not on this machine"),
+        (at("../survey.opf", "items", 2, "resources", 0, "uri", value="parts/lost.json"), "lost.json: no such file"),
+    ],
+)
+def test_opf_that_is_refused(tmp_path, change, said):
+    opf(tmp_path, change=change)
+    with pytest.raises(BadInput) as caught:
+        read(Data(tmp_path))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
