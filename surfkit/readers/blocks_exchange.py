@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -146,27 +146,20 @@ class _Block:
             _text(each, "Id"): _text(each, "Definition") for each in root.iterfind("SpatialReferenceSystems/SRS")
         }
         found = cls(path, systems, block, photos, names)
-        outside = block.findtext("TiePoints/Path")
-        if outside:
-            emit(
-                Warned(
-                    f"{path}: tie points lie in {outside.strip()!r}, which is not read; export them in the same file"
-                )
-            )
-        if len(blocks) > 1:
-            emit(Warned(f"{path} has {len(blocks)} blocks; the one of most photographs is used, without tie points"))
-        own = {_text(block, "SRSId"), ""}
-        others = [each for each in block.iterfind("TiePoints") if _text(each, "SRSId") not in own]
-        if others:
-            emit(Warned(f"{path}: tie points are in another coordinate reference system than the block: left out"))
-        if not tree.xyz or len(blocks) > 1 or others:
+        if why := _tie_points_fault(block, len(blocks)):
+            emit(Warned(f"{path}: {why}"))
             return found
-        xyz, rgb = np.array(tree.xyz), np.array(tree.rgb)
+        if not tree.xyz:
+            return found
         pixels = np.array([sight[2:] for sight in tree.sights], np.float64).reshape(-1, 2) + CENTRE
-        rows = np.array([sight[0] for sight in tree.sights], np.int64)
-        colors = (rgb.clip(0, 1) * 255).round().astype(np.uint8)
-        seers = [sight[1] for sight in tree.sights]
-        return cls(path, systems, block, photos, names, xyz, colors, rows, pixels, seers)
+        return replace(
+            found,
+            xyz=np.array(tree.xyz),
+            rgb=(np.array(tree.rgb).clip(0, 1) * 255).round().astype(np.uint8),
+            rows=np.array([sight[0] for sight in tree.sights], np.int64),
+            pixels=pixels,
+            seers=[sight[1] for sight in tree.sights],
+        )
 
     def shots(self, data: Data) -> list[Shot]:
         """The photographs that have a lens and a pose."""
@@ -263,6 +256,19 @@ def _parse(path: Path) -> tuple[ElementTree.Element, _Tree]:
     except (ElementTree.ParseError, LookupError) as error:
         raise BadInput(f"{path}: not XML, or cut off: {error}; export the block again") from error
     return root, tree
+
+
+def _tie_points_fault(block: ElementTree.Element, blocks: int) -> str:
+    """Why the tie points of a file are not used; "" where they are."""
+    if blocks > 1:
+        return f"it has {blocks} blocks; the one of most photographs is used, without tie points"
+    listed = block.findall("TiePoints")
+    for each in listed:
+        if outside := _text(each, "Path"):
+            return f"tie points lie in {outside!r}, which is not read; export them in the same file"
+    if any(_text(each, "SRSId") not in ("", _text(block, "SRSId")) for each in listed):
+        return "tie points are in another coordinate reference system than the block, and are left out"
+    return ""
 
 
 def _photos(path: Path, block: ElementTree.Element) -> list[tuple[ElementTree.Element, ElementTree.Element]]:

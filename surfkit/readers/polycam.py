@@ -30,8 +30,6 @@ from surfkit.readers.transforms import points
 KEYFRAMES = "keyframes"
 SETS = ("corrected_", "")
 """What the names of folders begin with: those of optimised poses and undistorted photographs, and the others."""
-PARTS = ("images", "cameras")
-"""What they end with."""
 ENDS = (".jpg", ".jpeg", ".png")
 POSE = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
@@ -52,7 +50,7 @@ class Polycam(Reader):
 
     def read(self, data: Data) -> Capture:
         folder = data.path / KEYFRAMES
-        kind = next((kind for kind in SETS if all(any((folder / f"{kind}{part}").glob("*.*")) for part in PARTS)), None)
+        kind = next((kind for kind in SETS if _is_filled(folder, kind)), None)
         if kind is None:
             raise BadInput(f"{folder}: no photographs with cameras in images/ and cameras/; export the raw data again")
         if not kind:
@@ -108,6 +106,12 @@ class PolycamDepths(DepthLayout):
         return {
             name: PolycamDepth(folder / f"{stem}.png", True, MILLIMETRE, metric=True) for name, stem in stems.items()
         }
+
+
+def _is_filled(folder: Path, kind: str) -> bool:
+    """Whether there are cameras and photographs of a kind of `SETS`."""
+    photos = (path for path in (folder / f"{kind}images").glob("*") if path.suffix in ENDS)
+    return any((folder / f"{kind}cameras").glob("*.json")) and any(photos)
 
 
 def _photo(folder: Path, stem: str) -> str:

@@ -59,10 +59,9 @@ class XmpSidecars(Reader):
         for path in files:
             with leaving_out():
                 values[path] = _values(path)
-        posed = [path for path, own in values.items() if {"Rotation", "Position"} <= own.keys()]
-        leave_out(
-            folder, [path.name for path in values if path not in set(posed)], len(values), "have no pose in their XMP"
-        )
+        posed = [path for path, given in values.items() if {"Rotation", "Position"} <= given.keys()]
+        without = [path.name for path in values.keys() - set(posed)]
+        leave_out(folder, sorted(without), len(values), "have no pose in their XMP")
         names = _names(folder, posed)
         found, shots, lenses = photographs(data, list(names.values())), [], Lenses(folder)
         for path, name in names.items():

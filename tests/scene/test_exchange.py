@@ -13,7 +13,7 @@ from surfkit.readers.read import read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 
 from .exchange import blocks_exchange, opf, polycam, xmp_sidecars
-from .programs import COLORS, DOTS, ORIGIN, POSES
+from .programs import COLORS, DOTS, ORIGIN, POSES, realitycapture
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
 AXES = ("XRightYUp", "XLeftYDown", "XLeftYUp", "XDownYRight", "XDownYLeft", "XUpYRight", "XUpYLeft")
@@ -123,6 +123,31 @@ def words(old, new):
 
 
 @pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (words("<TiePoints>", "<TiePoints><Path>ties.xml</Path>"), "tie points lie in 'ties.xml', which is not read"),
+        (words("<TiePoints>", "<TiePoints><SRSId>9</SRSId>"), "tie points are in another coordinate reference system"),
+        (words("<Block>", "<Block><Photogroups/></Block><Block>"), "it has 2 blocks; the one of most photographs"),
+    ],
+)
+def test_tie_points_of_blocks_that_are_left_out(tmp_path, change, said):
+    blocks_exchange(tmp_path, change=change)
+    with collect_notes() as kept:
+        capture = read_capture(Data(tmp_path), reader_of(Data(tmp_path)))
+    assert len(capture.shots) == len(POSES) and not len(capture.xyz)
+    assert any(said in text for text in kept.texts)
+    assert reader_of(Data(tmp_path)).tracks(Data(tmp_path)) is None
+
+
+def test_blocks_of_another_component_are_left_out(tmp_path):
+    blocks_exchange(tmp_path, change=words("<Component>1", "<Component>0"))
+    with collect_notes() as kept:
+        shots = read_capture(Data(tmp_path), reader_of(Data(tmp_path))).shots
+    assert [shot.name for shot in shots] == list(POSES)[1:]
+    assert any("1 of 4 photographs are left out, which are not of the largest component" in t for t in kept.texts)
+
+
+@pytest.mark.parametrize(
     ("given", "said"),
     [
         ({"system": "EPSG:4326"}, "in degrees"),
@@ -201,6 +226,20 @@ def test_scans_and_sidecars_that_are_refused(tmp_path, write, said):
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_csv_file_of_realitycapture_is_read_before_sidecars(tmp_path):
+    xmp_sidecars(tmp_path)
+    realitycapture(tmp_path)
+    assert type(reader_of(Data(tmp_path))).__name__ == "RealityCapture"
+
+
+def test_an_empty_folder_of_corrected_cameras_of_polycam(tmp_path):
+    polycam(tmp_path, kind="")
+    for part in ("images", "cameras"):
+        (tmp_path / f"keyframes/corrected_{part}").mkdir()
+        (tmp_path / f"keyframes/corrected_{part}/.DS_Store").touch()
+    assert len(read_capture(Data(tmp_path), reader_of(Data(tmp_path))).shots) == len(POSES)
 
 
 def test_a_photograph_without_a_pose_in_its_xmp_is_left_out(tmp_path):
