@@ -97,8 +97,9 @@ class _Tree(ElementTree.TreeBuilder):
         if position is None:
             return
         where = f"{self._path}: tie point {len(self.xyz) + 1}"
-        self.xyz.append(_texts(where, position, "xyz"))
+        xyz = _texts(where, position, "xyz")
         self.rgb.append([0.5] * 3 if color is None else _texts(where, color, ("Red", "Green", "Blue")))
+        self.xyz.append(xyz)
         for seen in point.iterfind("Measurement"):
             if seen.find("x") is not None:  # others are in millimetres
                 x, y = _texts(where, seen, "xy")

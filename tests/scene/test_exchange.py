@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from surfkit.core.check import BadInput
+from surfkit.core.check import BadInput, collecting
 from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import read, read_capture, reader_of
@@ -137,6 +137,13 @@ def test_tie_points_of_blocks_that_are_left_out(tmp_path, change, said):
     assert len(capture.shots) == len(POSES) and not len(capture.xyz)
     assert any(said in text for text in kept.texts)
     assert reader_of(Data(tmp_path)).tracks(Data(tmp_path)) is None
+
+
+def test_damaged_tie_points_of_blocks_are_told_all_at_once(tmp_path):
+    blocks_exchange(tmp_path, change=lambda text: text.replace("<Red>", "<Red>x").replace("<Red>x", "<Red>", 18))
+    with collecting() as kept:
+        capture = reader_of(Data(tmp_path)).read(Data(tmp_path))
+    assert len(kept) == 2 and len(capture.xyz) == len(capture.rgb) == 18
 
 
 def test_blocks_of_another_component_are_left_out(tmp_path):
