@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scene import programs
+from scene import exchange, programs
 from scene.folders import FLIGHT, blender, city, nerfstudio, odm
 
 from surfkit.core.registry import components
@@ -14,12 +14,13 @@ from surfkit.testing import check, check_reader
 from surfkit.testing.synthetic import photograph, write_colmap
 
 PROGRAMS = ("bundler", "metashape", "openmvg", "pix4d", "realitycapture")
-"""Written with a scene of their own: `scene/test_programs.py` compares their cameras with formulas."""
+EXCHANGE = ("blocks-exchange", "opf", "polycam", "xmp-sidecars")
+"""Written with a scene of their own: `scene/test_programs.py` and `test_exchange.py` compare cameras with formulas."""
 
 
 def program(name):
     def write(folder, truth):
-        getattr(programs, name)(folder)
+        getattr(programs if name in PROGRAMS else exchange, name.replace("-", "_"))(folder)
 
     return write
 
@@ -30,7 +31,7 @@ WRITE = {
     "matrixcity": lambda folder, truth: city(folder, truth, "aerial"),
     "nerfstudio": nerfstudio,
     "odm": odm,
-    **{name: program(name) for name in PROGRAMS},
+    **{name: program(name) for name in (*PROGRAMS, *EXCHANGE)},
 }
 
 
@@ -61,7 +62,7 @@ def test_every_reader(name, truth, tmp_path):
     """A reader of a new layout needs a function above that writes it."""
     folder = WRITE[name](tmp_path, truth) or tmp_path
     known = {"blender": square(truth), "matrixcity": None}  # the latter gives the photographs other names
-    known |= dict.fromkeys(PROGRAMS)
+    known |= dict.fromkeys((*PROGRAMS, *EXCHANGE))
     check(components(Reader)[name](), folder, known.get(name, truth))
 
 
