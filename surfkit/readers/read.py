@@ -129,14 +129,6 @@ def _frame(data: Data, capture: Capture, poses: np.ndarray) -> Frame:
     given = data.metres_per_unit
     if given is not None and capture.metres not in (None, given):
         emit(Warned(f"--metres-per-unit {given:g} is used, though {data.path} is in units of {capture.metres:g} m"))
-    if any(shift):
-        text = " ".join(f"{value:.15g}" for value in shift)
-        emit(
-            Warned(
-                f"coordinates reach {np.abs(frame.origin).max():.0f}, too large for files of float32: these leave out "
-                f"the offset {text}, which their headers and run.json name"
-            )
-        )
     return replace(frame, metres=_metres(given or capture.metres, capture.crs, frame), crs=capture.crs, shift=shift)
 
 

@@ -186,6 +186,7 @@ def make_mesh(run: Run, mesher: Mesher | Mesh, delivery: MeshOutput, subject: Me
         "cleaning": describe(report, subject),
         "files": [path.name for path in written],
         "crs": frame.crs,
+        "offset": list(frame.shift),
         "metres_per_unit": frame.metres,
         "seconds": round(time.perf_counter() - began, 2),
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from surfkit.core.events import Warned, emit
 from surfkit.core.registry import name_of
 from surfkit.run.folder import Run
@@ -34,9 +36,19 @@ def warn_of_no_edits(run: Run, scene: Scene) -> None:
 
 
 def warn_of_gaps(scene: Scene, state: StageState | None) -> None:
-    """Say what the data does not allow."""
-    if state is None and not scene.held_out:
+    """Say what the data does not allow, once, when a run begins."""
+    if state is not None:
+        return
+    if not scene.held_out:
         emit(Warned(NONE_HELD_OUT))
+    if any(shift := scene.frame.shift):
+        far, text = np.abs(scene.frame.origin).max(), " ".join(f"{value:.15g}" for value in shift)
+        emit(
+            Warned(
+                f"coordinates reach {far:.0f}, too large for the 32 bits that most programs read: all files of the run "
+                f"leave out the offset {text}, which their headers, run.json and mesh.json name"
+            )
+        )
 
 
 def note_held_out(run: Run, scene: Scene) -> None:

@@ -69,7 +69,8 @@ class Kept:
 
 def identity(surface: Surface) -> str:
     """A digest of a mesh: of its vertices with all that they have, and its triangles."""
-    found = hashlib.sha256(f"{surface.rows.dtype} {len(surface)} {surface.faces.dtype} {len(surface.faces)}".encode())
+    kinds = surface.rows.dtype, len(surface), surface.faces.dtype, len(surface.faces), surface.offset
+    found = hashlib.sha256(" ".join(map(str, kinds)).encode())
     for rows in (surface.rows, surface.faces):
         for at in range(0, len(rows), BLOCK):
             found.update(np.ascontiguousarray(rows[at : at + BLOCK]))

@@ -16,6 +16,7 @@ from surfkit.readers.geocentric import place_of
 from surfkit.readers.read import observations, read, read_capture, reader_of
 from surfkit.readers.wkt import parse_wkt
 from surfkit.run.notes import collect_notes
+from surfkit.run.warn import warn_of_gaps
 from surfkit.scene.earth import geocentric
 
 from . import programs
@@ -516,8 +517,13 @@ def test_what_files_leave_out_is_found_where_the_file_names_no_offset(tmp_path):
     """Coordinates of an export are those of the map already; float32 cannot hold them."""
     realitycapture(tmp_path, change=moved_to_the_map)
     (tmp_path / "georeference.json").write_text('{"crs": "EPSG:32632", "offset": [0, 0, 0]}')
-    with collect_notes():
-        frame = read(Data(tmp_path)).frame
+    with collect_notes() as notes:
+        scene = read(Data(tmp_path))
+        assert not any("leave out the offset" in text for text in notes.texts)
+        for state in (None, object()):  # a run that begins, and one that goes on
+            warn_of_gaps(scene, state)
+    assert sum("leave out the offset" in text for text in notes.texts) == 1
+    frame = scene.frame
     assert frame.crs == "EPSG:32632" and np.abs(np.array(frame.shift[:2]) - ORIGIN[:2]).max() < 1e4
 
 

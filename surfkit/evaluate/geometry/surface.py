@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from surfkit.core.optional import needed
 from surfkit.evaluate.geometry.heights import RASTERS, raster_system, read_heights_raster
 from surfkit.evaluate.geometry.las import CLOUDS, SCANS, las_notes, read_e57, read_las
 from surfkit.evaluate.geometry.lists import fans, has_lists, points_beside_lists
-from surfkit.evaluate.geometry.place import place_of, root_of
+from surfkit.evaluate.geometry.place import offset_in, place_of, root_of
 from surfkit.export.ply import TYPES, read_vertices
 from surfkit.readers.sparse_ply import read_points
 
@@ -37,11 +37,13 @@ class Surface:
         path: The file.
         rows: (V,) records with fields x, y, z, which may lie on disk, or a plain (V, 3) array.
         faces: (F, 3) rows of the corners; None for a cloud.
+        offset: What coordinates in `rows` leave out.
     """
 
     path: Path
     rows: np.ndarray
     faces: np.ndarray | None = None
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -49,9 +51,9 @@ class Surface:
     def vertices(self, part: slice | np.ndarray = slice(None)) -> np.ndarray:
         """(n, 3) float64 of all vertices, or of some."""
         if self.rows.dtype.names is None:
-            return np.asarray(self.rows[part], np.float64)
+            return np.asarray(self.rows[part], np.float64) + self.offset
         rows = self.rows[part]
-        return np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+        return np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64) + self.offset
 
     def blocks(self) -> Iterator[np.ndarray]:
         """(n, 3) float64 finite positions of the vertices, block by block."""
@@ -124,7 +126,7 @@ def _ply(path: Path) -> Surface:
         rows = points_beside_lists(path, lines) if count is None and has_lists(lines) else read_vertices(path)[0]
         if not {"x", "y", "z"} <= set(rows.dtype.names or ()):
             raise BadInput(f"{path}: its points lack x, y or z; write the file again")
-        return Surface(path, rows, None if count is None else _faces(path, lines, rows, count))
+        return Surface(path, rows, None if count is None else _faces(path, lines, rows, count), offset_in(path, lines))
     if count is None:
         return Surface(path, read_points(path)[0])
     return _other(path)
@@ -217,4 +219,4 @@ def _sound(found: Surface) -> Surface:
         faces = faces[np.concatenate(good)[faces].all(1)]
         if not len(faces):
             raise BadInput(f"{found.path}: no face with finite corners; make the mesh again")
-    return Surface(found.path, found.rows, faces)
+    return replace(found, faces=faces)
