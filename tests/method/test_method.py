@@ -355,7 +355,7 @@ def test_stereo_is_the_mesher_alone(data, tmp_path, own_cache, capsys, monkeypat
     splats = evolve(Recipe(depth=SWEEP, pretrain=replace(Recipe().pretrain, steps=1), mesh=mesher), "seed", 0)
     run(splats, data, tmp_path / "splats")
     alone = Recipe(depth=SWEEP, method=StereoFusion(mesher=mesher))
-    left = tmp_path / "alone" / "method" / ".tiles-killed"
+    left = tmp_path / "alone" / "method" / ".surfkit-tiles-killed"
 
     def killed(self, given):
         left.mkdir(parents=True)
