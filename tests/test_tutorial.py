@@ -160,7 +160,7 @@ def every_file_is_explained(run):
 def test_what_doctor_prints(monkeypatch, capsys):
     page = ROOT / "docs" / "own_photographs.md"
     command = next(span for span in spans(page) if span.startswith("surfkit doctor examples/"))
-    shown = next(block for block in code(page) if block.text.startswith("examples/boruszyn"))
+    shown = next(block for block in code(page) if block.text.startswith("data set       examples/boruszyn"))
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("COLUMNS", "400")
     assert main(command.split()[1:]) == 0

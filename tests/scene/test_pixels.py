@@ -2,10 +2,8 @@
 
 import io
 
-import cv2
 import numpy as np
 import pytest
-import rasterio
 from PIL import Image
 
 from surfkit.core.check import BadInput
@@ -14,6 +12,7 @@ from surfkit.core.registry import hookimpl, plugins
 from surfkit.scene import jpeg, large, photos
 from surfkit.scene.photos import open_picture, read_draft, read_photo, refuse_large
 from surfkit.scene.pixels import Pixels, is_opacity, kind_of, largest_of, opacity_of, white_level_of
+from tests.needs import needs
 
 SIZE = (50, 40)
 
@@ -25,7 +24,7 @@ def twelve_bits(bands=3, seed=0):
 def geotiff(path, values, **profile):
     """As GDAL writes it."""
     height, width, bands = values.shape
-    with rasterio.open(
+    with needs("rasterio").open(
         path, "w", driver="GTiff", height=height, width=width, count=bands, dtype=values.dtype, **profile
     ) as f:
         f.write(np.moveaxis(values, 2, 0))
@@ -35,7 +34,7 @@ def geotiff(path, values, **profile):
 def opencv(path, values):
     """As OpenCV writes it, which knows 16 bits of colour in PNG and TIFF."""
     order = [2, 1, 0, 3][: values.shape[2]]
-    assert cv2.imwrite(str(path), values[..., order])
+    assert needs("cv2").imwrite(str(path), values[..., order])
     return path
 
 

@@ -147,7 +147,7 @@ def test_sparse_points_only_where_depth_maps_have_none(farm):
         near = cKDTree(cloud.xyz[own].numpy()).query(cloud.xyz[own].numpy(), k=4)[0][:, 1:]
         np.testing.assert_allclose(cloud.size[own].numpy(), share * np.sqrt((near**2).mean(1)), rtol=1e-4)
     again = start.cloud(known(farm, spoilt=half))
-    assert all(torch.equal(a, b) for a, b in zip(vars(cloud).values(), vars(again).values(), strict=True))
+    assert all(torch.equal(value, vars(again)[name]) for name, value in vars(cloud).items() if torch.is_tensor(value))
 
 
 def test_maps_may_show_all_sparse_points(farm):
