@@ -11,6 +11,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.read import read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
+from tests.needs import needs
 
 from .exchange import blocks_exchange, opf, polycam, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES, realitycapture
@@ -172,7 +173,7 @@ def test_blocks_of_another_component_are_left_out(tmp_path):
 )
 def test_blocks_that_are_refused(tmp_path, given, said):
     if "EPSG:4326" in given.values():
-        pytest.importorskip("pyproj")
+        needs("pyproj")
     blocks_exchange(tmp_path, **given)
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))

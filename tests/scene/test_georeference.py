@@ -144,10 +144,9 @@ def test_damaged_georeferences(tmp_path, coords, reference, text):
 def test_survey_coordinates_keep_their_precision(tmp_path):
     move = np.array([432_123.25, 5_412_345.5, 312.0])
     plain = read(Data(surveyed(tmp_path / "plain", np.zeros(3))))
-    with collect_notes() as notes:
-        scene = read(Data(surveyed(tmp_path / "far", move), metres_per_unit=1))
+    scene = read(Data(surveyed(tmp_path / "far", move), metres_per_unit=1))
     frame = scene.frame
-    assert frame.shift == (432120.0, 5412350.0, 0.0) and "offset 432120 5412350 0" in notes.texts[0]
+    assert frame.shift == (432120.0, 5412350.0, 0.0)
     assert plain.frame.shift == (0, 0, 0) and frame.local_metres == pytest.approx(1 / frame.scale)
     np.testing.assert_allclose(scene.cloud.xyz, plain.cloud.xyz, atol=1e-6, err_msg="training sees the same scene")
     local = torch.randn(50, 3, generator=torch.Generator().manual_seed(0))
