@@ -26,7 +26,7 @@ from surfkit.sfm.ground_control import Control, Ground, doubts, place_by_points,
 from surfkit.sfm.level import points_of, turn_upright, up_of
 from surfkit.sfm.mapping import SMALLEST, map_photographs, read_model
 from surfkit.sfm.matching import matched
-from surfkit.sfm.photographs import PHOTOGRAPHS, Photo
+from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs
 from surfkit.sfm.plausible import upside_down
 from surfkit.sfm.positions import Positions, settle
 from surfkit.sfm.report import draw, model_facts, reasons
@@ -87,7 +87,13 @@ class Preparation:
 
     def _look(self) -> tuple[Sources, list[Photo]]:
         path = self.work / PHOTOGRAPHS
+        before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
+        if before and not {photo.name for photo in before} & {photo.name for photo in photos}:
+            raise BadInput(
+                f"{self.scene} was prepared from other photographs, {few([photo.name for photo in before])}, and none "
+                f"of them is in {self.root}; name another folder with --out, or delete {self.scene}"
+            )
         write_json(path, photos)
         return sources, photos
 

@@ -273,6 +273,19 @@ def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path,
     assert not list(tmp_path.rglob("*.npz"))
 
 
+def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
+    for name in ("a", "b"):
+        for at in range(3):
+            save(tmp_path / name / f"{name}{at}.jpg", picture(arc(3)[at]))
+    words = ["prepare", "photos", "--out", str(tmp_path / "s")]
+    main([*words, str(tmp_path / "a")])
+    kept = (tmp_path / "s/prepare/photographs.json").read_bytes()
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "b")]) == 2
+    assert "was prepared from other photographs, 'a0.jpg'" in capsys.readouterr().err
+    assert (tmp_path / "s/prepare/photographs.json").read_bytes() == kept
+
+
 def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):
     assert main(["prepare", "photos", str(folder), "--out", str(folder / "scene")]) == 2
     assert "lies in the folder of photographs" in capsys.readouterr().err
