@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -170,9 +171,10 @@ def reader_of(data: Data) -> Reader:
 
 
 def _finds_cameras(photos: Path) -> str:
+    command = f"surfkit prepare photos {shlex.quote(str(photos))}"  # to be pasted
     return (
-        f"`surfkit prepare photos {photos}` finds the cameras of the photographs and writes a data set, as `surfkit "
-        "train --prepare` does first"
+        f"`{command}` finds the cameras of the photographs and writes a data set, as `surfkit train --prepare` does "
+        "first"
     )
 
 
