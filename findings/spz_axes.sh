@@ -9,7 +9,7 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet gsply==0.4.6 numpy zstandard
+"$folder/venv/bin/pip" install --quiet gsply==0.4.6 numpy==2.4.6 zstandard==0.25.0
 for version in 2.7.1 3.7.0; do
     mkdir -p "$folder/$version"
     (cd "$folder/$version" && npm init -y >/dev/null && npm install --silent --no-audit --no-fund "@playcanvas/splat-transform@$version" >/dev/null)

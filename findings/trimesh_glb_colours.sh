@@ -7,7 +7,7 @@ set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
-"$folder/venv/bin/pip" install --quiet trimesh==5.2.0 numpy
+"$folder/venv/bin/pip" install --quiet trimesh==5.2.0 numpy==2.4.6
 "$folder/venv/bin/python" - "$folder" <<'PYTHON'
 import json
 import struct
