@@ -1,5 +1,7 @@
 // Shows splats in a page of its own. The data are an .spz file of version 3 (see spz.py) in base64, which the GPU
-// decodes; a worker sorts the splats by depth, and they are blended from the farthest to the nearest.
+// decodes; a worker sorts the splats by depth, and they are blended from the farthest to the nearest. Ellipsoids are
+// projected as in 3DGS, section 4; discs are met by the ray of each pixel, as in 2DGS, section 4.2: to first order, as
+// ellipsoids are, a large disc would spread over pixels that it is far from.
 "use strict";
 
 const NEAR = 0.05; // in units of the page, of which the scene takes 64
@@ -9,6 +11,8 @@ const told = document.getElementById("told");
 const canvas = document.querySelector("canvas");
 
 const VERTEX = `#version 300 es
+#define REACH 3.3290429691304455
+#define EDGE_ON 0.002
 precision highp float;
 precision highp int;
 uniform highp usampler2D splats;
@@ -18,10 +22,12 @@ uniform vec2 size; // of the picture, pixels
 uniform float focal; // pixels
 uniform float grain; // between positions
 uniform bool dims; // opacity by what the blur adds to the footprint
+uniform bool discs;
 layout(location = 0) in vec2 corner;
 layout(location = 1) in uint index;
 out vec4 color;
-out vec2 place;
+out vec3 place; // in a splat: xy / z, in standard deviations
+out vec2 away; // pixels from the middle of the blur of a disc
 
 float part(uint word) {
   return ((word & 512u) != 0u ? -1.0 : 1.0) * float(word & 511u) / 511.0 * 0.7071067811865476;
@@ -43,6 +49,60 @@ vec4 bytes(uint word) {
   return vec4(float(word & 255u), float(word >> 8 & 255u), float(word >> 16 & 255u), float(word >> 24));
 }
 
+// Where the rim of a disc, k standard deviations from its centre, lies on the screen: middle and half sides of its box.
+// axes: u and v, as long as a standard deviation, and the centre, camera frame; the rim must lie ahead of the camera.
+vec4 rim(mat3 axes, float k) {
+  vec3 weights = vec3(k * k, k * k, -1.0);
+  mat3 rows = transpose(axes);
+  float depth = dot(weights * rows[2], rows[2]);
+  vec2 middle = vec2(dot(weights * rows[0], rows[2]), dot(weights * rows[1], rows[2])) / depth;
+  vec2 square = vec2(dot(weights * rows[0], rows[0]), dot(weights * rows[1], rows[1])) / depth;
+  return focal * vec4(middle, sqrt(max(middle * middle - square, 0.0)));
+}
+
+// Places the corner of a disc; false where it is not drawn.
+bool disc(mat3 axes, float opacity, out vec2 pixel) {
+  vec2 slopes = vec2(axes[0].z, axes[1].z);
+  if (REACH * length(slopes) >= axes[2].z) return false;
+  float k = min(sqrt(2.0 * log(255.0 * opacity)), REACH);
+  vec4 box = rim(axes, k);
+  vec2 blurred = rim(axes, 3.0).xy;
+  vec2 half_sides = max(box.zw, abs(box.xy - blurred) + k * 0.7071067811865476);
+  pixel = box.xy + corner * half_sides;
+  away = pixel - blurred;
+  vec3 ray = vec3(pixel / focal, 1.0), across = cross(axes[0], axes[1]);
+  // By Cramer's rule, and linear on the screen.
+  place = vec3(dot(cross(axes[1], axes[2]), ray), dot(cross(axes[2], axes[0]), ray), dot(across, ray));
+  bool edge_on = abs(dot(across, axes[2])) < EDGE_ON * length(across) * length(axes[2]);
+  if (edge_on) place = vec3(1.0, 1.0, 0.0); // infinitely far: the blur alone is drawn
+  return true;
+}
+
+// Places the corner of an ellipsoid; false where it is not drawn.
+bool ellipsoid(mat3 axes, vec3 scales, vec3 there, inout float opacity, out vec2 pixel) {
+  vec2 reach = 0.65 * size / focal; // beyond the picture, the projection is that at its border
+  vec2 ray = clamp(there.xy / there.z, -reach, reach);
+  float zoom = focal / there.z;
+  vec3 right = zoom * (vec3(axes[0].x, axes[1].x, axes[2].x) - ray.x * vec3(axes[0].z, axes[1].z, axes[2].z)) * scales;
+  vec3 down = zoom * (vec3(axes[0].y, axes[1].y, axes[2].y) - ray.y * vec3(axes[0].z, axes[1].z, axes[2].z)) * scales;
+  float a = dot(right, right), b = dot(right, down), c = dot(down, down);
+  float sharp = a * c - b * b;
+  a += 0.3;
+  c += 0.3;
+  opacity *= (dims ? sqrt(max(sharp, 0.0) / (a * c - b * b)) : 1.0);
+  if (opacity < 1.0 / 255.0) return false;
+  float middle = 0.5 * (a + c), apart = length(vec2(0.5 * (a - c), b));
+  float longer = middle + apart, shorter = max(middle - apart, 0.05);
+  vec2 along = apart < 1e-6 * middle ? vec2(1.0, 0.0)
+    : normalize(a > c ? vec2(longer - c, b) : vec2(b, longer - a));
+  vec2 sigmas = corner * sqrt(2.0 * log(255.0 * opacity));
+  vec2 shift = sigmas.x * sqrt(longer) * along + sigmas.y * sqrt(shorter) * vec2(-along.y, along.x);
+  pixel = focal * there.xy / there.z + shift;
+  place = vec3(sigmas, 1.0);
+  away = vec2(0.0);
+  return true;
+}
+
 void main() {
   ivec2 at = ivec2(int(index % ${ROW}u) * 2, int(index / ${ROW}u));
   uvec4 first = texelFetch(splats, at, 0), second = texelFetch(splats, at + ivec2(1, 0), 0);
@@ -53,25 +113,12 @@ void main() {
   vec4 shade = bytes(first.w) / 255.0;
   vec3 scales = exp(bytes(second.y).xyz / 16.0 - 10.0);
 
-  vec2 reach = 0.65 * size / focal; // beyond the picture, the projection is that at its border
-  vec2 ray = clamp(there.xy / there.z, -reach, reach);
-  float zoom = focal / there.z;
   mat3 axes = turn * rotation(second.x);
-  vec3 right = zoom * (vec3(axes[0].x, axes[1].x, axes[2].x) - ray.x * vec3(axes[0].z, axes[1].z, axes[2].z)) * scales;
-  vec3 down = zoom * (vec3(axes[0].y, axes[1].y, axes[2].y) - ray.y * vec3(axes[0].z, axes[1].z, axes[2].z)) * scales;
-  float a = dot(right, right), b = dot(right, down), c = dot(down, down);
-  float sharp = a * c - b * b;
-  a += 0.3;
-  c += 0.3;
-  float opacity = shade.a * (dims ? sqrt(max(sharp, 0.0) / (a * c - b * b)) : 1.0);
-  if (opacity < 1.0 / 255.0) return;
-  float middle = 0.5 * (a + c), apart = length(vec2(0.5 * (a - c), b));
-  float longer = middle + apart, shorter = max(middle - apart, 0.05);
-  vec2 along = apart < 1e-6 * middle ? vec2(1.0, 0.0)
-    : normalize(a > c ? vec2(longer - c, b) : vec2(b, longer - a));
-  place = corner * sqrt(2.0 * log(255.0 * opacity));
-  vec2 shift = place.x * sqrt(longer) * along + place.y * sqrt(shorter) * vec2(-along.y, along.x);
-  vec2 pixel = focal * there.xy / there.z + shift;
+  vec2 pixel;
+  float opacity = shade.a;
+  if (discs) {
+    if (opacity < 1.0 / 255.0 || !disc(mat3(axes[0] * scales.x, axes[1] * scales.y, there), opacity, pixel)) return;
+  } else if (!ellipsoid(axes, scales, there, opacity, pixel)) return;
   gl_Position = vec4(2.0 * pixel.x / size.x, -2.0 * pixel.y / size.y, 0.0, 1.0);
 
   vec3 way = normalize(mean - eye);
@@ -85,11 +132,16 @@ void main() {
 
 const FRAGMENT = `#version 300 es
 precision highp float;
+uniform bool discs;
 in vec4 color;
-in vec2 place;
+in vec3 place;
+in vec2 away;
 out vec4 pixel;
 void main() {
-  float alpha = min(color.a * exp(-0.5 * dot(place, place)), 0.99);
+  float square = dot(place.xy, place.xy) / (place.z * place.z);
+  float blur = 2.0 * dot(away, away);
+  if (discs && !(square <= blur)) square = blur;
+  float alpha = min(color.a * exp(-0.5 * square), 0.99);
   if (alpha < 1.0 / 255.0) discard;
   pixel = vec4(color.rgb * alpha, alpha);
 }`;
@@ -178,7 +230,12 @@ function stand(at) {
   camera.view = (at + facts.views.length) % facts.views.length;
   const view = facts.views[camera.view];
   Object.assign(camera, { eye: [...view.eye], turn: [...view.turn], away: view.away, focal: view.focal, aspect: view.aspect });
-  told.textContent = [facts.title, facts.told, view.name].filter(Boolean).join(" - ");
+  tell();
+}
+
+function tell() {
+  if (document.body.dataset.state !== "drawn") return; // "loading ..." stays
+  told.textContent = [facts.title, facts.told, facts.views[camera.view].name].filter(Boolean).join(" - ");
 }
 
 const middle = () => plus(camera.eye, rows(camera.turn)[2], camera.away);
@@ -244,6 +301,7 @@ async function main() {
   gl.clearColor(0, 0, 0, 1);
   gl.uniform1f(uniform("grain"), splats.grain);
   gl.uniform1i(uniform("dims"), splats.dims ? 1 : 0);
+  gl.uniform1i(uniform("discs"), facts.discs ? 1 : 0);
   const places = Object.fromEntries(["turn", "eye", "size", "focal"].map((name) => [name, uniform(name)]));
 
   const worker = new Worker(URL.createObjectURL(new Blob([`(${sorter})()`], { type: "text/javascript" })));
@@ -293,7 +351,10 @@ async function main() {
     drawn = data.length;
     isSorting = false;
     draw();
-    document.body.dataset.state = "drawn";
+    if (document.body.dataset.state !== "drawn") {
+      document.body.dataset.state = "drawn";
+      tell();
+    }
     sort();
   };
 

@@ -35,6 +35,8 @@ MOST_VIEWS = 64
 """Places of photographs that the page knows, evenly spaced."""
 LOOKED_AT = 20_000
 """Splats by which it is found how far ahead of a camera the scene lies."""
+CELLS = 16
+"""Parts of each side of a picture, by which it is found how much of it is filled."""
 FOCAL = 1.0
 """Focal length in heights of the picture where no camera is known: 53 degrees."""
 
@@ -94,8 +96,9 @@ class Page(Format):
             "told": f"{len(kept):,} splats" + (f" of {len(table):,}" if len(kept) < len(table) else ""),
             "centre": centre.tolist(),
             "unit": unit,
+            "discs": kept.kind == "surfel",
             "up": up.tolist(),
-            "start": max(range(len(seen)), key=lambda at: seen[at]["inside"], default=0),
+            "start": max(range(len(seen)), key=lambda at: seen[at]["shown"], default=0),
             "views": seen or [_overview(up)],
         }
         with replacing(path) as file:
@@ -115,8 +118,11 @@ class Page(Format):
 
 
 def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, here: SplatTable) -> dict[str, Any]:
-    """Where a photograph was taken, in the units of the page, how far ahead of it the scene lies, and which share of
-    the splats it shows."""
+    """Where a photograph was taken, in the units of the page, how far ahead of it the scene lies, and how much it shows.
+
+    That is the share of the splats times that of the picture where there are some: a page that began at the rim of a
+    survey would be half empty.
+    """
     assert frame is not None
     pose = frame.input_pose(view.camera.world_to_camera)
     turn = pose[:3, :3]
@@ -126,9 +132,14 @@ def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, her
     camera = view.camera
     inside = (z > 0) & (np.abs(x) * camera.fx < z * camera.width / 2) & (np.abs(y) * camera.fy < z * camera.height / 2)
     away = float(np.median(z[inside])) if inside.any() else EXTENT
+    steps = [
+        (side[inside] / z[inside] * focal / length + 0.5) * CELLS
+        for side, focal, length in ((x, camera.fx, camera.width), (y, camera.fy, camera.height))
+    ]
+    filled = len(np.unique(np.stack(steps, 1).astype(int), axis=0)) / CELLS**2
     shape = {"focal": camera.fy / camera.height, "aspect": camera.width / camera.height}
     place = {"eye": eye.tolist(), "turn": turn.ravel().tolist(), "away": away}
-    return {"name": view.name, **place, **shape, "inside": float(inside.mean()) if len(few) else 0.0}
+    return {"name": view.name, **place, **shape, "shown": filled * float(inside.mean()) if len(few) else 0.0}
 
 
 def _overview(up: np.ndarray) -> dict[str, Any]:

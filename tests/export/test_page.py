@@ -2,19 +2,27 @@
 
 import base64
 import gzip
+import io
+import itertools
 import json
+import math
 import re
 import shutil
 import subprocess
+import threading
+import urllib.request
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.export.page import Page
+from surfkit.raster.api import Splats
+from surfkit.raster.reference import draw
 from surfkit.run.notes import collect_notes
 from surfkit.scene.camera import Camera
 from surfkit.scene.scene import Frame, View
@@ -23,6 +31,7 @@ from surfkit.testing.files import splat_table
 from .models import turned
 
 NODE = shutil.which("node")
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 TYPE = {"type": ""}
 
 
@@ -157,6 +166,21 @@ def test_views_are_those_of_the_cameras(tmp_path):
     assert seen["away"] * facts["unit"] * frame.scale == pytest.approx(float(np.median(z)), rel=0.2)
 
 
+def test_it_does_not_begin_at_the_rim(tmp_path):
+    """Where half a picture is empty, though all splats are in it."""
+    side = torch.linspace(-1, 1, 40, dtype=torch.float64)
+    means = torch.cartesian_prod(side, side, torch.zeros(1, dtype=torch.float64))
+    table = splat_table(count=1600, degree=0)
+    views = []
+    for name, x in (("rim", 3.0), ("middle", 0.0)):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, 3] = torch.tensor([x, 0.0, 4.0 if x else 1.8])  # from the middle, not all are seen
+        views.append(View(name, Camera(pose, 40.0, 40.0, 40.0, 20.0, 80, 40), tmp_path / name))
+    Page().write_seen(tmp_path / "a.html", replace(table, means=means), Frame(np.zeros(3), 1.0), views, None)
+    facts = facts_of(tmp_path / "a.html")
+    assert facts["views"][facts["start"]]["name"] == "middle"
+
+
 def test_of_many_splats_those_are_kept_of_which_most_is_seen(tmp_path):
     table = splat_table(count=50)
     with collect_notes() as notes:
@@ -223,3 +247,67 @@ def test_the_script_decodes_and_sorts(tmp_path):
     assert sorted(found["order"]) == np.flatnonzero(depths >= 0.05).tolist() and len(found["order"]) > 50
     assert (np.diff(depths[found["order"]]) <= 1e-4).all(), "the farthest first"
     np.testing.assert_allclose(np.reshape(found["turn"], (3, 3)) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """Draws a page in Chromium without a GPU: a file to its picture, (H, W, 3) float64 of 0 to 1."""
+    connect = pytest.importorskip("websockets.sync.client").connect
+    home = tmp_path_factory.mktemp("browser")
+    flags = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    flags += ["--remote-debugging-port=0", f"--user-data-dir={home}", "about:blank"]
+    started = subprocess.Popen([BROWSER, *flags], stderr=subprocess.PIPE, text=True)
+    address = next(line for line in started.stderr if "DevTools listening" in line).split()[-1]
+    threading.Thread(target=started.stderr.read, daemon=True).start()
+    base = address.replace("ws://", "http://").partition("/devtools")[0]
+    with urllib.request.urlopen(f"{base}/json") as answer:
+        (tab,) = [each["webSocketDebuggerUrl"] for each in json.load(answer) if each["type"] == "page"]
+    with connect(tab, max_size=None) as socket:
+
+        def call(method, **given):
+            socket.send(json.dumps({"id": (number := next(numbers)), "method": method, "params": given}))
+            while (said := json.loads(socket.recv())).get("id") != number:
+                pass
+            return said["result"]
+
+        def show(path, width, height):
+            call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+            call("Page.navigate", url=path.as_uri())
+            drawn = "document.body && document.body.dataset.state === 'drawn'"
+            while not call("Runtime.evaluate", expression=drawn)["result"].get("value"):
+                pass
+            hide = "for (const name of ['told', 'more']) document.getElementById(name).hidden = true"
+            call("Runtime.evaluate", expression=f"{hide}; new Promise(requestAnimationFrame)", awaitPromise=True)
+            data = base64.b64decode(call("Page.captureScreenshot", format="png")["data"])
+            return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")) / 255
+
+        numbers = itertools.count()
+        yield show
+        call("Browser.close")
+    started.wait()
+
+
+@pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
+@pytest.mark.parametrize("kind", ["gaussian", "surfel"])
+def test_the_page_draws_what_the_rasterizer_draws(tmp_path, kind, shown):
+    """Large splats too, beside the picture and before it: to first order, a disc spreads where it is not."""
+    table = splat_table(kind, 300, 1)
+    draws = torch.Generator().manual_seed(3)
+    means = torch.randn(300, 3, generator=draws) * 0.7
+    scales = torch.full_like(table.log_scales, math.log(0.06)) + 0.3 * torch.randn(
+        table.log_scales.shape, generator=draws
+    )
+    if kind == "surfel":
+        means[:4] = torch.tensor([[1.2, -0.9, -1.3], [-1.0, 0.8, -1.0], [0.9, 1.1, 0.4], [-1.3, -0.9, 1.0]])
+        scales[:4] = math.log(0.4)
+    table = replace(table, means=means, log_scales=scales)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 3.0
+    camera = Camera(pose, 90.0, 90.0, 60.0, 45.0, 120, 90)
+    views = [View("a", camera, tmp_path / "a.png")]
+    Page().write_seen(tmp_path / "a.html", table, Frame(np.zeros(3), 1.0), views, None)
+    sh = torch.cat([table.sh0[:, None], table.sh_rest], 1)
+    splats = Splats(kind, means, table.quats, scales.exp(), table.opacity_logits.sigmoid(), sh)
+    expected = draw(splats, camera, 1e-3).maps.color.clamp(0, 1).permute(1, 2, 0).double().numpy()
+    off = shown(tmp_path / "a.html", 120, 90) - expected
+    assert expected.std() > 0.1 and 10 * np.log10(1 / (off**2).mean()) > 42
