@@ -118,7 +118,7 @@ class Page(Format):
 
 
 def _place(view: View, frame: Frame | None, centre: np.ndarray, unit: float, here: SplatTable) -> dict[str, Any]:
-    """Where a photograph was taken, in the units of the page, how far ahead of it the scene lies, and how much it shows.
+    """Where a photograph was taken, in the units of the page, how far ahead the scene lies, and how much it shows.
 
     That is the share of the splats times that of the picture where there are some: a page that began at the rim of a
     survey would be half empty.
