@@ -32,7 +32,7 @@ def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
     steep triangles.
 
     Raises:
-        BadInput: rasterio is not installed, no raster, a picture, turned or without a place, or without heights.
+        BadInput: rasterio is not installed, no raster, a picture, without a place, or without heights.
     """
     with needed("rasterio", str(path)):
         import rasterio
