@@ -66,7 +66,7 @@ def gather(data: Data, quick: bool = False) -> Gathered:
             masks = find_masks(data.path, data.masks, capture.shots, quick) if data.path.is_dir() else {}
         except BadInput as error:
             faults.append(error)
-        told = bool(masks)  # in words of its own, how many masks there are
+        told = not all(mask.alpha for mask in masks.values())  # in words of its own, how many masks there are
         decided = Decided(dict.fromkeys(files, PLAIN), ()) if quick else decide(files, data.alpha, data.white)
         masks = with_opacity(masks, [shot for shot in capture.shots if shot.name in files], decided)
         said = [*said, *list(warnings)[len(said) + told :], *decided.lines]

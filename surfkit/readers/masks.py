@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from surfkit.core.check import BadInput, few, reject
-from surfkit.core.events import Warned, emit
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.readers.capture import Shot
 from surfkit.readers.pixels import Decided
 from surfkit.scene.cache import Cache
@@ -54,12 +54,21 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot], quick: bo
             reject(BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}"))
         elif mask := shot.mask or _of(shot, known):
             found[shot.name] = mask
-    if found:
-        emit(Warned(f"what is black in their masks is ignored in {len(found)} of {len(shots)} photographs"))
-    elif known:
+    cut_out, clear = (set(), None) if quick else _cut_out(list(dict.fromkeys(found.values())))
+    masks = {name: Mask(path, path in cut_out) for name, path in found.items()}
+    if by_colours := [name for name, mask in masks.items() if not mask.alpha]:
+        emit(Warned(f"what is black in their masks is ignored in {len(by_colours)} of {len(shots)} photographs"))
+    elif not found and known:
         emit(Warned(f"none of the {len(known)} masks has the name of a photograph; call them {FOLDER}/NAME.png"))
-    cut_out = set() if quick else _cut_out(found)
-    return {name: Mask(path, path in cut_out) for name, path in found.items()}
+    if cut_out:
+        count = f"{len(found) - len(by_colours)} of {len(shots)} photographs"
+        emit(
+            Warned(
+                f"what is transparent in their masks is ignored in {count}: these masks have an alpha channel, {clear} "
+                "has transparent pixels, and colours do not count in any of them"
+            )
+        )
+    return masks
 
 
 def with_opacity(masks: Mapping[str, Mask], shots: Sequence[Shot], decided: Decided) -> dict[str, Mask]:
@@ -172,29 +181,19 @@ def _tell(text: str, masks: tuple[Mask, ...]) -> None:
     emit(Warned(text))
 
 
-def _cut_out(found: Mapping[str, Path]) -> set[Path]:
-    """Masks by name of which the alpha channel counts: if one has transparent pixels, all that have such a channel.
+def _cut_out(paths: Sequence[Path]) -> tuple[set[Path], Path | None]:
+    """Masks of which the alpha channel counts, and one of them that has transparent pixels.
 
-    Only these are decoded, up to the first that decides.
+    They are all that have such a channel, if one has transparent pixels. Only these are decoded, up to that one.
     """
-    paths = list(dict.fromkeys(found.values()))
     with ThreadPoolExecutor(THREADS) as pool:
         having = [path for path, has in zip(paths, pool.map(_has_alpha, paths), strict=True) if has]
         for at in range(0, len(having), THREADS):
             some = having[at : at + THREADS]
             if clear := [path for path, is_clear in zip(some, pool.map(_is_clear, some), strict=True) if is_clear]:
-                break
-        else:
-            return set()
-    first = next(name for name, path in found.items() if path == clear[0])
-    others = "" if len(having) == len(paths) else f"; the other {len(paths) - len(having)} go by their colours"
-    emit(
-        Warned(
-            f"{len(having)} masks have an alpha channel, and that of {first} has transparent pixels: of all of them, "
-            f"what is opaque is kept, and colours do not count{others}"
-        )
-    )
-    return set(having)
+                return set(having), clear[0]
+            emit(Progress("looking at masks", at + len(some), len(having)))
+    return set(), None
 
 
 def _has_alpha(path: Path) -> bool:

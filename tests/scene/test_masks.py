@@ -165,8 +165,11 @@ def test_alpha_channels_count_in_all_masks_of_a_set_if_one_has_transparent_pixel
     shares = [view_mask(view).float().mean().item() for view in scene.train]
     assert shares == pytest.approx([0.75, 1.0, 0.5, 7 / 12], abs=0.06 if bent else 1e-6)
     assert [view.mask.alpha for view in scene.train] == [False, not bent, not bent, not bent]
-    told = "3 masks have an alpha channel, and that of view_002.png has transparent pixels: of all of them, what is"
-    assert f"{told} opaque is kept, and colours do not count; the other 1 go by their colours" in notes
+    assert notes == [
+        "what is black in their masks is ignored in 1 of 4 photographs",
+        "what is transparent in their masks is ignored in 3 of 4 photographs: these masks have an alpha channel, "
+        f"{farm / 'masks/view_002.png'} has transparent pixels, and colours do not count in any of them",
+    ]
     only = build_scene(Data(farm, test_every=0), read_capture(Data(farm), reader_of(Data(farm))), only={"view_001.png"})
     assert view_mask(only.train[0]).float().mean() == pytest.approx(1.0, abs=0.06 * bent)
 
