@@ -63,7 +63,7 @@ def gather(data: Data, quick: bool = False) -> Gathered:
         said, files = list(warnings), {shot.name: shot.path for shot in capture.shots if shot.path.is_file()}
         masks: dict[str, Mask] = {}
         try:
-            masks = find_masks(data.path, data.masks, capture.shots, quick) if data.path.is_dir() else {}
+            masks = find_masks(data.path, data.masks, capture.shots) if data.path.is_dir() else {}
         except BadInput as error:
             faults.append(error)
         told = not all(mask.alpha for mask in masks.values())  # in words of its own, how many masks there are

@@ -29,7 +29,7 @@ ENDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 THREADS = 4
 
 
-def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot], quick: bool = False) -> dict[str, Mask]:
+def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[str, Mask]:
     """The mask of each photograph that has one, by name.
 
     Masks are those that the data set names; `masks/NAME.png` or `masks/STEM.png` with the folders of the photograph or
@@ -42,7 +42,6 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot], quick: bo
         root: The data set.
         folder: Of the masks, relative to the data set; every folder called masks if None.
         shots: All photographs of the data set, not a part of them.
-        quick: Whether to leave that undecided, and to decode no mask.
 
     Raises:
         BadInput: The folder or a mask that the data set names is not there.
@@ -54,7 +53,7 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot], quick: bo
             reject(BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}"))
         elif mask := shot.mask or _of(shot, known):
             found[shot.name] = mask
-    cut_out, clear = (set(), None) if quick else _cut_out(list(dict.fromkeys(found.values())))
+    cut_out, clear = _cut_out(list(dict.fromkeys(found.values())))
     masks = {name: Mask(path, path in cut_out) for name, path in found.items()}
     if by_colours := [name for name, mask in masks.items() if not mask.alpha]:
         emit(Warned(f"what is black in their masks is ignored in {len(by_colours)} of {len(shots)} photographs"))
