@@ -30,7 +30,7 @@ _HOME = {
     "surfkit.scene.camera": ("Camera",),
     "surfkit.scene.observations": ("Observations", "Seen"),
     "surfkit.scene.pixels": ("Pixels",),
-    "surfkit.scene.scene": ("Cloud", "Frame", "Lens", "Scene", "View"),
+    "surfkit.scene.scene": ("Cloud", "Frame", "Lens", "Mask", "Scene", "View"),
     "surfkit.export.axes": ("FileAxes",),
     "surfkit.export.base": ("Format",),
     "surfkit.export.table": ("SplatTable", "Tile"),

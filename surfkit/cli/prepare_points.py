@@ -16,6 +16,7 @@ from surfkit.core.lock import locked
 from surfkit.readers.data import Data
 from surfkit.readers.read import reader_of
 from surfkit.run.notes import collect_notes
+from surfkit.scene.pixels import Alpha
 from surfkit.sfm.settings import WORK, Settings
 from surfkit.sfm.tie_points import TiePoints
 from surfkit.train.bars import bars
@@ -59,6 +60,15 @@ class Points:
     images: Path | None = None
     """Folder of the photographs, when it is not images/; relative to the data set."""
 
+    masks: Path | None = None
+    """Folder of the masks, if it is not called masks; relative to the data set. No features are found where they are
+    black, and they go with SCENE, undistorted."""
+
+    alpha: Alpha | None = None
+    """What becomes of transparent pixels of photographs: mask makes masks of them, blend composites them over black,
+    ignore takes their colours as stored. Default: blend, but ignore where a fourth band of a TIFF file is no
+    opacity."""
+
     @property
     def scene(self) -> Path:
         """The folder of the new data set."""
@@ -66,7 +76,8 @@ class Points:
 
     def run(self) -> None:
         """Triangulate, and print the results."""
-        data, scene = Data(self.data, layout=self.layout, images=self.images), self.scene
+        given = {"layout": self.layout, "images": self.images, "masks": self.masks, "alpha": self.alpha}
+        data, scene = Data(self.data, **given), self.scene
         way = "auto" if self.pairs == "poses" else "exhaustive"
         settings = Settings(self.longest, self.features, way, self.neighbours, seed=self.seed)
         reader_of(data)  # or one line that says what is wrong

@@ -25,6 +25,7 @@ from surfkit.doctor.photographs import Photograph, Wanted, look_at
 from surfkit.doctor.priors import priors
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
+from surfkit.readers.masks import empty_masks
 from surfkit.readers.read import RANDOM_POINTS, check_size
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
@@ -190,7 +191,7 @@ def _sizes(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> list
 
 def _masks(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
     """Masks that are damaged, of another shape, or inverted."""
-    faults = {name: bare(gathered.masks[name], look.mask_fault) for name, look in known.items() if look.mask_fault}
+    faults = {name: bare(gathered.masks[name].path, look.mask_fault) for name, look in known.items() if look.mask_fault}
     found = of_each("masks", {f"mask of {name}": text for name, text in faults.items()})
     kept = [look.kept for look in known.values() if look.kept is not None]
     empty = [name for name, look in known.items() if look.kept == 0]
@@ -201,9 +202,7 @@ def _masks(gathered: Gathered, known: dict[str, Photograph]) -> list[Finding]:
         )
         found.append(Finding("warning", "inverted-masks", text))
     elif empty:
-        count = "1 mask is" if len(empty) == 1 else f"{len(empty)} masks are"
-        text = f"{count} all black, so that nothing of the photograph counts, {few(empty)}; correct or delete it"
-        found.append(Finding("warning", "empty-masks", text, tuple(empty)))
+        found.append(Finding("warning", "empty-masks", empty_masks(empty), tuple(empty)))
     return found
 
 
@@ -311,9 +310,12 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     bent = sum(not is_pinhole(shot.camera) for shot in shots)
     if bent:
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
-    own = sum(gathered.masks.get(shot.name) == shot.path for shot in shots)
-    if count := len(gathered.masks) - own:
+    kinds = [(mask.alpha, mask.path == shot.path) for shot in shots if (mask := gathered.masks.get(shot.name))]
+    if count := kinds.count((False, False)):
         told.append(f"ignore what is black in the masks of {count} photographs")
+    if count := kinds.count((True, False)):
+        told.append(f"ignore what is transparent in the masks of {count} photographs")
+    own = kinds.count((True, True))
     if own:
         told.append(f"ignore what is transparent in {own} photographs")
     if not recipe.has_stages:

@@ -23,6 +23,7 @@ from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.read import model_folder, read_capture, reader_of
 from surfkit.scene.names import PICTURES
 from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.scene import Mask
 
 EMPTY = Capture((), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
@@ -43,7 +44,7 @@ class Gathered:
 
     layout: str | None
     capture: Capture
-    masks: dict[str, Path]
+    masks: dict[str, Mask]
     held_out: frozenset[str]
     pixels: Mapping[str, Pixels]
     loose: tuple[Path, ...]
@@ -60,12 +61,12 @@ def gather(data: Data, quick: bool = False) -> Gathered:
     with heard() as warnings, collecting() as faults:
         layout, capture = _read(data, faults)
         said, files = list(warnings), {shot.name: shot.path for shot in capture.shots if shot.path.is_file()}
-        masks: dict[str, Path] = {}
+        masks: dict[str, Mask] = {}
         try:
             masks = find_masks(data.path, data.masks, capture.shots) if data.path.is_dir() else {}
         except BadInput as error:
             faults.append(error)
-        told = bool(masks)  # in words of its own, how many masks there are
+        told = not all(mask.alpha for mask in masks.values())  # in words of its own, how many masks there are
         decided = Decided(dict.fromkeys(files, PLAIN), ()) if quick else decide(files, data.alpha, data.white)
         masks = with_opacity(masks, [shot for shot in capture.shots if shot.name in files], decided)
         said = [*said, *list(warnings)[len(said) + told :], *decided.lines]

@@ -17,6 +17,7 @@ from surfkit.doctor.exposure import luminance
 from surfkit.readers.masks import check_mask, read_mask
 from surfkit.scene.photos import open_header, read_draft
 from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.scene import Mask
 
 DRAFT = 256
 """Longer side at which photographs are looked at, pixels, or up to twice that."""
@@ -62,13 +63,13 @@ class Wanted:
 
     Attributes:
         path: Of the photograph.
-        mask: Of its mask.
+        mask: Its mask.
         places: Where the brightness is wanted, if anywhere.
         pixels: What the values of the photograph mean.
     """
 
     path: Path
-    mask: Path | None = None
+    mask: Mask | None = None
     places: Places | None = None
     pixels: Pixels = PLAIN
 
@@ -101,7 +102,7 @@ def _look(wanted: Wanted, quick: bool) -> Photograph:
     except OSError as error:
         found["fault"] = f"{wanted.path}: cannot be read: {error.strerror}"
     if wanted.mask is not None:
-        found |= _mask(wanted.mask, found.get("size"), quick, wanted.mask == wanted.path)
+        found |= _mask(wanted.mask, found.get("size"), quick)
     return Photograph(**found)
 
 
@@ -116,14 +117,15 @@ def _pixels(pixels: np.ndarray, places: Places | None) -> dict:
     return {"flat": flat, "brightness": None if places is None else luminance(pixels, places())}
 
 
-def _mask(path: Path, size: tuple[int, int] | None, quick: bool, photo: bool) -> dict:
+def _mask(mask: Mask, size: tuple[int, int] | None, quick: bool) -> dict:
     try:
         if size is not None:
-            check_mask(path, size)
+            check_mask(mask.path, size)
         if quick:
             return {}
         by = max(1, max(size or (DRAFT, DRAFT)) // DRAFT)
         width, height = size or (DRAFT, DRAFT)
-        return {"kept": float(read_mask(path, (max(1, width // by), max(1, height // by)), photo).float().mean())}
+        seen = read_mask(mask.path, (max(1, width // by), max(1, height // by)), mask.alpha)
+        return {"kept": float(seen.float().mean())}
     except BadInput as error:
         return {"mask_fault": str(error)}

@@ -75,6 +75,10 @@ class Reading:
     depth_layout: Annotated[DepthLayout | None, choice(DepthLayout, optional=True)] = None
     """Layout of the data set's depth maps, such as nerfstudio-depths; recognised if left out."""
 
+    depth_of: Literal["distorted", "undistorted"] | None = None
+    """Of which photographs the data set's depth maps are, where lenses distort and the shape of a map fits both.
+    Default: by the sparse points, and of the distorted ones where these do not tell."""
+
     test_data: Path | None = None
     """Another data set, of the same layout and in the same coordinates, whose photographs are all held out: the test
     folder of MatrixCity as CityGaussian prepares it."""

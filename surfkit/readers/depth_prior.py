@@ -17,6 +17,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import DepthFile, normal_path, read_record
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_layouts import EstimatedDepths
+from surfkit.readers.depth_lens import fits_both, has_shape, judge, lens_in
 from surfkit.readers.depth_sampling import distorted, nearest, resized, straightened, straightened_nearest
 from surfkit.readers.depth_units import Unit, far_warning, in_other_units, points_in, unit_of
 from surfkit.readers.made_maps import located
@@ -67,10 +68,12 @@ class Alignment:
     Attributes:
         typical: See `DepthPrior`.
         fits: Scale and offset of the map of each training photograph that has one which can be used, by name.
+        straight: Whether maps whose shape does not tell are of undistorted photographs.
     """
 
     typical: float
     fits: dict[str, tuple[float, float]]
+    straight: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ class Fit:
     """A map, and the scale and offset that turn its values into inverse depths in 1/local units.
 
     `trusted` is the share of its pixels with high confidence, 1 where that is not known; `unit` is what tells its unit,
-    if it has one; `lens` what distorts it, if anything does.
+    if it has one. `straight` is as for `Alignment`, `lens` what distorts it, if anything does, and `either` whether its
+    shape does not tell.
     """
 
     file: DepthFile
@@ -86,7 +90,9 @@ class Fit:
     offset: float
     trusted: float = 1.0
     unit: Unit | None = None
+    straight: bool = False
     lens: Lens | None = None
+    either: bool = False
 
 
 def prior_cache(
@@ -130,7 +136,7 @@ def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
     inverse = inverse.nan_to_num(0, 0, 0).clamp_min(0)
     beside = [None if part is None else torch.from_numpy(np.array(part)) for part in (confidence, normal)]
     trust, facing = (None if part is None else part.reshape(-1, *inverse.shape) for part in beside)
-    if (lens := _lens(view, fit.file, inverse.shape)) is not None:
+    if (lens := lens_in(view, fit.file, inverse.shape, fit.straight)) is not None:
         trust, facing = (None if part is None else straightened_nearest(part, lens) for part in (trust, facing))
         inverse = straightened(inverse, lens)
     facing = None if facing is None else nearest(facing, size)
@@ -140,18 +146,6 @@ def _read(view: View, fit: Fit, typical: float, normals: bool) -> DepthPrior:
         return DepthPrior(inverse, there, typical, facing)
     grown = interpolate(trust[None], size, mode="nearest-exact")[0, 0]
     return DepthPrior(inverse, grown * there, typical, facing)
-
-
-def _lens(view: View, file: DepthFile, shape: Sequence[int]) -> Lens | None:
-    """The lens of a map of (height, width) that is of the distorted photograph; None if nothing in it is distorted."""
-    lens = view.lens
-    return None if lens is None or file.straight or not _fits(shape, lens.width, lens.height) else lens
-
-
-def _fits(shape: Sequence[int], width: int, height: int) -> bool:
-    """Whether a map of (height, width) has the shape of a picture of a width and height."""
-    wanted = shape[1] * height / width
-    return abs(shape[0] - wanted) <= 1 + 0.01 * wanted
 
 
 def prior_files(data: Data, scene: Scene) -> dict[str, DepthFile]:
@@ -187,7 +181,10 @@ def read_priors(
     if lost:
         again = "put it back" if data.priors is None else "give the surfkit train command again, which makes it again"
         raise BadInput(f"{data.priors or data.path}: the depth map of {lost[0]} is gone; {again}")
-    fits = [Fit(maps[v.name], *known.fits[v.name]) if v.name in known.fits else None for v in scene.train]
+    fits = [
+        Fit(maps[v.name], *known.fits[v.name], straight=known.straight) if v.name in known.fits else None
+        for v in scene.train
+    ]
     return prior_cache(scene.train, fits, known.typical, budget_bytes, normals)
 
 
@@ -204,8 +201,10 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
         emit(Warned(f"{data.path} has no depth priors, so {OFF}{remedy}"))
         return Alignment(0.0, {})
     tracks = observations(data, scene)
+    verdict = judge(data, scene, maps, tracks)
+    straight = verdict.straight
     with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene), scene.train))
+        answers = list(pool.map(lambda view: _fit(view, maps.get(view.name), tracks, scene, straight), scene.train))
     fits = [answer if isinstance(answer, Fit) else None for answer in answers]
     reasons = {v.name: a for v, a in zip(scene.train, answers, strict=True) if isinstance(a, str)}
     unfit = dict.fromkeys(_outliers(fits, band), "its scale is far from that of the other images")
@@ -218,16 +217,17 @@ def alignment(data: Data, scene: Scene, normals: bool = False, band: tuple[float
     if reasons:
         emit(Warned(f"{len(reasons)} of {len(fits)} photographs train without a depth prior: {list_reasons(reasons)}"))
     _warn_of_leaks(data, scene)
-    if bent := sum(fit is not None and fit.lens is not None for fit in fits):
-        emit(Warned(f"{bent} depth maps are of distorted photographs, and are undistorted with them"))
+    used = [fit for fit in fits if fit is not None]
+    if text := verdict.line(sum(fit.lens is not None for fit in used), sum(fit.either for fit in used)):
+        emit(Warned(text))
     if text := far_warning([fit and fit.unit for fit in fits], scene):
         emit(Warned(text))
-    if text := trust_warning(float(np.mean([fit.trusted for fit in fits if fit is not None]))):
+    if text := trust_warning(float(np.mean([fit.trusted for fit in used]))):
         emit(Warned(text))
     found = {v.name: (fit.scale, fit.offset) for v, fit in zip(scene.train, fits, strict=True) if fit is not None}
     if normals and (text := normals_warning(data, [maps[name] for name in found])):
         emit(Warned(text))
-    return Alignment(typical_inverse_depth(scene.train, tracks, scene), found)
+    return Alignment(typical_inverse_depth(scene.train, tracks, scene), found, straight)
 
 
 def trust_warning(share: float) -> str | None:
@@ -262,30 +262,31 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) if more <= 1 else f"{', '.join(names[:NAMED])} and {more:,} others"
 
 
-def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene) -> Fit | str:
+def _fit(view: View, file: DepthFile | None, observations: Observations, scene: Scene, straight: bool) -> Fit | str:
     """How the map of a view becomes inverse depth, or why it cannot."""
     if file is None:
         return "no map"
     try:
         values = file.read()
         confidence, normal = file.read_confidence(), file.read_normal()
-        lens = _lens(view, file, values.shape)
+        lens, either = lens_in(view, file, values.shape, straight), fits_both(view, file, values.shape)
         _check_map(values, view, lens)
         _check_beside(values, {"confidence": confidence, "normals": normal})
         trusted = 1.0 if confidence is None else float((confidence > TRUSTED).mean())
         at, inverse, tracked = points_in(view, observations, scene, guess=file.aligned)
         at = at if lens is None else distorted(at, lens)
         if not file.aligned:
-            return Fit(file, *align(sample(values, at), inverse), trusted, lens=lens)
+            scale, offset = align(sample(values, at), inverse)
+            return Fit(file, scale, offset, trusted, None, straight, lens, either)
         unit = unit_of(values / scene.frame.scale, at, inverse, tracked)
-        return Fit(file, 1 / scene.frame.scale, 0.0, trusted, unit, lens)
+        return Fit(file, 1 / scene.frame.scale, 0.0, trusted, unit, straight, lens, either)
     except BadInput as error:
         return str(error).removeprefix(f"{file.path}: ")
 
 
 def _check_map(values: np.ndarray, view: View, lens: Lens | None) -> None:
     height, width = values.shape
-    if lens is None and not _fits(values.shape, view.camera.width, view.camera.height):
+    if lens is None and not has_shape(values.shape, view.camera.width, view.camera.height):
         raise BadInput(f"{width} x {height} px is not the shape of its photograph")
     known = values[np.isfinite(values)]
     if not len(known):

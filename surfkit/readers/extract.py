@@ -17,7 +17,7 @@ from surfkit.core.files import replacing
 from surfkit.readers.depth_prior import Alignment
 from surfkit.scene.camera import Camera
 from surfkit.scene.pixels import PLAIN, Pixels
-from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
+from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Shot:
 
     name: str
     path: Path
-    mask: Path | None
+    mask: Mask | None
     white: bool
     lens: tuple[float, float, float, float]
     size: tuple[int, int]

@@ -26,7 +26,8 @@ class Stamp:
         size: Bytes; -1 if it cannot be read.
         time_ns: When it was last written. While this and the size stay, its content is not read again.
         content: Digest of three pieces of the file, or of all of it when it is not longer or the recipe names it.
-        meaning: Digest of what else decides what its numbers mean.
+        meaning: What else decides what its numbers mean, or a digest of it; empty where that is not known, as in older
+            runs for masks.
     """
 
     size: int
@@ -134,7 +135,9 @@ def _beside_changed(old: Mapping[str, Stamp], new: Mapping[str, Stamp]) -> str |
     """What beside a photograph is not what it was."""
     for what in (*old, *new):
         a, b = old.get(what), new.get(what)
-        if a is None or b is None or (a.size, a.content, a.meaning) != (b.size, b.content, b.meaning):
+        if a is None or b is None or (a.size, a.content) != (b.size, b.content):
+            return what
+        if a.meaning and b.meaning and a.meaning != b.meaning:
             return what
     return None
 
@@ -182,9 +185,9 @@ def _print(view: View, held_out: bool, before: Print | None, maps: Mapping[str, 
 
 
 def _beside(view: View, maps: Mapping[str, DepthFile]) -> Iterator[tuple[str, Path, str]]:
-    """What lies beside a photograph: what it is, where, and a digest of what decides what its numbers mean."""
+    """What lies beside a photograph: what it is, where, and what else decides what its numbers mean."""
     if view.mask is not None:
-        yield "mask", view.mask, ""
+        yield "mask", view.mask.path, "alpha" if view.mask.alpha else "colours"
     if file := maps.get(view.name):
         yield "depth map", file.path, digest(file.meaning)
         if (path := confidence_path(file.path)).exists():

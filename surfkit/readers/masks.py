@@ -1,8 +1,11 @@
-"""Masks beside photographs: black pixels are ignored."""
+"""Masks beside photographs: what is black, or transparent, is ignored."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -11,30 +14,34 @@ from PIL import Image
 from torch import Tensor
 
 from surfkit.core.check import BadInput, few, reject
-from surfkit.core.events import Warned, emit
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.readers.capture import Shot
 from surfkit.readers.pixels import Decided
 from surfkit.scene.cache import Cache
 from surfkit.scene.photos import open_header, open_picture, photo_size
 from surfkit.scene.pixels import has_opacity, opacity_of
-from surfkit.scene.scene import View
+from surfkit.scene.scene import Mask, View
 
 FOLDER = "masks"
 MARKS = (".mask", "_mask")
 """What may follow the name of a photograph, before the ending."""
 ENDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+THREADS = 4
 
 
-def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[str, Path]:
+def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[str, Mask]:
     """The mask of each photograph that has one, by name.
 
     Masks are those that the data set names; `masks/NAME.png` or `masks/STEM.png` with the folders of the photograph or
     without, in any folder called masks; or STEM_mask.png and STEM.mask.png, there or beside the photograph.
 
+    Whether alpha channels or colours count is decided for all of them together: alone, a cut-out that is opaque
+    throughout looks like a mask by its colours, which are black as often as not.
+
     Args:
         root: The data set.
         folder: Of the masks, relative to the data set; every folder called masks if None.
-        shots: The photographs.
+        shots: All photographs of the data set, not a part of them.
 
     Raises:
         BadInput: The folder or a mask that the data set names is not there.
@@ -46,26 +53,29 @@ def find_masks(root: Path, folder: Path | None, shots: Sequence[Shot]) -> dict[s
             reject(BadInput(f"{shot.mask}: no such mask, which the data set names for {shot.name!r}"))
         elif mask := shot.mask or _of(shot, known):
             found[shot.name] = mask
-    if found:
-        emit(Warned(f"what is black in their masks is ignored in {len(found)} of {len(shots)} photographs"))
-        if clear := [name for name, path in found.items() if _may_be_clear(path)]:
-            emit(
-                Warned(
-                    f"{len(clear)} masks have an alpha channel, that of {clear[0]} for one: where some of it is "
-                    "transparent, what is opaque is kept, and its colours do not count"
-                )
-            )
-    elif known:
+    cut_out, clear = _cut_out(list(dict.fromkeys(found.values())))
+    masks = {name: Mask(path, path in cut_out) for name, path in found.items()}
+    if by_colours := [name for name, mask in masks.items() if not mask.alpha]:
+        emit(Warned(f"what is black in their masks is ignored in {len(by_colours)} of {len(shots)} photographs"))
+    elif not found and known:
         emit(Warned(f"none of the {len(known)} masks has the name of a photograph; call them {FOLDER}/NAME.png"))
-    return found
+    if cut_out:
+        count = f"{len(found) - len(by_colours)} of {len(shots)} photographs"
+        emit(
+            Warned(
+                f"what is transparent in their masks is ignored in {count}: these masks have an alpha channel, {clear} "
+                "has transparent pixels, and colours do not count in any of them"
+            )
+        )
+    return masks
 
 
-def with_opacity(masks: Mapping[str, Path], shots: Sequence[Shot], decided: Decided) -> dict[str, Path]:
+def with_opacity(masks: Mapping[str, Mask], shots: Sequence[Shot], decided: Decided) -> dict[str, Mask]:
     """Masks by name, with photographs whose own opacity is the mask; a mask that is there already goes before it."""
     both, own = [], {}
     for shot in shots:
         if decided.pixels[shot.name].alpha == "mask":
-            own[shot.name] = shot.path
+            own[shot.name] = Mask(shot.path, alpha=True)
             both += [shot.name] if shot.name in masks else []
     if both:
         text = f"{len(both)} photographs have a mask and an opacity, {few(both)}"
@@ -73,28 +83,23 @@ def with_opacity(masks: Mapping[str, Path], shots: Sequence[Shot], decided: Deci
     return {**own, **masks}
 
 
-def read_mask(path: Path, size: tuple[int, int], photo: bool = False) -> Tensor:
+def read_mask(path: Path, size: tuple[int, int], alpha: bool = False) -> Tensor:
     """(H, W) bool of a mask at another size: False where it is black, and the pixel is to be ignored.
 
-    Black is the lower half of the values; in a mask of 0 and 1 it is 0. Of a mask of which pixels are transparent, what
-    is opaque by half is kept, whatever colour it has.
+    Black is the lower half of the values; in a mask of 0 and 1 it is 0.
 
     Args:
         path: Any picture.
         size: Width and height wanted; every pixel takes the nearest one of the mask.
-        photo: Whether it is the photograph itself, of which the opacity alone counts.
+        alpha: Whether its alpha channel counts, and not its colours: what is opaque by half is kept.
 
     Raises:
         BadInput: The file is damaged.
     """
 
     def decode(image: Image.Image) -> np.ndarray:
-        if has_opacity(image):
-            clear = opacity_of(image)
-            if photo or clear.min(initial=255) < 255:
-                return np.asarray(Image.fromarray(clear).resize(size, Image.Resampling.NEAREST)) > 127
-        if photo:
-            return np.ones((size[1], size[0]), bool)
+        if alpha and has_opacity(image):
+            return np.asarray(Image.fromarray(opacity_of(image)).resize(size, Image.Resampling.NEAREST)) > 127
         plain = image.convert("L") if image.mode in ("1", "P", "PA", "RGBA", "LA", "CMYK") else image
         values = np.asarray(plain.resize(size, Image.Resampling.NEAREST))
         return values.max(-1) if values.ndim == 3 else values
@@ -108,10 +113,21 @@ def read_mask(path: Path, size: tuple[int, int], photo: bool = False) -> Tensor:
 
 
 def mask_cache(views: Sequence[View], budget_bytes: int | None = None) -> Cache[Tensor | None] | None:
-    """The masks of views by position, (H, W) bool or None; None if no view has one."""
+    """The masks of views by position, (H, W) bool or None; None if no view has one.
+
+    Once all of them have been read, a line names those that keep nothing of their photographs.
+    """
     if not any(view.mask for view in views):
         return None
-    return Cache(lambda at: view_mask(views[at]), mask_sizes(views), budget_bytes)
+    looked_at = _Emptied(views)
+
+    def read(at: int) -> Tensor | None:
+        mask = view_mask(views[at])
+        if mask is not None:
+            looked_at.note(at, bool(mask.any()))
+        return mask
+
+    return Cache(read, mask_sizes(views), budget_bytes)
 
 
 def mask_sizes(views: Sequence[View]) -> list[int]:
@@ -122,7 +138,7 @@ def mask_sizes(views: Sequence[View]) -> list[int]:
 def view_mask(view: View) -> Tensor | None:
     """(H, W) bool of the mask of a view, if it has one, at the size of its camera."""
     size = view.camera.width, view.camera.height
-    return None if view.mask is None else read_mask(view.mask, size, view.mask == view.path)
+    return None if view.mask is None else read_mask(view.mask.path, size, view.mask.alpha)
 
 
 def check_mask(path: Path, size: tuple[int, int]) -> None:
@@ -132,12 +148,74 @@ def check_mask(path: Path, size: tuple[int, int]) -> None:
         raise BadInput(f"{path}: {width} x {height} px is not the shape of its photograph; make the mask anew")
 
 
-def _may_be_clear(path: Path) -> bool:
+def empty_masks(names: Sequence[str]) -> str:
+    """What to say of masks that keep nothing, by the names of their photographs."""
+    count = "1 mask keeps" if len(names) == 1 else f"{len(names)} masks keep"
+    return f"{count} nothing of the photograph, {few(names)}; correct or delete {'it' if len(names) == 1 else 'them'}"
+
+
+class _Emptied:
+    """Says of masks, once all have been read, which keep nothing of their photographs: they are decoded once."""
+
+    def __init__(self, views: Sequence[View]) -> None:
+        self._views, self._empty, self._lock = views, [], threading.Lock()
+        self._left = {at for at, view in enumerate(views) if view.mask is not None}
+
+    def note(self, at: int, keeps: bool) -> None:
+        """The mask of a position was read, and keeps something or not."""
+        with self._lock:
+            if at not in self._left:
+                return
+            self._left.remove(at)
+            self._empty += [] if keeps else [at]
+            done = not self._left
+        if done and self._empty:
+            views = [self._views[at] for at in sorted(self._empty)]
+            _tell(empty_masks([view.name for view in views]), tuple(view.mask for view in views))
+
+
+@lru_cache(maxsize=256)
+def _tell(text: str, masks: tuple[Mask, ...]) -> None:
+    """Say something of masks once, however many stages read them."""
+    emit(Warned(text))
+
+
+def _cut_out(paths: Sequence[Path]) -> tuple[set[Path], Path | None]:
+    """Masks of which the alpha channel counts, and one of them that has transparent pixels.
+
+    They are all that have such a channel, if one has transparent pixels. Only these are decoded, up to that one.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        having = [path for path, has in zip(paths, pool.map(_has_alpha, paths), strict=True) if has]
+        for at in range(0, len(having), THREADS):
+            some = having[at : at + THREADS]
+            if clear := [path for path, is_clear in zip(some, pool.map(_is_clear, some), strict=True) if is_clear]:
+                return set(having), clear[0]
+            emit(Progress("looking at masks", at + len(some), len(having)))
+    return set(), None
+
+
+def _has_alpha(path: Path) -> bool:
     """Whether a mask has an alpha channel."""
     try:
         return open_header(path, has_opacity)
     except BadInput:  # told when the mask is looked at
         return False
+
+
+def _is_clear(path: Path) -> bool:
+    """Whether a mask with an alpha channel has transparent pixels."""
+    try:
+        stat = path.stat()
+        return _decoded_is_clear(path, stat.st_size, stat.st_mtime_ns)
+    except (BadInput, OSError):  # told when the mask is looked at
+        return False
+
+
+@lru_cache(maxsize=1 << 17)
+def _decoded_is_clear(path: Path, size: int, time_ns: int) -> bool:
+    """The same of a file of a size and time: a command may read its data set several times."""
+    return open_picture(path, lambda image: int(opacity_of(image).min(initial=255)) < 255)
 
 
 def _folders(root: Path, folder: Path | None) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
@@ -30,7 +30,7 @@ from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES, VIDEOS, is_video
 from surfkit.scene.observations import Observations, Seen
 from surfkit.scene.photos import is_turned, photo_size, refuse_large
-from surfkit.scene.scene import Cloud, Frame, Lens, Scene, View
+from surfkit.scene.scene import Cloud, Frame, Lens, Mask, Scene, View
 
 RANDOM_POINTS = 50_000
 """Where a data set has no sparse points."""
@@ -99,8 +99,9 @@ def build_scene(
     frame = _frame(data, capture, poses)
     data, shots = reduced(data, shots)
     decided = decide({shot.name: shot.path for shot in shots}, data.alpha, data.white)
+    masks = with_opacity(find_masks(data.path, data.masks, shots), shots, decided)
     wanted = [shot for shot in shots if only is None or shot.name in only]
-    views = _views(data, wanted, decided, frame, keep, pixels)
+    views = _views(data, wanted, decided, masks, frame, keep, pixels)
     scene = Scene(
         name=data.path.resolve().name,
         train=tuple(view for view in views if view.name not in held_out),
@@ -229,7 +230,13 @@ def _wanted() -> str:
 
 
 def _views(
-    data: Data, shots: Sequence[Shot], decided: Decided, frame: Frame, keep: Path | None, pixels: bool
+    data: Data,
+    shots: Sequence[Shot],
+    decided: Decided,
+    masks: Mapping[str, Mask],
+    frame: Frame,
+    keep: Path | None,
+    pixels: bool,
 ) -> list[View]:
     """The photographs at the size to use them at, undistorted."""
 
@@ -240,7 +247,6 @@ def _views(
 
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
-    masks = with_opacity(find_masks(data.path, data.masks, shots), shots, decided)
     with ThreadPoolExecutor(4) as pool:
         sizes = list(pool.map(lambda shot: photo_size(shot.path), shots))
         turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
@@ -248,7 +254,7 @@ def _views(
             check_size(shot, size)
             refuse_large(shot.path, size, data.size(*size))
             if shot.name in masks:
-                check_mask(masks[shot.name], size)
+                check_mask(masks[shot.name].path, size)
         given = [
             Picture(
                 shot.path,

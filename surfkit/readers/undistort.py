@@ -20,7 +20,7 @@ from surfkit.readers.masks import read_mask
 from surfkit.scene.copies import digest, place
 from surfkit.scene.photos import read_photo
 from surfkit.scene.pixels import PLAIN, Pixels
-from surfkit.scene.scene import Lens
+from surfkit.scene.scene import Lens, Mask
 
 FOLDER = "undistorted"
 RECIPE = "1"
@@ -38,7 +38,7 @@ class Picture:
 
     Attributes:
         path: On disk.
-        mask: On disk, if it has one.
+        mask: Its mask, if it has one.
         camera: pycolmap.Camera.
         size: Width and height to use it at.
         white: Whether its transparent pixels lie over white, or over black.
@@ -46,7 +46,7 @@ class Picture:
     """
 
     path: Path
-    mask: Path | None
+    mask: Mask | None
     camera: Any
     size: tuple[int, int]
     white: bool = False
@@ -91,15 +91,16 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
         if mask is not None:
             _save(mask, _keep(picture, grid, inside).to(torch.uint8).mul(255)[None].expand(3, -1, -1))
         photo = read_photo(picture.path, picture.size, picture.white, picture.pixels).float()
-        if picture.mask == picture.path:  # colours of transparent pixels are none, and do not spread
-            shown = read_mask(picture.path, picture.size, photo=True).float()[None]
+        if _is_own_mask(picture):  # colours of transparent pixels are none, and do not spread
+            shown = read_mask(picture.path, picture.size, alpha=True).float()[None]
             parts = grid_sample(torch.cat([photo * shown, shown])[None], grid, "bicubic", "border", align_corners=False)
             values = parts[0, :3] / parts[0, 3:].clamp(min=0.1)
         else:
             values = grid_sample(photo[None], grid, "bicubic", "border", align_corners=False)[0]
         _save(path, (values * inside).round().clamp(0, 255).to(torch.uint8))  # last: with it, the mask is there too
     size = camera.width, camera.height
-    return replace(picture, path=path, mask=mask, camera=camera, size=size, pixels=PLAIN)
+    kept = None if mask is None else Mask(mask)
+    return replace(picture, path=path, mask=kept, camera=camera, size=size, pixels=PLAIN)
 
 
 def pinhole_of(picture: Picture) -> Picture:
@@ -146,14 +147,20 @@ def _keep(picture: Picture, grid: Tensor, inside: Tensor) -> Tensor:
     """(h, w) bool: pixels that the photograph shows and its mask keeps."""
     if picture.mask is None:
         return inside
-    mask = read_mask(picture.mask, picture.size, picture.mask == picture.path).float()[None, None]
+    mask = read_mask(picture.mask.path, picture.size, picture.mask.alpha).float()[None, None]
     return inside & (grid_sample(mask, grid, "nearest", "border", align_corners=False)[0, 0] > 0.5)
+
+
+def _is_own_mask(picture: Picture) -> bool:
+    """Whether the opacity of a photograph is its mask."""
+    return picture.mask is not None and picture.mask.path == picture.path
 
 
 def _cached(picture: Picture, lens: Lens, root: Path) -> str:
     """The name of the undistorted picture, which depends on all that it was made from; as earlier versions spelt it."""
-    paths = [path for path in (picture.path, picture.mask) if path is not None]
+    paths = [picture.path] if picture.mask is None else [picture.path, picture.mask.path]
     values = "" if picture.pixels == PLAIN else f" {picture.pixels}"
+    values += " alpha" if picture.mask is not None and picture.mask.alpha and not _is_own_mask(picture) else ""
     return f"{picture.path.stem}-{digest(root, f'{RECIPE} _{lens} {picture.white}{values}', paths)}.png"
 
 

@@ -37,6 +37,19 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class Mask:
+    """What of a photograph is to be ignored.
+
+    Attributes:
+        path: A picture on disk; that of the photograph itself where its opacity is the mask.
+        alpha: Whether its alpha channel counts: what is opaque is kept. If not, its colours: what is black is ignored.
+    """
+
+    path: Path
+    alpha: bool = False
+
+
+@dataclass(frozen=True)
 class View:
     """One photograph and the camera that took it.
 
@@ -44,7 +57,7 @@ class View:
         name: Path of the photograph below the image folder, as the data set spells it.
         camera: At the size used in training.
         path: The photograph on disk.
-        mask: Its mask on disk, black where the photograph is to be ignored.
+        mask: Its mask, if it has one.
         white: Whether its transparent pixels lie over white, or over black.
         lens: That of the photograph of which `path` is the undistorted picture; None where nothing was distorted.
         pixels: What the values of the file mean.
@@ -53,7 +66,7 @@ class View:
     name: str
     camera: Camera
     path: Path
-    mask: Path | None = None
+    mask: Mask | None = None
     white: bool = False
     lens: Lens | None = None
     pixels: Pixels = PLAIN

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from surfkit.core.check import BadInput
-from surfkit.core.events import Progress, emit
+from surfkit.core.check import BadInput, few
+from surfkit.core.events import Progress, Warned, emit
 from surfkit.core.files import replacing
 from surfkit.scene.photos import read_photo
 from surfkit.sfm.engine import load_engine
@@ -87,6 +87,9 @@ def find_features(photos: Sequence[Photo], sources: Sources, folder: Path, setti
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
+    if bare := [photo.name for photo in photos if photo.mask and not counts[photo.name]]:
+        said = f"no features are where the masks of {len(bare)} photographs keep something, {few(bare)}"
+        emit(Warned(f"{said}; correct or delete masks that keep nothing"))
     return {photo.name: counts[photo.name] for photo in photos}
 
 

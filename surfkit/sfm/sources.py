@@ -15,6 +15,7 @@ from surfkit.readers.capture import Shot
 from surfkit.readers.masks import ENDS, check_mask, find_masks, read_mask
 from surfkit.readers.masks import FOLDER as MASKS
 from surfkit.scene.names import PICTURES, is_video
+from surfkit.scene.scene import Mask
 from surfkit.sfm.exif import Exif
 from surfkit.sfm.frames import Taken, take_frames
 from surfkit.sfm.photographs import Photo, files_of, known_photographs, look, look_at
@@ -35,7 +36,7 @@ class Sources:
     root: Path
     videos: frozenset[str] = frozenset()
     frames: Path | None = None
-    masks: Mapping[str, Path] = field(default_factory=dict)
+    masks: Mapping[str, Mask] = field(default_factory=dict)
 
     def path(self, name: str) -> Path:
         """The file of a photograph."""
@@ -46,7 +47,7 @@ class Sources:
     def read_mask(self, name: str, size: tuple[int, int]) -> np.ndarray:
         """(H, W) bool of the mask of a photograph, at a width and height: False where it is to be ignored."""
         mask = self.masks[name]
-        return read_mask(mask, size, mask == self.path(name)).numpy()
+        return read_mask(mask.path, size, mask.alpha).numpy()
 
 
 def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tuple[Sources, list[Photo]]:
@@ -72,8 +73,7 @@ def look_at_all(given: Path, work: Path, record: Path, settings: Settings) -> tu
     if paths := [folder / video / name for video, found in sorted(taken.items()) for name in found.names]:
         frames = look_at(folder, paths, known)
         photos += [replace(frame, exif=Exif(camera=f"video {frame.name.rpartition('/')[0]}")) for frame in frames]
-    photos = [replace(photo, mask=_own_mask(photo)) for photo in photos]
-    sources = replace(sources, masks={photo.name: sources.path(photo.name) for photo in photos if photo.mask})
+    sources, photos = with_own_masks(sources, photos)
     if settings.masks is not None:
         return _with_masks(sources, photos, settings.masks)
     if inside := [photo.name for photo in photos if MASKS in photo.name.lower().split("/")[:-1]]:
@@ -112,24 +112,36 @@ def _with_masks(sources: Sources, photos: Sequence[Photo], folder: Path) -> tupl
     """The same with the masks of a folder, or BadInput for one that has not the shape of its photograph."""
     shots = [Shot(photo.name, np.eye(4), None, sources.path(photo.name)) for photo in photos]
     masks = find_masks(sources.root, folder.absolute(), shots)
-    masks = {name: path for name, path in masks.items() if path.is_relative_to(folder.absolute())}
+    masks = {name: mask for name, mask in masks.items() if mask.path.is_relative_to(folder.absolute())}
     if not masks:
         named = "NAME.jpg.png or NAME.png, as the photograph NAME.jpg"
         raise BadInput(f"--masks {folder}: no picture in it has the name of a photograph; call masks {named}")
     idle = [path.name for path in sorted(folder.absolute().rglob("*")) if path.suffix.lower() in ENDS]
-    idle = [name for name in idle if name not in {path.name for path in masks.values()}]
+    idle = [name for name in idle if name not in {mask.path.name for mask in masks.values()}]
     if idle:
         emit(Warned(f"--masks {folder}: {len(idle)} masks have the name of no photograph: {few(idle)}"))
+    return with_masks(sources, photos, masks)
+
+
+def with_masks(sources: Sources, photos: Sequence[Photo], masks: Mapping[str, Mask]) -> tuple[Sources, list[Photo]]:
+    """The same with masks by the names of photographs.
+
+    Raises:
+        BadInput: A mask is damaged or has not the shape of its photograph.
+    """
     found = []
     for photo in photos:
         digest = photo.mask
-        if photo.usable and photo.name in masks:
-            check_mask(masks[photo.name], photo.size)
-            digest = hashlib.sha256(masks[photo.name].read_bytes()).hexdigest()[:32]
+        if photo.usable and (mask := masks.get(photo.name)):
+            check_mask(mask.path, photo.size)
+            digest = hashlib.sha256(mask.path.read_bytes()).hexdigest()[:32]
+            digest = f"alpha {digest}" if mask.alpha else digest
         found.append(replace(photo, mask=digest))
     return replace(sources, masks={**sources.masks, **masks}), found
 
 
-def _own_mask(photo: Photo) -> str:
-    """Digest of the mask that the opacity of a photograph is, where it is to be one; else nothing."""
-    return f"opacity {photo.digest}" if photo.usable and photo.reading.alpha == "mask" else ""
+def with_own_masks(sources: Sources, photos: Sequence[Photo]) -> tuple[Sources, list[Photo]]:
+    """The same with the opacity of photographs as their masks, where it is to be one, and no others."""
+    own = {p.name: f"opacity {p.digest}" for p in photos if p.usable and p.reading.alpha == "mask"}
+    masks = {name: Mask(sources.path(name), alpha=True) for name in own}
+    return replace(sources, masks=masks), [replace(photo, mask=own.get(photo.name, "")) for photo in photos]

@@ -6,7 +6,7 @@ What comes out is a COLMAP model of the same cameras, in the same coordinates, w
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,14 @@ from surfkit.scene.photos import photo_size
 from surfkit.scene.scene import Frame
 from surfkit.sfm.compare import compare
 from surfkit.sfm.deliver import deliver
+from surfkit.sfm.deliver_masks import deliver_masks
 from surfkit.sfm.engine import load_engine, run
 from surfkit.sfm.features import FEWEST
 from surfkit.sfm.mapping import SMALLEST, read_model
 from surfkit.sfm.photographs import PHOTOGRAPHS, Photo, known_photographs, look_at
 from surfkit.sfm.report import model_facts
 from surfkit.sfm.settings import REPORT, WORK, Settings
-from surfkit.sfm.sources import Sources
+from surfkit.sfm.sources import Sources, with_masks, with_own_masks
 
 
 @dataclass(frozen=True)
@@ -68,11 +69,11 @@ class TiePoints:
         root, shots = _by_path(capture)
         self._tell_what_is_lost(capture)
         stages = Stages(self.work)
-        photos = stages.run("photographs", "", lambda: self._look(root, shots))
+        sources, photos = stages.run("photographs", "", lambda: self._look(root, shots))
         cameras = {photo.name: _camera(shots[photo.name], photo.size) for photo in photos}
         offset = _offset(capture)
         poses = {name: _moved(shots[name].pose, offset) for name in cameras}
-        found = compare(stages, photos, Sources(root), self.work, self.settings, cameras, poses)
+        found = compare(stages, photos, sources, self.work, self.settings, cameras, poses)
         if poor := [name for name, count in found.counts.items() if count < FEWEST]:
             emit(Warned(f"{len(poor)} of {len(photos)} photographs have hardly any features: {few(poor)} are left out"))
         key = key_of(found.key, [pose.tolist() for pose in poses.values()])
@@ -89,9 +90,7 @@ class TiePoints:
         if placed is None:  # no file to keep an offset in
             model.transform(load_engine().Sim3d(1.0, load_engine().Rotation3d(), offset))
         by_name = {photo.name: photo for photo in photos}
-        stages.run(
-            "undistortion", "", lambda: deliver([(model, placed)], by_name, Sources(root), self.scene, self.work)
-        )
+        stages.run("undistortion", "", lambda: self._deliver(model, placed, by_name, sources))
         report = {
             "photographs": len(capture.shots),
             "registered": model.num_reg_images(),
@@ -104,18 +103,20 @@ class TiePoints:
 
     def _tell_what_is_lost(self, capture: Capture) -> None:
         """Say what of the data set the new one has not."""
-        if masks := find_masks(self.data.path, self.data.masks, capture.shots):
-            emit(Warned(f"{len(masks)} masks are not taken over: photographs of {self.scene} have other pixels"))
         if capture.held_out:
             named = few(sorted(capture.held_out))
             emit(Warned(f"which photographs the data set keeps from training is not taken over: {named} (--test-list)"))
         if capture.metres and capture.crs is None and capture.metres != 1:
             emit(Warned(f"the unit is not taken over: give --metres-per-unit {capture.metres:g} when you train"))
 
-    def _look(self, root: Path, names: Iterable[str]) -> list[Photo]:
-        """The photographs of the data set that can be used."""
-        path = self.work / PHOTOGRAPHS
-        photos = look_at(root, [root / name for name in sorted(names)], known_photographs(path))
+    def _look(self, root: Path, shots: Mapping[str, Shot]) -> tuple[Sources, list[Photo]]:
+        """The photographs of the data set that can be used, and where they and their masks are."""
+        path, data = self.work / PHOTOGRAPHS, self.data
+        paths = [root / name for name in sorted(shots)]
+        photos = look_at(root, paths, known_photographs(path), data.alpha, ("--alpha",))
+        known = find_masks(data.path, data.masks, list(shots.values()))
+        masks = {name: known[shot.name] for name, shot in shots.items() if shot.name in known}
+        sources, photos = with_masks(*with_own_masks(Sources(root), photos), masks)
         write_json(path, photos)
         if wrong := [f"{photo.name} ({photo.problem})" for photo in photos if not photo.usable]:
             emit(Warned(f"{len(wrong)} of {len(photos)} photographs cannot be used, and are left out: {few(wrong)}"))
@@ -124,7 +125,12 @@ class TiePoints:
             raise BadInput(
                 f"{root}: {len(usable)} of {len(photos)} photographs can be used; {SMALLEST} or more are needed"
             )
-        return usable
+        return sources, usable
+
+    def _deliver(self, model: Any, placed: Placed | None, photos: dict[str, Photo], sources: Sources) -> None:
+        """Write photographs, masks and the model of the data set."""
+        deliver_masks([model], photos, sources, self.scene, self.work)
+        deliver([(model, placed)], photos, sources, self.scene, self.work)
 
     def _triangulate(self, database: Path, poses: Mapping[str, np.ndarray]) -> Any:
         """The model with points between the cameras, kept in `points/`."""

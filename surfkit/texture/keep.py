@@ -84,7 +84,9 @@ def seen(views: Sequence[View]) -> str:
         camera = view.camera
         lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height
         found.update(f"{view.name} {lens}".encode() + camera.world_to_camera.contiguous().numpy().tobytes())
-        for path in (view.path, view.mask):
+        mask = view.mask and view.mask.path
+        found.update(b"alpha" if view.mask is not None and view.mask.alpha else b"")
+        for path in (view.path, mask):
             facts = path.stat() if path is not None and path.exists() else None
             found.update(f"{facts and (facts.st_size, facts.st_mtime_ns)}".encode())
     return found.hexdigest()

@@ -229,7 +229,7 @@ FAULTS = {
         lambda f: [masks_of(255)(f), paint("masks/view_003.png", np.zeros((48, 64), np.uint8))(f)],
         "empty-masks",
         "warning",
-        "1 mask is all black, so that nothing of the photograph counts, 'view_003.png'; correct or delete it",
+        "1 mask keeps nothing of the photograph, 'view_003.png'; correct or delete it",
     ),
     "mask-shape": (
         lambda f: [masks_of(255)(f), paint("masks/view_003.png", np.zeros((48, 20), np.uint8))(f)],

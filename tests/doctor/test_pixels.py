@@ -75,7 +75,9 @@ def test_masks_with_an_alpha_channel_are_told(farm):
     for path in (farm / "images").iterdir():
         Image.fromarray(np.dstack([np.zeros((48, 64, 3), np.uint8), alpha])).save(farm / "masks" / path.name)
     found = diagnosed(farm)
-    assert [text for text in (each.text for each in found.findings) if text.startswith("6 masks have an alpha channel")]
+    said = "what is transparent in their masks is ignored in 6 of 6 photographs: these masks have an alpha channel"
+    assert [text for text in (each.text for each in found.findings) if text.startswith(said)]
+    assert "ignore what is transparent in the masks of 6 photographs" in found.will
     assert not [finding for finding in found.findings if finding.what == "inverted-masks"]
 
 

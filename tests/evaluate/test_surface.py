@@ -231,28 +231,31 @@ def test_a_file_that_is_no_scan_is_refused(tmp_path):
         read_surface(tmp_path / "a.e57")
 
 
+@pytest.mark.filterwarnings("error::PendingDeprecationWarning:surfkit.evaluate.geometry.heights")
+@pytest.mark.parametrize("turned", [0.0, 0.5])
 @pytest.mark.parametrize("north_up", [True, False])
-def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, told, monkeypatch):
+def test_a_raster_of_heights_is_a_mesh(tmp_path, north_up, turned, told, monkeypatch):
     rasterio = needs("rasterio")
     rows, columns = np.indices((30, 40))
     heights = (100 + 0.5 * columns + 0.25 * rows).astype(np.float32)
     heights[3, 4] = -9999
     step = -2.0 if north_up else 2.0
-    place = rasterio.Affine(2.0, 0, 500_000.0, 0, step, 5_800_000.0)
+    place = rasterio.Affine(2.0, turned, 500_000.0, turned / 2, step, 5_800_000.0)
     kind = {"driver": "GTiff", "width": 40, "height": 30, "count": 1, "dtype": "float32", "nodata": -9999}
     with rasterio.open(tmp_path / "dsm.tif", "w", **kind, transform=place, crs="EPSG:32633") as file:
         file.write(heights, 1)
     found = read_surface(tmp_path / "dsm.tif")
     xyz = found.vertices()
     assert len(xyz) == 30 * 40 - 1 and system_of(tmp_path / "dsm.tif") == "EPSG:32633"
-    column, row = (xyz[:, 0] - 500_000) / 2 - 0.5, (xyz[:, 1] - 5_800_000) / step - 0.5
+    axes = np.array([[2.0, turned], [turned / 2, step]])
+    column, row = np.linalg.solve(axes, (xyz[:, :2] - (500_000, 5_800_000)).T) - 0.5
     assert np.allclose(xyz[:, 2], 100 + 0.5 * column + 0.25 * row, atol=1e-4)
     corners = xyz[found.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (normals[:, 2] > 0).all()
     flat = np.abs(normals[:, 2]).sum() / 2
-    # Six of the triangles of two square units each meet in the cell without a height.
-    assert flat == pytest.approx(4 * 29 * 39 - 6 * 2)
+    # Six of the triangles of half a cell each meet in the cell without a height.
+    assert flat == pytest.approx(abs(np.linalg.det(axes)) * (29 * 39 - 6 / 2))
     monkeypatch.setattr("surfkit.evaluate.geometry.heights.MAX_CELLS", 300)
     assert len(read_surface(tmp_path / "dsm.tif")) < 320 and "read as 20 x 15" in told[-1]
 

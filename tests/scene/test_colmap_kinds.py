@@ -236,7 +236,7 @@ def test_what_a_lens_does_not_show_is_masked(farm):
     if view.mask is not None:
         from surfkit.readers.masks import read_mask
 
-        keep = read_mask(view.mask, (view.camera.width, view.camera.height))
+        keep = read_mask(view.mask.path, (view.camera.width, view.camera.height))
         assert (view_photo(view)[:, ~keep] == 0).all()
 
 

@@ -9,7 +9,7 @@ from surfkit.doctor.examine import examine
 from surfkit.readers.capture import load_pycolmap
 from surfkit.readers.data import Data
 from surfkit.readers.depth_files import confidence_path, normal_path, save_array, write_map, write_record
-from surfkit.readers.depth_prior import read_priors
+from surfkit.readers.depth_prior import alignment, read_priors
 from surfkit.readers.depth_sampling import straightened
 from surfkit.readers.extract import load, of, save
 from surfkit.readers.read import read
@@ -20,6 +20,8 @@ from surfkit.testing.synthetic import photograph
 from .folders import FLIGHT, lens, nerfstudio, views_of
 
 BENT = {"k1": -0.15, "k2": 0.02, "p1": 0.003, "p2": -0.002}
+SLIGHTLY = {"k1": -0.06, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+"""Undistorted photographs have the shape of the distorted ones, within the rounding of their size."""
 
 
 @pytest.fixture(scope="module")
@@ -48,17 +50,17 @@ def pixels(width, height):
     return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
 
 
-def scene_with_maps(folder, truth, unit=1.0, by=1, points=True, edit=None):
+def scene_with_maps(folder, truth, unit=1.0, by=1, points=True, bend=BENT):
     """A nerfstudio folder of a distorted lens with depth maps of its photographs, whose stored depth times `unit` is
     in units of the poses, and which are `by` times as large as the photographs."""
     ground, c = Ground(truth), lens(truth)
     camera = load_pycolmap().Camera(
-        model="OPENCV", width=c["w"], height=c["h"], params=[c["fl_x"], c["fl_y"], c["cx"], c["cy"], *BENT.values()]
+        model="OPENCV", width=c["w"], height=c["h"], params=[c["fl_x"], c["fl_y"], c["cx"], c["cy"], *bend.values()]
     )
     at = pixels(c["w"] * by, c["h"] * by) / by
 
     def change(contents):
-        contents.update(BENT)
+        contents.update(bend)
         for frame in contents["frames"]:
             name = frame["file_path"].rpartition("/")[2]
             rays = np.asarray(camera.cam_from_img(at.reshape(-1, 2))).reshape(at.shape)
@@ -67,8 +69,6 @@ def scene_with_maps(folder, truth, unit=1.0, by=1, points=True, edit=None):
         contents["depth_unit_scale_factor"] = 1.0
         if not points:
             del contents["ply_file_path"]
-        if edit:
-            edit(contents)
 
     nerfstudio(folder, truth, change)
     if points:
@@ -155,6 +155,54 @@ def test_maps_that_surfkit_made_are_of_the_undistorted_photograph(tmp_path, trut
     scene, priors, notes = priors_of(data)
     assert not any("distorted" in note for note in notes)
     assert max(off(ground, scene, view, priors[at])[0] for at, view in enumerate(scene.train)) < 1e-4
+
+
+def of_undistorted_photographs(folder, ground, by=3):
+    """The same maps, of the pictures that a lens without distortion would have taken: no shape tells them apart."""
+    scene = read(Data(folder, test_every=0))
+    for view in scene.train:
+        c, name = view.camera, view.name.rpartition("/")[2]
+        assert abs(c.height / c.width / (view.lens.height / view.lens.width) - 1) < 0.01
+        rays = (pixels(c.width * by, c.height * by) / by - (c.cx, c.cy)) / (c.fx, c.fy)
+        save_array(folder / f"depth/{name[:-4]}.npy", (1 / ground.inverse(name, rays)).astype(np.float32))
+
+
+def typical_error(ground, scene, priors):
+    """Of the better half of the views: others see the plane edge on."""
+    return np.sort([off(ground, scene, view, priors[at])[0] for at, view in enumerate(scene.train)])[2]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1.2])
+@pytest.mark.parametrize("straight", [False, True])
+def test_sparse_points_show_of_which_photographs_maps_are_that_have_the_shape_of_both(tmp_path, truth, straight, unit):
+    ground = scene_with_maps(tmp_path, truth, by=3, bend=SLIGHTLY)
+    if straight:
+        of_undistorted_photographs(tmp_path, ground)
+    for path in (tmp_path / "depth").iterdir():
+        save_array(path, np.load(path) * np.float32(unit))
+    data = Data(tmp_path, test_every=0)
+    scene, priors, notes = priors_of(data)
+    kind = "undistorted photographs" if straight else "distorted photographs, and are undistorted with them"
+    assert f"6 depth maps are of {kind}: they fit the sparse points better so" in notes
+    assert typical_error(ground, scene, priors) == pytest.approx(1 - 1 / unit, abs=2e-4)
+    known = alignment(data, scene)
+    again = read_priors(data, scene, known=known)
+    assert known.straight == straight and torch.equal(again[0].inverse, priors[0].inverse), "workers do the same"
+    other = Data(tmp_path, test_every=0, depth_of="distorted" if straight else "undistorted")
+    scene, priors, notes = priors_of(other)
+    assert not any("sparse points" in note for note in notes), "who says otherwise is believed"
+    assert typical_error(ground, scene, priors) > 1 - 1 / unit + 0.01
+
+
+def test_what_is_assumed_of_maps_is_told_where_nothing_shows_it(tmp_path, truth):
+    ground = scene_with_maps(tmp_path, truth, by=3, points=False, bend=SLIGHTLY)
+    of_undistorted_photographs(tmp_path, ground)
+    (note,) = [note for note in priors_of(Data(tmp_path, test_every=0))[2] if "distorted" in note]
+    assert note.startswith("6 depth maps are taken for those of distorted photographs, and are undistorted with them")
+    assert note.endswith("give --depth-of undistorted")
+    scene, priors, notes = priors_of(Data(tmp_path, test_every=0, depth_of="undistorted"))
+    assert not any("distorted" in note for note in notes)
+    assert max(off(ground, scene, view, priors[at])[0] for at, view in enumerate(scene.train)) < 2e-3
 
 
 def test_edges_stay_sharp_and_holes_stay_holes(truth):

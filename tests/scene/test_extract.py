@@ -13,6 +13,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import map_path
 from surfkit.readers.depth_prior import alignment, read_priors
 from surfkit.readers.read import read
+from surfkit.scene.scene import Mask
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
@@ -29,7 +30,7 @@ def farm(tmp_path_factory):
         np.save(path, np.where(exact.depth > 0, (inverse + 0.4) / 0.02, 0).astype(np.float32))
     data = Data(folder)
     scene = read(data)
-    named = replace(scene.train[1], mask=folder / "mask.png", white=True)
+    named = replace(scene.train[1], mask=Mask(folder / "mask.png", alpha=True), white=True)
     scene = replace(scene, train=(scene.train[0], named, *scene.train[2:]))
     return data, scene, alignment(data, scene)
 

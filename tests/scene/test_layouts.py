@@ -12,6 +12,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import RANDOM_POINTS, observations, read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
+from surfkit.scene.scene import Mask
 from surfkit.testing.synthetic import photograph
 
 from .folders import FLIGHT, blender, lens, nerfstudio, odm, pixels_of, save, sparse, to_world, views_of
@@ -66,7 +67,7 @@ def test_nerfstudio_with_its_own_split_intrinsics_by_frame_masks_and_points_as_t
         scene = read(Data(tmp_path))
     same(scene, truth)
     assert [view.name for view in scene.held_out] == ["images/view_002.png"]
-    assert scene.train[1].mask == tmp_path / "hidden/m.png" and "1 of 6" in notes[0]
+    assert scene.train[1].mask == Mask(tmp_path / "hidden/m.png") and "1 of 6" in notes[0]
     np.testing.assert_allclose(scene.frame.to_input(scene.cloud.xyz.numpy()), xyz, atol=1e-4)
     assert torch.equal(scene.cloud.rgb, truth.scene.cloud.rgb)
 

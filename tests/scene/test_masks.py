@@ -1,6 +1,7 @@
 """Masks are found by the names that other programs give them, and are turned into pixels that count."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,14 @@ import torch
 from PIL import Image
 
 from surfkit.core.check import BadInput
+from surfkit.readers import masks
 from surfkit.readers.data import Data
+from surfkit.readers.fingerprint import changed, fingerprint
 from surfkit.readers.masks import mask_cache, read_mask, view_mask
-from surfkit.readers.read import read
+from surfkit.readers.read import build_scene, read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 from surfkit.scene.photos import view_photo
+from surfkit.scene.scene import Cloud, Mask, Scene
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 
 
@@ -63,7 +67,7 @@ def scene_of(farm, **settings):
 def test_the_habits_of_other_programs(farm, place):
     put(farm / place)
     scene, notes = scene_of(farm)
-    assert [view.mask for view in scene.train] == [None, farm / place, None, None]
+    assert [view.mask for view in scene.train] == [None, Mask(farm / place), None, None]
     assert notes == ["what is black in their masks is ignored in 1 of 4 photographs"]
     wanted = torch.from_numpy(left_black() > 0)
     assert (view_mask(scene.train[1]) == wanted).float().mean() > 0.95
@@ -82,14 +86,14 @@ def test_photographs_in_folders_have_masks_in_the_same_folders(farm):
     put(farm / "masks/left/0.png")
     put(farm / "masks/right/0.png", 255 - left_black())
     scene, _ = scene_of(farm)
-    masks = {view.name: view.mask and view.mask.relative_to(farm / "masks").as_posix() for view in scene.train}
+    masks = {view.name: view.mask and view.mask.path.relative_to(farm / "masks").as_posix() for view in scene.train}
     assert masks == {"left/0.png": "left/0.png", "left/1.png": None, "right/0.png": "right/0.png", "right/1.png": None}
 
 
 def test_a_folder_by_name(farm):
     put(farm / "people/view_002.png")
     assert scene_of(farm)[0].train[2].mask is None
-    assert scene_of(farm, masks=Path("people"))[0].train[2].mask == farm / "people/view_002.png"
+    assert scene_of(farm, masks=Path("people"))[0].train[2].mask == Mask(farm / "people/view_002.png")
     with pytest.raises(BadInput, match="--masks .*none: no such folder of masks"):
         scene_of(farm, masks=Path("none"))
 
@@ -135,4 +139,104 @@ def test_masks_are_undistorted_with_their_photographs(farm):
         put(farm / "masks" / path.name)
     for view in scene_of(farm)[0].train:
         bright = view_photo(view)[0] > 110
-        assert view.mask.parent == farm / "undistorted" and (view_mask(view) == bright).float().mean() > 0.98
+        assert view.mask.path.parent == farm / "undistorted" and (view_mask(view) == bright).float().mean() > 0.98
+
+
+def cut_out(kept, colour=0):
+    """A mask of one colour, opaque where something is kept."""
+    return np.dstack([np.full((*kept.shape, 3), colour, np.uint8), np.where(kept, 255, 0).astype(np.uint8)])
+
+
+def sides():
+    """What four masks keep: all of it, all of it, a half, and three quarters."""
+    kept = np.ones((4, 30, 40), bool)
+    kept[2, :, :20], kept[3, :10], kept[3, 10:15, :20] = False, False, False
+    return kept
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_alpha_channels_count_in_all_masks_of_a_set_if_one_has_transparent_pixels(farm, bent):
+    """Of an opaque cut-out the alpha channel counts too; a mask without one goes by its colours."""
+    if bent:
+        (farm / "sparse/0/cameras.txt").write_text("1 OPENCV 40 30 36 36 20 15 -0.001 0 0 0\n")
+    for number, kept in enumerate(sides()):
+        put(farm / f"masks/view_00{number}.png", cut_out(kept) if number else left_black())
+    scene, notes = scene_of(farm)
+    shares = [view_mask(view).float().mean().item() for view in scene.train]
+    assert shares == pytest.approx([0.75, 1.0, 0.5, 7 / 12], abs=0.06 if bent else 1e-6)
+    assert [view.mask.alpha for view in scene.train] == [False, not bent, not bent, not bent]
+    assert notes == [
+        "what is black in their masks is ignored in 1 of 4 photographs",
+        "what is transparent in their masks is ignored in 3 of 4 photographs: these masks have an alpha channel, "
+        f"{farm / 'masks/view_002.png'} has transparent pixels, and colours do not count in any of them",
+    ]
+    only = build_scene(Data(farm, test_every=0), read_capture(Data(farm), reader_of(Data(farm))), only={"view_001.png"})
+    assert view_mask(only.train[0]).float().mean() == pytest.approx(1.0, abs=0.06 * bent)
+
+
+def test_alpha_channels_without_transparent_pixels_say_nothing(farm):
+    for number in range(4):
+        put(farm / f"masks/view_00{number}.png", np.dstack([left_black()] * 3 + [np.full((30, 40), 255, np.uint8)]))
+    scene, notes = scene_of(farm)
+    assert [view_mask(view).float().mean().item() for view in scene.train] == [0.75] * 4
+    assert not any("alpha" in note for note in notes)
+
+
+def test_few_masks_are_decoded_to_decide(farm, monkeypatch):
+    """Those without an alpha channel never, those with one up to the first that has transparent pixels."""
+    decoded = []
+    plain = masks.open_picture
+    monkeypatch.setattr(masks, "open_picture", lambda path, use: decoded.append(path.name) or plain(path, use))
+    monkeypatch.setattr(masks, "THREADS", 1)
+    for number, kept in enumerate(sides()):
+        put(farm / f"masks/view_00{number}.png", cut_out(kept) if number else left_black())
+    found = read(Data(farm, test_every=0))
+    assert decoded == ["view_001.png", "view_002.png"]
+    read(Data(farm, test_every=0))
+    assert decoded == ["view_001.png", "view_002.png"], "a command that reads its data set again does not decode again"
+    assert found.train[3].mask.alpha
+
+
+def test_an_undistorted_mask_is_made_again_when_its_alpha_channel_counts(farm):
+    (farm / "sparse/0/cameras.txt").write_text("1 OPENCV 40 30 36 36 20 15 -0.001 0 0 0\n")
+    for number in range(4):
+        put(farm / f"masks/view_00{number}.png", cut_out(np.ones((30, 40), bool), 255 * (number != 1)))
+    before = scene_of(farm)[0].train[1]
+    assert not view_mask(before).any()
+    put(farm / "masks/view_003.png", cut_out(sides()[2], 255))
+    after = scene_of(farm)[0].train[1]
+    assert view_mask(after).float().mean() > 0.9
+    (change,) = changed(fingerprint(scene_with(before)), fingerprint(scene_with(after)))
+    assert change.what == "the mask of view_001.png has changed, come or gone"
+
+
+def scene_with(view):
+    return Scene("one", (view,), (), Cloud(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8)), None)
+
+
+def test_a_fingerprint_knows_whether_alpha_or_colours_count(farm):
+    put(farm / "masks/view_001.png", cut_out(sides()[2]))
+    view = scene_of(farm)[0].train[1]
+    now, other = (
+        fingerprint(scene_with(replace(view, mask=replace(view.mask, alpha=alpha)))) for alpha in (True, False)
+    )
+    assert not changed(now, now)
+    assert [change.name for change in changed(now, other)] == ["view_001.png"]
+    stamp = replace(now.photographs["view_001.png"].beside["mask"], meaning="")
+    older = replace(now, photographs={"view_001.png": replace(now.photographs["view_001.png"], beside={"mask": stamp})})
+    assert not changed(older, now), "older runs did not keep it"
+
+
+def test_masks_that_keep_nothing_are_told_once_when_all_have_been_read(farm):
+    for number in range(4):
+        put(farm / f"masks/view_00{number}.png", np.full((30, 40), 255 * (number in (1, 2)), np.uint8))
+    scene, notes = scene_of(farm)
+    assert not any("nothing" in note for note in notes)
+    with collect_notes() as kept:
+        for _ in range(2):
+            found = mask_cache(scene.train, 0)
+            for at in (3, 3, 0, 2, 1):
+                found[at]
+    assert kept.texts == [
+        "2 masks keep nothing of the photograph, 'view_000.png', 'view_003.png'; correct or delete them"
+    ]

@@ -20,6 +20,7 @@ from surfkit.run.notes import collect_notes
 from surfkit.scene.copies import Copies
 from surfkit.scene.photos import photo_cache, view_photo
 from surfkit.scene.pixels import PLAIN, Pixels
+from surfkit.scene.scene import Mask
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
 from tests.scene.test_pixels import geotiff, opencv
 
@@ -152,7 +153,7 @@ def test_what_becomes_of_transparent_pixels(farm, alpha, bent):
         assert (kept[:6] == 0).all() and kept[14:-3].mean() > 0.9
         if not bent:
             assert torch.equal(got[:, mask], before[0][:, mask]) and mask.float().mean() == 0.75
-        assert view.mask == view.path or bent
+        assert view.mask == Mask(view.path, alpha=True) or bent
     else:
         assert mask is None or bent
 
@@ -209,20 +210,17 @@ def test_of_many_photographs_some_are_looked_at(tmp_path, monkeypatch):
     assert line.startswith("3 of 3 photographs that were looked at, of 8, have transparent pixels")
 
 
-def test_a_mask_with_an_alpha_channel_goes_by_what_is_opaque(tmp_path):
+def test_a_mask_goes_by_what_is_opaque_or_by_its_colours(tmp_path):
     alpha = np.full((30, 40), 255, np.uint8)
     alpha[:10] = 0
     wanted = torch.from_numpy(alpha > 0)
     black, white = np.zeros((30, 40, 3), np.uint8), np.full((30, 40, 3), 255, np.uint8)
-    half = white.copy()
-    half[:, :20] = 0
     for name, colour in {"black": black, "white": white}.items():
         Image.fromarray(np.dstack([colour, alpha])).save(tmp_path / f"{name}.png")
         Image.fromarray(np.dstack([colour[..., 0], alpha]), "LA").save(tmp_path / f"{name}-LA.png")
         for path in (tmp_path / f"{name}.png", tmp_path / f"{name}-LA.png"):
-            assert torch.equal(read_mask(path, (40, 30)), wanted)
-    Image.fromarray(np.dstack([half, np.full_like(alpha, 255)])).save(tmp_path / "opaque.png")
-    assert torch.equal(read_mask(tmp_path / "opaque.png", (40, 30)), torch.from_numpy(half[..., 0] > 0))
+            assert torch.equal(read_mask(path, (40, 30), alpha=True), wanted)
+            assert torch.equal(read_mask(path, (40, 30)), torch.full((30, 40), name == "white"))
 
 
 def test_options_that_a_command_lacks_are_not_named(tmp_path):

@@ -60,6 +60,23 @@ def test_no_feature_is_taken_where_a_mask_is_black(folder):
         assert not unmasked.mask
 
 
+def test_a_set_of_cut_outs_is_read_alike_and_masks_that_keep_nothing_are_told(folder):
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[HIDDEN] = 0
+    for name, opacity in {"flight/0.jpg": alpha, "flight/1": np.full_like(alpha, 255), "2_mask": alpha * 0}.items():
+        Image.fromarray(np.dstack([np.zeros((HEIGHT, WIDTH, 3), np.uint8), opacity])).save(folder / f"m/{name}.png")
+    settings = Settings(features=800, masks=folder / "m")
+    sources, photos = sources_of(folder, masks=folder / "m")
+    shares = [sources.read_mask(photo.name, (WIDTH, HEIGHT)).mean() for photo in photos[:4]]
+    hidden = 90 * 90 / (WIDTH * HEIGHT)
+    assert shares == pytest.approx([1 - hidden, 1, 0, 1 - hidden]), "the last one by its colours"
+    with collect_notes() as notes:
+        counts = find_features(photos, sources, folder / "f", settings)
+    assert counts["flight/1.jpg"] > counts["flight/0.jpg"] > 50 and counts["flight/2.jpg"] == 0
+    told = "no features are where the masks of 1 photographs keep something, 'flight/2.jpg'; correct or delete masks"
+    assert notes.texts == [f"{told} that keep nothing"]
+
+
 def test_masks_go_with_the_scene_undistorted_as_its_photographs(folder, capsys):
     words = ["prepare", "photos", str(folder / "p"), "--out", str(folder / "s"), *QUICK]
     assert main([*words, "--masks", str(folder / "m")]) == 0
@@ -73,7 +90,7 @@ def test_masks_go_with_the_scene_undistorted_as_its_photographs(folder, capsys):
         if view.mask is None:
             continue
         size = photo_size(view.path)
-        kept = read_mask(view.mask, size).numpy()
+        kept = read_mask(view.mask.path, size).numpy()
         x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
         rays = np.stack([x - view.camera.cx, y - view.camera.cy], -1) / view.camera.fx
         spots = focal * rays * (1 + bend * (rays**2).sum(-1, keepdims=True)) + (WIDTH / 2, HEIGHT / 2)
@@ -110,7 +127,7 @@ def test_what_is_transparent_is_masked_where_alpha_says_so(folder):
     assert main(command) == 0
     scene = read(Data(folder / "s", test_every=0))
     assert len([view for view in scene.train if view.mask is not None]) == 3
-    assert 0.6 < read_mask(scene.train[0].mask, (WIDTH, HEIGHT)).float().mean() < 0.9
+    assert 0.6 < read_mask(scene.train[0].mask.path, (WIDTH, HEIGHT)).float().mean() < 0.9
 
 
 def test_masks_of_the_user_in_the_scene_are_not_replaced(folder, capsys):

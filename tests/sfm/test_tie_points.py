@@ -8,6 +8,7 @@ from needs import needs_native
 
 from surfkit.cli import main
 from surfkit.readers.data import Data
+from surfkit.readers.masks import view_mask
 from surfkit.readers.read import observations, read
 from surfkit.sfm import features, matching, photographs, tie_points
 from surfkit.testing.synthetic import SURFACES
@@ -142,15 +143,23 @@ def test_lenses_that_bend_and_coordinates_without_a_system(tmp_path, monkeypatch
         rows = [(FOCAL, k1, 0.0), *turn, move]
         lines += [" ".join(repr(float(value)) for value in row) for row in rows]
     shutil.copy(folder / "images/view 0.jpg", folder / "images/a copy.jpg")  # without a camera
-    save(folder / "masks/view 0.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))
+    hidden = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    hidden[:, : WIDTH // 2] = 0
+    save(folder / "masks/view 0.png", np.repeat(hidden[..., None], 3, 2))
     (folder / "bundle.out").write_text("\n".join(lines) + "\n")
     (folder / "list.txt").write_text("".join(f"{name}\n" for name in POSES))
     looked, plain = [], photographs._look
     monkeypatch.setattr(photographs, "_look", lambda path, photo: looked.append(path.name) or plain(path, photo))
     assert main(["prepare", "points", str(folder), "--out", str(tmp_path / "s"), *QUICK]) == 0
     assert sorted(looked) == list(POSES), "what is not of the data set is not read"
-    assert "1 masks are not taken over" in capsys.readouterr().err
-    scene = read(Data(tmp_path / "s", test_every=0))
+    assert "what is black in their masks is ignored in 1 of 5 photographs" in capsys.readouterr().err
+    data = Data(tmp_path / "s", test_every=0)
+    scene = read(data)
+    assert [view.mask is not None for view in scene.train] == [True, False, False, False, False]
+    kept = view_mask(scene.train[0]).float().mean(0)
+    assert (kept[: WIDTH // 2 - 8] == 0).all() and kept[WIDTH // 2 + 8 : -4].min() > 0.9
+    across = [spots.at[:, 0] for spots in map(observations(data, scene).seen.get, POSES)]
+    assert across[0].min() > 0.47 and len(across[0]) > 20 and across[1].min() < 0.2, "no features under the mask"
     assert (scene.frame.crs, scene.frame.metres) == (None, None)
     assert [view.name for view in scene.train] == list(POSES)
     for view in scene.train:

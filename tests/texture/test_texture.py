@@ -19,7 +19,7 @@ from surfkit.mesh.base import Mesh
 from surfkit.mesh.shade import draw_faces
 from surfkit.scene.camera import Camera
 from surfkit.scene.earth import to_ecef
-from surfkit.scene.scene import Frame
+from surfkit.scene.scene import Frame, Mask
 from surfkit.texture import exposure, make, pieces
 from surfkit.texture import level as leveling
 from surfkit.texture.candidates import NONE, Candidates
@@ -507,10 +507,10 @@ def test_masks_hide(tmp_path):
         mask[:, : WIDTH if black else 0] = 0
         masks.append(tmp_path / f"mask-{at}.png")
         Image.fromarray(mask).save(masks[-1])
-    some = [replace(view, mask=masks[at % 2]) for at, view in enumerate(scene.views)]
+    some = [replace(view, mask=Mask(masks[at % 2])) for at, view in enumerate(scene.views)]
     found, _, _ = look_at_all(local_mesh(scene.surface, scene.frame), Photographs(some, 10**8), 1000)
     assert set(np.unique(found.view)) == {NONE, 1, 3, 5, 7, 9, 11}
-    hidden = replace(scene, views=tuple(replace(view, mask=masks[0]) for view in scene.views))
+    hidden = replace(scene, views=tuple(replace(view, mask=Mask(masks[0])) for view in scene.views))
     record = made(hidden, tmp_path / "out", replace(PNG, formats=("glb",)))
     assert record["seen"] == 0 and record["photographs"] == 0
     _, colors = points_on(read_pieces(tmp_path / "out" / "textured.glb"))

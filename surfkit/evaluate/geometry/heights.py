@@ -32,7 +32,7 @@ def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
     steep triangles.
 
     Raises:
-        BadInput: rasterio is not installed, no raster, a picture, turned or without a place, or without heights.
+        BadInput: rasterio is not installed, no raster, a picture, without a place, or without heights.
     """
     with needed("rasterio", str(path)):
         import rasterio
@@ -44,7 +44,7 @@ def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
             shape = (-(-file.height // every), -(-file.width // every))
             heights = file.read(1, out_shape=shape, masked=True).astype(np.float64).filled(np.nan)
             heights = heights * file.scales[0] + file.offsets[0]
-            transform = file.transform * file.transform.scale(file.width / shape[1], file.height / shape[0])
+            transform, (wide, high) = file.transform, (file.width / shape[1], file.height / shape[0])
     except rasterio.errors.RasterioError as error:
         raise BadInput(f"{path}: cannot be read as a raster: {' '.join(str(error).split())}") from error
     if transform.is_identity:
@@ -52,7 +52,9 @@ def read_heights_raster(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if every > 1:
         emit(Warned(f"{path}: {file.width} x {file.height} cells, read as {shape[1]} x {shape[0]}"))
     rows, columns = np.indices(shape)
-    x, y = transform * (columns + 0.5, rows + 0.5)
+    x, y = (columns + 0.5) * wide, (rows + 0.5) * high  # in cells of the file
+    a, b, c, d, e, f = transform[:6]  # affine 2 multiplies by *, affine 3 by @
+    x, y = a * x + b * y + c, d * x + e * y + f
     return mesh_of_cells(path, np.stack([x, y, heights], axis=2), is_mirrored=transform.determinant < 0)
 
 
