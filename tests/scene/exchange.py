@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from .programs import COLORS, DOTS, HEIGHT, POSES, WIDTH, F, photographs, seen_from
 
@@ -125,6 +126,40 @@ def polycam(folder, kind="corrected_", change=lambda number, values: None, depth
             map_mm = np.full((HEIGHT // 4, WIDTH // 4), 1250, np.uint16)
             Image.fromarray(map_mm).save(folder / f"keyframes/depth/{number}.png")
     (folder / "made").rmdir()
+    return project
+
+
+def record3d(folder, own=False, change=lambda values: None):
+    """As nerfstudio reads it: quaternions x, y, z, w and places, camera to world with the axes of OpenGL, of a world
+    with y up; K by columns.
+
+    The world of the dots has z up: its x, y, z are ARKit's x, -z, y.
+    """
+    fx, fy, cx, cy = F, F + 2.0, WIDTH / 2 + 2.5, HEIGHT / 2 - 1.5
+    names = {name: f"rgbd/{at}.jpg" for at, name in enumerate(POSES)}
+    back = {place: name for name, place in names.items()}
+
+    def project(place, points):
+        X, Y, Z = seen_from(back[place], points).T
+        return np.stack([fx * X / Z + cx, fy * Y / Z + cy], 1)
+
+    (folder / "rgbd").mkdir()
+    photographs(folder / "made", lambda name, points: project(names[name], points))
+    poses = []
+    for at, (name, (turn, centre)) in enumerate(POSES.items()):
+        Image.open(folder / "made" / name).save(folder / names[name], quality=100)
+        (folder / "made" / name).unlink()
+        (folder / f"rgbd/{at}.depth").write_bytes(b"bvx2")
+        right, down, ahead = turn
+        x, y, z = np.stack([right, -down, -ahead, centre], 1)  # rows: along the axes of the dots
+        matrix = np.stack([x, z, -y])
+        poses.append([*Rotation.from_matrix(matrix[:, :3]).as_quat().tolist(), *matrix[:, 3].tolist()])
+    (folder / "made").rmdir()
+    values = {"w": WIDTH, "h": HEIGHT, "fps": 60, "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    if own:
+        values |= {"perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * len(poses), "K": [9, 0, 0, 0, 9, 0, 1, 1, 1]}
+    change(values)
+    (folder / "metadata").write_text(json.dumps(values))
     return project
 
 

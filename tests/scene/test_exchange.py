@@ -13,7 +13,7 @@ from surfkit.readers.read import read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 from tests.needs import needs
 
-from .exchange import blocks_exchange, opf, polycam, xmp_sidecars
+from .exchange import blocks_exchange, opf, polycam, record3d, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES, realitycapture
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
@@ -27,6 +27,8 @@ CASES = {
     "opf": partial(opf, R1=-0.1, R2=0.07, R3=-0.02, T1=0.003, T2=-0.002),
     "polycam": polycam,
     "polycam without corrections": partial(polycam, kind=""),
+    "record3d": record3d,
+    "record3d with a lens each": partial(record3d, own=True),
     "xmp": partial(xmp_sidecars, k1=-0.09, k2=0.06, k3=-0.03, u=0.02, v=-0.015),
     "xmp with tangential terms": partial(xmp_sidecars, model="brown4t2", k1=-0.09, t1=0.003, t2=-0.002),
     "xmp in attributes": partial(xmp_sidecars, model="perspective", elements=False, u=0.01, aspect=1.004),
@@ -39,7 +41,7 @@ def test_dots_lie_where_the_format_puts_them(tmp_path, case):
     project = CASES[case](tmp_path)
     data = Data(tmp_path, test_every=0)
     shots = read_capture(data, reader_of(data)).shots
-    assert len(shots) == len(POSES) and (case.startswith("polycam") or [shot.name for shot in shots] == list(POSES))
+    assert len(shots) == len(POSES) and (case.startswith(("polycam", "record3d")) or [shot.name for shot in shots] == list(POSES))
     for shot, (turn, centre) in zip(shots, POSES.values(), strict=True):
         np.testing.assert_allclose(shot.pose[:3, :3], turn, atol=1e-9)
         np.testing.assert_allclose(-shot.pose[:3, :3].T @ shot.pose[:3, 3], centre, atol=1e-9)
@@ -218,6 +220,14 @@ def test_raw_data_of_polycam_without_corrections_is_told(tmp_path):
         (partial(polycam, change=lambda number, values: values.update(t_00=9)), "the pose is not a rotation"),
         (partial(polycam, change=lambda number, values: values.update(fx="wide")), "where 6 finite numbers belong"),
         (partial(polycam, change=lambda number, values: values.update(fx=0)), "no lens has size"),
+        (partial(record3d, change=lambda values: values.pop("K")), "metadata: it lacks K; export"),
+        (partial(record3d, change=lambda values: values.update(K=[1] * 8)), "where 9 finite numbers belong"),
+        (partial(record3d, change=lambda values: values.update(poses=[])), "metadata: no list of poses"),
+        (partial(record3d, own=True, change=lambda values: values["poses"].pop()), "a lens for each of 3 poses"),
+        (
+            partial(record3d, change=lambda values: values["poses"].__setitem__(2, [0] * 7)),
+            "poses.2: its first four numbers are no quaternion",
+        ),
         (partial(xmp_sidecars, model="division", k1=0.1), "distortion model 'division' with 6 coefficients; known: "),
         (partial(xmp_sidecars, change=lambda name, text: f"<!DOCTYPE a>{text}"), "has definitions of its own"),
         (partial(xmp_sidecars, change=lambda name, text: text[:-9]), "not XML"),
@@ -234,6 +244,22 @@ def test_scans_and_sidecars_that_are_refused(tmp_path, write, said):
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_packed_file_of_record3d_is_told_to_be_unpacked(tmp_path):
+    (tmp_path / "room.r3d").write_bytes(b"PK")
+    with pytest.raises(BadInput, match="no metadata or metadata.json beside rgbd/; unpack room.r3d there: it is a zip"):
+        read(Data(tmp_path))
+
+
+def test_depth_of_record3d_is_told_and_one_lens_is_one_camera(tmp_path):
+    record3d(tmp_path, own=True)
+    (tmp_path / "rgbd/1.jpg").unlink()
+    with collect_notes() as kept:
+        capture = read_capture(Data(tmp_path, missing="skip"), reader_of(Data(tmp_path)))
+    assert any("depth of Record3D is compressed by LZFSE, and is not read" in text for text in kept.texts)
+    assert [shot.name for shot in capture.shots] == ["rgbd/0.jpg", "rgbd/2.jpg", "rgbd/3.jpg"]
+    assert capture.metres == 1.0 and len({id(shot.camera) for shot in capture.shots}) == 1
 
 
 def test_a_csv_file_of_realitycapture_is_read_before_sidecars(tmp_path):
