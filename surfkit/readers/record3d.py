@@ -1,8 +1,8 @@
 """Record3D: an unpacked .r3d file, with a file of metadata and photographs in rgbd/.
 
-Poses are a quaternion (x, y, z, w) and a place, of the camera in the world, with the axes of ARKit: of a camera x right,
-y up, z backward; of the world y up, in metres. The world is turned to z up here: x, -z, y. K is listed by columns.
-Depth is compressed by LZFSE, and is not read.
+Poses are a quaternion (x, y, z, w) and a place, of the camera in the world, with the axes of ARKit: of a camera x
+right, y up, z backward; of the world y up, in metres. The world is turned to z up here: x, -z, y. K is listed by
+columns. Depth is compressed by LZFSE, and is not read.
 """
 
 from __future__ import annotations

@@ -204,6 +204,42 @@ def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text
     return project
 
 
+def opf_points(folder, project, ids):
+    """OPF 1.0, point_cloud: a matrix from z up to y up, by columns; matches packed in 40 and 24 bits.
+
+    What is before the points of a file, and between those of one that begins later, must not be read.
+    """
+    cameras = [name for _ in DOTS for name in POSES]
+    marks = [project(name, dot[None])[0] for dot in DOTS for name in POSES]
+    packed = [(row * len(POSES)) | (len(POSES) << 40) for row in range(len(DOTS))]
+    arrays = {
+        "position": (np.array(DOTS, "<f4"), 5126, "VEC3"),
+        "colour": (np.column_stack([COLORS, np.full(len(DOTS), 255)]).astype("u1"), 5121, "VEC4"),
+        "camera": (np.array([list(POSES).index(name) for name in cameras], "<u4"), 5125, "SCALAR"),
+        "range": (np.array(packed, "<u8").view("<u4").reshape(-1, 2), 5125, "VEC2"),
+        "pixel": (np.array(marks, "<f4"), 5126, "VEC2"),
+    }
+    accessors, views, buffers = [], [], []
+    for at, (name, (values, kind, shape)) in enumerate(arrays.items()):
+        (folder / f"{name}.bin").write_bytes(bytes(12) + values.tobytes())
+        accessors.append(
+            {"bufferView": at, "byteOffset": 4, "componentType": kind, "type": shape, "count": len(values)}
+        )
+        views.append({"buffer": at, "byteOffset": 8, "byteLength": values.nbytes + 4})
+        buffers.append({"uri": f"{name}.bin", "byteLength": values.nbytes + 12})
+    matches = {"cameraIds": 2, "cameraUids": [ids[name] for name in POSES], "pointIndexRanges": 3}
+    matches |= {"imagePoints": {"pixelCoordinates": 4, "featureIds": 2, "scales": 2}}
+    mesh = {
+        "attributes": {"POSITION": 0, "COLOR_0": 1},
+        "extensions": {"OPF_mesh_primitive_matches": matches},
+        "mode": 0,
+    }
+    matrix = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+    whole = {"asset": {"version": "2.0", "extensions": {"OPF_asset_version": {"version": "1.0"}}}, "scene": 0}
+    whole |= {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "matrix": matrix}], "meshes": [{"primitives": [mesh]}]}
+    return whole | {"accessors": accessors, "bufferViews": views, "buffers": buffers}
+
+
 def opf(folder, shift=(0, 0, 0), scale=(1, 1, 1), definition=None, swap=False, change=lambda files: None, **given):
     """OPF: Rx(omega) Ry(phi) Rz(kappa) from a camera (x right, y up, z backward); canonical = map + shift."""
     c = {**dict.fromkeys(("R1", "R2", "R3", "T1", "T2"), 0.0), "cx": WIDTH / 2 + 3.0, "cy": HEIGHT / 2 - 2.0, **given}
@@ -243,9 +279,11 @@ def opf(folder, shift=(0, 0, 0), scale=(1, 1, 1), definition=None, swap=False, c
     }
     kinds = ("camera-list", "input-cameras", "calibrated-cameras", "scene-reference-frame")
     items = [entry(kind, f"parts/{name}") for kind, name in zip(kinds, files, strict=True)]
+    (folder / "parts").mkdir()
+    files["tracks.gltf"] = opf_points(folder / "parts", project, numbers)
+    items[2]["resources"].append({"uri": "parts/tracks.gltf", "format": "model/gltf+json"})
     files["../survey.opf"] = {"format": "application/opf-project+json", "items": items if definition else items[:-1]}
     change(files)
-    (folder / "parts").mkdir()
     for name, contents in files.items():
         (folder / "parts" / name).write_text(json.dumps(contents))
     return photographs(folder / "images", project)
