@@ -43,7 +43,7 @@ class Record3D(Reader):
         values = read_json(path, dict[str, Any])
         if lacking := [name for name in ("w", "h", "K", "poses") if name not in values]:
             raise BadInput(f"{path}: it lacks {', '.join(lacking)}; export from Record3D again")
-        poses, own = values["poses"], values.get("perFrameIntrinsicCoeffs")
+        poses, own = values["poses"], values.get("perFrameIntrinsicCoeffs") or None
         if not isinstance(poses, list) or not poses:
             raise BadInput(f"{path}: no list of poses; record with camera poses, and export again")
         if own is not None and not (isinstance(own, list) and len(own) == len(poses)):

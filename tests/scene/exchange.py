@@ -207,7 +207,7 @@ def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text
 def opf_points(folder, project, ids):
     """OPF 1.0, point_cloud: a matrix from z up to y up, by columns; matches packed in 40 and 24 bits.
 
-    What is before the points of a file, and between those of one that begins later, must not be read.
+    Before the values of each file are bytes that must not be read.
     """
     cameras = [name for _ in DOTS for name in POSES]
     marks = [project(name, dot[None])[0] for dot in DOTS for name in POSES]
@@ -221,12 +221,10 @@ def opf_points(folder, project, ids):
     }
     accessors, views, buffers = [], [], []
     for at, (name, (values, kind, shape)) in enumerate(arrays.items()):
-        (folder / f"{name}.bin").write_bytes(bytes(12) + values.tobytes())
-        accessors.append(
-            {"bufferView": at, "byteOffset": 4, "componentType": kind, "type": shape, "count": len(values)}
-        )
-        views.append({"buffer": at, "byteOffset": 8, "byteLength": values.nbytes + 4})
-        buffers.append({"uri": f"{name}.bin", "byteLength": values.nbytes + 12})
+        (folder / f"{name}.bin").write_bytes(bytes(8) + values.tobytes())
+        accessors.append({"bufferView": at, "componentType": kind, "type": shape, "count": len(values)})
+        views.append({"buffer": at, "byteOffset": 8, "byteLength": values.nbytes})
+        buffers.append({"uri": f"{name}.bin", "byteLength": values.nbytes + 8})
     matches = {"cameraIds": 2, "cameraUids": [ids[name] for name in POSES], "pointIndexRanges": 3}
     matches |= {"imagePoints": {"pixelCoordinates": 4, "featureIds": 2, "scales": 2}}
     mesh = {

@@ -387,6 +387,7 @@ def at(name, *path, value):
         (at("tracks.gltf", "accessors", value=[]), "tracks.gltf: damaged, or not as OPF has sparse points: IndexError"),
         (at("tracks.gltf", "accessors", 4, "count", value=3), "its points have matches that are not there"),
         (at("tracks.gltf", "bufferViews", 4, "byteStride", value=16), "its buffers are interleaved"),
+        (at("tracks.gltf", "accessors", 0, "byteOffset", value=4), "its buffers are interleaved"),
         (at("tracks.gltf", "nodes", 0, "matrix", value=[1, 2]), "matrix: [1, 2], where 16 finite numbers belong"),
         (at("../survey.opf", "items", 2, "resources", 0, "uri", value="https://a/b.json"), "is not on this machine"),
         (at("../survey.opf", "items", 2, "resources", 0, "uri", value="parts/lost.json"), "lost.json: no such file"),

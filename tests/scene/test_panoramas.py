@@ -361,3 +361,15 @@ def test_points_are_not_triangulated_between_panoramas(tmp_path, capsys):
     nerfstudio(tmp_path / "data")
     assert main(["prepare", "points", str(tmp_path / "data"), "--out", str(tmp_path / "scene")]) == 2
     assert "3 panoramas, 'images/a.png'" in capsys.readouterr().err
+
+
+def test_the_edge_of_a_panorama_is_no_edge_in_a_view(tmp_path):
+    """Noise, and the same noise half a turn on: what lies in the middle of one lies at both edges of the other."""
+    colmap(tmp_path, tracks=False)
+    noise = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "images/a.png")
+    Image.fromarray(np.roll(noise, WIDTH // 2, 1)).save(tmp_path / "images/b.png")
+    found = {view.name: view_photo(view).numpy().astype(float) for view in scene_of(tmp_path)[0].train}
+    for face, other in (("front", "back"), ("back", "front"), ("left", "right"), ("right", "left")):
+        assert np.abs(found[f"a-{face}.png"] - found[f"b-{other}.png"]).max() <= 1, face
+    assert np.abs(found["a-up.png"] - found["b-up.png"][:, ::-1, ::-1]).max() <= 1
