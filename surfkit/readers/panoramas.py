@@ -82,7 +82,10 @@ def view_names(shots: Sequence[Shot]) -> list[str]:
 
 def view_sizes(data: Data, shot: Shot, size: tuple[int, int]) -> list[tuple[int, int]]:
     """Width and height of each view that a photograph gives, which has a width and height itself."""
-    return [data.size(*size)] if not is_panorama(shot.camera) else [data.size(*[_side(size[0])] * 2)] * len(FACES)
+    if not is_panorama(shot.camera):
+        return [data.size(*size)]
+    side = _side(size[0])
+    return [data.size(side, side)] * len(FACES)
 
 
 def size_to_read(data: Data, shot: Shot, size: tuple[int, int]) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -144,7 +145,9 @@ def build_scene(
 def _cutting(data: Data, whole: Sequence[Shot], frame: Frame) -> str:
     """What to say of panoramas."""
     query = DepthQuery(data.path, [shot.name for shot in whole], model_folder(data), frame.metres)
-    maps = len(find_maps(query, data.depth_layout))
+    maps = 0
+    with suppress(BadInput):  # told where depth maps are used
+        maps = len(find_maps(query, data.depth_layout))
     unused = f"; depth maps of {maps} of them are not cut with them, and not used" if maps else ""
     count = "1 panorama is" if len(whole) == 1 else f"{len(whole)} panoramas are"
     return f"{count} cut into {len(FACES)} views each, which lie in {place(data.path, FOLDER)}{unused}"
