@@ -26,9 +26,12 @@ from surfkit.doctor.priors import priors
 from surfkit.readers.capture import Shot
 from surfkit.readers.data import Data
 from surfkit.readers.masks import empty_masks
+from surfkit.readers.panoramas import FACES, size_to_read, view_sizes
+from surfkit.readers.panoramas import FOLDER as PANORAMAS
 from surfkit.readers.read import RANDOM_POINTS, check_size
-from surfkit.readers.undistort import cache_folder, is_pinhole
+from surfkit.readers.undistort import cache_folder, is_panorama, is_pinhole
 from surfkit.recipe import Recipe
+from surfkit.scene.copies import place
 from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.photos import refuse_large
 
@@ -181,7 +184,7 @@ def _sizes(data: Data, gathered: Gathered, known: dict[str, Photograph]) -> list
         if look is not None and look.size is not None:
             try:
                 check_size(shot, look.size)
-                refuse_large(shot.path, look.size, data.size(*look.size))
+                refuse_large(shot.path, look.size, size_to_read(data, shot, look.size))
             except BadInput as error:
                 faults[shot.name] = bare(shot.path, str(error))
             except ZeroDivisionError:
@@ -303,11 +306,16 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     whose = "as listed" if data.test_list is not None else whose
     whose = name_of(data.split) if data.split is not None else whose
     told = [f"train on {train} photographs, and measure on {held}" + (f" ({whose})" if held else "")]
-    changes = {(look.size, data.size(*look.size)) for look in known.values() if look.size}
+    sized = [(shot, known[shot.name].size) for shot in shots if shot.name in known and known[shot.name].size]
+    changes = {(size, size_to_read(data, shot, size)) for shot, size in sized}
     if smaller := sorted((a, b) for a, b in changes if a != b):
         (was, now), more = smaller[-1], f" (and {len(smaller) - 1} other sizes)" if len(smaller) > 1 else ""
         told.append(f"reduce photographs of {was[0]} x {was[1]} px to {now[0]} x {now[1]}{more}")
-    bent = sum(not is_pinhole(shot.camera) for shot in shots)
+    whole = sum(is_panorama(shot.camera) for shot in shots)
+    bent = sum(not is_pinhole(shot.camera) for shot in shots) - whole
+    if whole:
+        folder = place(data.path, PANORAMAS)
+        told.append(f"cut {whole} panoramas into {len(FACES)} views each, once, into {folder}")
     if bent:
         told.append(f"undistort {bent} photographs, once, into {cache_folder(data.path)}")
     kinds = [(mask.alpha, mask.path == shot.path) for shot in shots if (mask := gathered.masks.get(shot.name))]
@@ -321,7 +329,7 @@ def _will(data: Data, gathered: Gathered, known: dict[str, Photograph], recipe: 
     if not recipe.has_stages:
         return (*told, f"reconstruct with method:{name_of(recipe.method)}")
     sparse = len(gathered.capture.xyz)
-    pixels = sum(math.prod(data.size(*look.size)) for look in known.values() if look.size)
+    pixels = sum(math.prod(view) for shot, size in sized for view in view_sizes(data, shot, size))
     count = recipe.start.expected(sparse or RANDOM_POINTS, pixels)
     drawn = "" if sparse else f"; {RANDOM_POINTS:,} random points stand in for sparse ones"
     return (*told, f"start from about {count:,} points (start:{name_of(recipe.start)}{drawn})")

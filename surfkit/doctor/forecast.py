@@ -20,10 +20,13 @@ from surfkit.doctor.probe import Job, Part, Probed, probe
 from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import prior_bytes
+from surfkit.readers.panoramas import FOLDER as PANORAMAS
+from surfkit.readers.panoramas import view_names, view_sizes
 from surfkit.readers.read import build_scene
 from surfkit.readers.undistort import cache_folder, is_pinhole
 from surfkit.recipe import Recipe
 from surfkit.run.stage import CHECKPOINT_EVERY
+from surfkit.scene.copies import place
 from surfkit.scene.memory import cache_bytes, free_bytes
 from surfkit.scene.scene import Scene
 from surfkit.train.material import needs_normals, needs_priors
@@ -131,16 +134,18 @@ def _free_disk(path: Path) -> int:
 
 
 def _sizes(data: Data, examined: Examined, names: set[str]) -> list[tuple[int, int]]:
-    """Widths and heights at which photographs will be used."""
-    looks = (examined.photographs[name] for name in names if name in examined.photographs)
-    return [data.size(*look.size) for look in looks if look.size]
+    """Widths and heights at which photographs will be used, once for each view that they give."""
+    shots, known = examined.gathered.capture.shots, examined.photographs
+    looks = [(shot, known[shot.name]) for shot in shots if shot.name in names and shot.name in known]
+    return [size for shot, look in looks if look.size for size in view_sizes(data, shot, look.size)]
 
 
 def _with_maps(data: Data, examined: Examined, recipe: Recipe) -> set[str]:
     """Names of the training photographs that have a depth map, or will have."""
-    names = [shot.name for shot in examined.gathered.train]
-    found = set(depth_maps(data, examined.gathered))
-    return found or (set(names) if recipe.depth is not None else set())
+    train = examined.gathered.train
+    maps = set(depth_maps(data, examined.gathered))
+    found = {shot.name for shot in train if not maps.isdisjoint(view_names([shot]))}
+    return found or ({shot.name for shot in train} if recipe.depth is not None else set())
 
 
 def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
@@ -153,11 +158,12 @@ def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
     view_bytes += sum(w * h for w, h in _sizes(data, examined, train & set(gathered.masks)))
     view_bytes += prior_bytes(needs_normals(losses)) * sum(w * h for w, h in _sizes(data, examined, train & priors))
     bent = sum(not is_pinhole(shot.camera) for shot in gathered.capture.shots)
-    there = sum(not path.stem.endswith("-mask") for path in cache_folder(data.path).glob("*.png")) if bent else 0
+    kept = [*cache_folder(data.path).glob("*.png"), *place(data.path, PANORAMAS).glob("*-front.png")] if bent else []
+    there = sum(not path.stem.endswith("-mask") for path in kept)
     return Load(
         steps=recipe.pretrain.steps,
-        train=len(train),
-        held_out=len(gathered.capture.shots) - len(train),
+        train=len(view_names(gathered.train)),
+        held_out=len(view_names(gathered.capture.shots)) - len(view_names(gathered.train)),
         view_bytes=view_bytes,
         budget_bytes=cache_bytes(plan.cache),
         undistort=max(0, bent - there),
@@ -171,12 +177,12 @@ def _load(data: Data, recipe: Recipe, examined: Examined, plan: Plan) -> Load:
 
 
 def _scene(data: Data, examined: Examined, load: Load, folder: Path) -> tuple[Scene, Load]:
-    """The scene with a few views, undistorted into a folder of ours, and what that has taken for each."""
+    """The scene with a few views, undistorted or cut into a folder of ours, and what that has taken for each."""
     train = examined.gathered.train
     chosen = [train[at * len(train) // min(VIEWS, len(train))] for at in range(min(VIEWS, len(train)))]
     start = time.perf_counter()
     with heard():
-        scene = build_scene(data, examined.gathered.capture, folder, {shot.name for shot in chosen})
+        scene = build_scene(data, examined.gathered.capture, folder, set(view_names(chosen)))
     seconds = (time.perf_counter() - start) * min(load.threads, len(chosen)) / len(chosen)
     written = sum(path.stat().st_size for path in folder.iterdir())
     bent = sum(not is_pinhole(shot.camera) for shot in chosen)

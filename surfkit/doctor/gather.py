@@ -19,6 +19,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_files import DepthFile
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.masks import FOLDER, MARKS, find_masks, with_opacity
+from surfkit.readers.panoramas import view_names
 from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.read import model_folder, read_capture, reader_of
 from surfkit.scene.names import PICTURES
@@ -81,13 +82,13 @@ def gather(data: Data, quick: bool = False) -> Gathered:
 
 
 def depth_maps(data: Data, gathered: Gathered) -> dict[str, DepthFile]:
-    """The depth map of each photograph to train on that has one, by name.
+    """The depth map of each view to train on that has one, by name.
 
     Raises:
         BadInput: A file that describes the maps is damaged.
     """
     metres = data.metres_per_unit or gathered.capture.metres
-    query = DepthQuery(data.path, [shot.name for shot in gathered.train], model_folder(data), metres)
+    query = DepthQuery(data.path, view_names(gathered.train), model_folder(data), metres)
     return find_maps(query, data.depth_layout)
 
 

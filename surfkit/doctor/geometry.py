@@ -12,7 +12,7 @@ from surfkit.core.check import BadInput, few
 from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.holes import holes
 from surfkit.readers.capture import Shot
-from surfkit.readers.undistort import check_camera
+from surfkit.readers.undistort import check_camera, is_panorama
 from surfkit.scene.scene import Frame
 
 SAMPLE = 4_000
@@ -96,12 +96,18 @@ def places(shot: Shot, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         xyz: (S, 3) float64, input frame.
 
     Returns:
-        (S, 2) shares of the width and height, NaN where a point is not in view; (S,) camera z, input units.
+        (S, 2) shares of the width and height, NaN where a point is not in view; (S,) camera z, input units, or the
+        distance for a panorama.
     """
     rays = xyz @ shot.pose[:3, :3].T + shot.pose[:3, 3]
     depth, camera = rays[:, 2], shot.camera
     size = np.array([camera.width, camera.height])
     found = np.full((len(xyz), 2), np.nan)
+    if is_panorama(camera):  # all around it
+        depth = np.linalg.norm(rays, axis=1)
+        good = np.isfinite(depth) & (depth > 0)
+        found[good] = np.asarray(camera.img_from_cam(rays[good]), np.float64).reshape(-1, 2) / size
+        return found, depth
     with np.errstate(all="ignore"):
         flat = rays[:, :2] / depth[:, None]
         focal = np.array([camera.focal_length_x, camera.focal_length_y])

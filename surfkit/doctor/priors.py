@@ -12,6 +12,7 @@ from surfkit.doctor.finding import Finding, from_errors
 from surfkit.doctor.gather import Gathered, depth_maps, heard
 from surfkit.readers.data import Data
 from surfkit.readers.depth_prior import OFF, alignment, normals_warning, prepare_command
+from surfkit.readers.panoramas import view_names, view_sizes
 from surfkit.readers.read import build_scene
 from surfkit.recipe import Recipe
 from surfkit.train.material import needs_normals, needs_priors
@@ -20,6 +21,7 @@ from surfkit.train.material import needs_normals, needs_priors
 def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[Finding]:
     """Depth priors, where the recipe uses them; with `quick`, their numbers are not looked at."""
     train, losses = gathered.train, recipe.pretrain.losses
+    names = view_names(train)
     stereo = recipe.start.needs_prior or recipe.method.needs_prior
     if not train or not (stereo or needs_priors(losses)):
         return []
@@ -30,7 +32,7 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
     except BadInput as error:
         return from_errors("depth-priors", [error])
     if not maps and recipe.depth is not None:
-        text = f"there are no depth priors, so the run makes them, {len(train)} maps with {name_of(recipe.depth)}"
+        text = f"there are no depth priors, so the run makes them, {len(names)} maps with {name_of(recipe.depth)}"
         return [Finding("note", "depth-priors", text), *(_normals_to_come(recipe) if normals else [])]
     if not maps and stereo:
         begins = f"method:{name_of(recipe.method)} needs" if recipe.method.needs_prior else "the run begins at"
@@ -39,10 +41,11 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
         text = f"the recipe uses depth priors, and there are no depth priors, so {OFF}; {make}"
         return [Finding("warning", "depth-priors", text)]
     found = []
-    if missing := [shot.name for shot in train if shot.name not in maps]:
-        text = f"{len(missing)} of {len(train)} photographs have no depth prior, {few(missing)}; {make}"
+    if missing := [name for name in names if name not in maps]:
+        text = f"{len(missing)} of {len(names)} photographs have no depth prior, {few(missing)}; {make}"
         found.append(Finding("warning", "depth-priors", text, tuple(missing)))
-    longest = max(max(data.size(shot.camera.width, shot.camera.height)) for shot in train)
+    sizes = [view_sizes(data, shot, (shot.camera.width, shot.camera.height)) for shot in train]
+    longest = max(side for views in sizes for size in views for side in size)
     if recipe.depth is not None and (text := others_warning(data.path, maps.values(), recipe.depth, longest)):
         found.append(Finding("warning", "depth-priors", f"{text}{REMEDY}"))
     if normals and (text := normals_warning(data, list(maps.values()))):
@@ -52,12 +55,11 @@ def priors(data: Data, gathered: Gathered, recipe: Recipe, quick: bool) -> list[
 
 def _numbers(data: Data, gathered: Gathered, maps: Collection[str]) -> list[Finding]:
     """What training will say of the numbers in the maps."""
-    held_out = gathered.held_out
     shots = [shot for shot in gathered.capture.shots if shot.path.is_file()]
     capture = replace(gathered.capture, shots=shots)
     with heard():  # of these, doctor tells in its own words
         try:
-            scene = build_scene(data, capture, only=set(maps) - held_out, pixels=False)
+            scene = build_scene(data, capture, only=set(maps), pixels=False)
         except BadInput:
             return []
     with heard() as said:

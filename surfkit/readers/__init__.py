@@ -16,6 +16,7 @@ def surfkit_components():
     from surfkit.readers.pix4d import Pix4D
     from surfkit.readers.polycam import Polycam, PolycamDepths
     from surfkit.readers.realitycapture import RealityCapture
+    from surfkit.readers.record3d import Record3D
     from surfkit.readers.split import GauUScene
     from surfkit.readers.transforms import Blender, MatrixCity, Nerfstudio
     from surfkit.readers.xmp_sidecars import XmpSidecars
@@ -34,6 +35,7 @@ def surfkit_components():
         "pix4d": Pix4D,
         "polycam": Polycam,
         "realitycapture": RealityCapture,
+        "record3d": Record3D,
         "xmp-sidecars": XmpSidecars,
     }
     depths = {

@@ -14,6 +14,7 @@ from surfkit.core.check import BadInput, few, reject
 from surfkit.core.events import Warned, emit
 from surfkit.readers.capture import Shot, Tracks, shorten
 from surfkit.readers.data import Data
+from surfkit.readers.undistort import is_panorama
 from surfkit.scene.groups import connect_groups
 from surfkit.scene.names import find_files
 
@@ -140,7 +141,7 @@ def tracks_of(shots: Sequence[Shot], xyz: np.ndarray, seen: Mapping[str, tuple[n
         cameras[shot.name] = shot.camera
         rows, pixels = seen[shot.name]
         local = xyz[rows] @ shot.pose[:3, :3].T + shot.pose[:3, 3]
-        ahead = local[:, 2] > 0
+        ahead = (local[:, 2] > 0) | is_panorama(shot.camera)
         error = np.full(len(rows), np.inf)
         if ahead.any():
             error[ahead] = np.linalg.norm(np.asarray(shot.camera.img_from_cam(local[ahead])) - pixels[ahead], axis=1)

@@ -24,12 +24,15 @@ from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.data import Data
 from surfkit.readers.geocentric import place_of
 from surfkit.readers.georeference import Similarity
+from surfkit.readers.panoramas import panorama
 from surfkit.readers.transforms import points
 
 HEAD = 4096
 """Bytes of a file that are looked at to recognise it."""
 LENSES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
 """Kinds of sensors, and whether they are fisheyes."""
+SPHERICAL = "spherical"
+"""Kind of a sensor whose photographs are panoramas; it has no calibration."""
 COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 NO = ("false", "0")
 
@@ -52,7 +55,11 @@ class Metashape(Reader):
         for number in dict.fromkeys(camera.get("sensor_id") for camera in cameras):
             with leaving_out():
                 where = f"{path}: sensor {number}"
-                known[number] = lenses.camera(where, _lens(where, sensors.get(number)))
+                sensor = sensors.get(number)
+                is_whole = sensor is not None and sensor.get("type") == SPHERICAL
+                known[number] = (
+                    panorama(where, _size(where, sensor)) if is_whole else lenses.camera(where, _lens(where, sensor))
+                )
         lenses.tell()
         shots = []
         for camera, name in zip(cameras, names, strict=True):
@@ -150,15 +157,13 @@ def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
     best = next((one for one in given if one.get("class") == "adjusted"), given[0])
     kind = best.get("type") or sensor.get("type", "")
     if kind not in LENSES:
-        raise BadInput(f"{where}: of type {kind}; known: {', '.join(LENSES)}; cut up panoramas")
-    resolution = best.find("resolution") if best.find("resolution") is not None else sensor.find("resolution")
-    size = [resolution.get(side, "") if resolution is not None else "" for side in ("width", "height")]
-    width, height = numbers(f"{where}: resolution", size, 2)
+        raise BadInput(f"{where}: of type {kind}; known: {', '.join((*LENSES, SPHERICAL))}")
+    width, height = _size(where, best if best.find("resolution") is not None else sensor)
     if best.find("f") is None:
         raise BadInput(f"{where}: no f in its calibration; open the project in Metashape, and export the cameras again")
     value = {name: float(numbers(f"{where}: {name}", best.findtext(name) or "0", 1)[0]) for name in COEFFICIENTS}
     return Brown(
-        size=(int(width), int(height)),
+        size=(width, height),
         focal=(value["f"] + value["b1"], value["f"]),
         centre=(width / 2 + value["cx"], height / 2 + value["cy"]),
         radial=(value["k1"], value["k2"], value["k3"], value["k4"]),
@@ -167,6 +172,14 @@ def _lens(where: str, sensor: ElementTree.Element | None) -> Brown:
         shear=value["b2"],
         fisheye=LENSES[kind],
     )
+
+
+def _size(where: str, element: ElementTree.Element) -> tuple[int, int]:
+    """Width and height of the photographs of a sensor, from it or from a calibration of it."""
+    resolution = element.find("resolution")
+    words = [resolution.get(side, "") if resolution is not None else "" for side in ("width", "height")]
+    width, height = numbers(f"{where}: resolution", words, 2)
+    return int(width), int(height)
 
 
 def _placed(path: Path, chunk: ElementTree.Element, part: str | None, capture: Capture) -> Capture:

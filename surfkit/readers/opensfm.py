@@ -19,6 +19,7 @@ from surfkit.readers.capture import Capture, Shot, Tracks, camera_of
 from surfkit.readers.data import Data
 from surfkit.readers.geocentric import topocentric_to_utm, warn_of_bend
 from surfkit.readers.georeference import place_on_earth
+from surfkit.readers.panoramas import panorama
 from surfkit.scene.names import find_files
 
 PLACES = ("opensfm/reconstruction.topocentric.json", "opensfm/reconstruction.json", "reconstruction.json")
@@ -36,6 +37,7 @@ LENSES = {
     "fisheye_opencv": (FISHEYE, ("k1", "k2", "k3", "k4")),
 }
 """COLMAP's name of each projection, and the coefficients that it takes."""
+PANORAMAS = ("spherical", "equirectangular")
 STRETCHED = {
     "RADIAL": (WHOLE, ("k1", "k2", *[""] * 6)),
     "SIMPLE_RADIAL": (WHOLE, ("k1", *[""] * 7)),
@@ -148,8 +150,10 @@ def _largest(path: Path, models: Any) -> Mapping[str, Any]:
 def _camera(where: str, lens: Mapping[str, Any]) -> Any:
     """The pycolmap camera of OpenSfM's normalised intrinsics: lengths are shares of the longer side."""
     kind = str(lens.get("projection_type"))
+    if kind in PANORAMAS:
+        return panorama(where, (int(lens["width"]), int(lens["height"])))
     if kind not in LENSES:
-        raise BadInput(f"{where}: projection {kind}; known: {', '.join(LENSES)}; cut up panoramas")
+        raise BadInput(f"{where}: projection {kind}; known: {', '.join((*LENSES, *PANORAMAS))}")
     model, names = LENSES[kind]
     width, height = int(lens["width"]), int(lens["height"])
     longer = max(width, height)

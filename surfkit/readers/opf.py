@@ -21,13 +21,18 @@ from surfkit.core.codec import read_json
 from surfkit.core.events import Warned, emit
 from surfkit.readers.base import Reader
 from surfkit.readers.brown import Brown, Lenses
-from surfkit.readers.camera_files import leave_out, numbers, one_file, photographs, pose_at
-from surfkit.readers.capture import Capture, Shot, shorten
+from surfkit.readers.camera_files import groups_of, leave_out, numbers, one_file, photographs, pose_at, tracks_of
+from surfkit.readers.capture import Capture, Shot, Tracks, shorten
 from surfkit.readers.data import Data
 from surfkit.readers.exchanged import map_system, photo_names
+from surfkit.readers.opf_points import Points, read_opf_points
 from surfkit.readers.transforms import points
 
 FORMAT = "application/opf-{}+json"
+CALIBRATED, GLTF = FORMAT.format("calibrated-cameras"), "model/gltf+json"
+"""Of the calibrated cameras, and of the sparse points beside them."""
+Seen = dict[str, tuple[np.ndarray, np.ndarray]]
+"""By name of the photograph, rows of the points that it shows, and their pixels."""
 FLIP = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
 
@@ -40,38 +45,11 @@ class OPF(Reader):
         return bool(_files(root))
 
     def read(self, data: Data) -> Capture:
-        path = one_file(data.path, _files(data.path), "project NAME.opf; export the project as OPF")
-        project = read_json(path, dict[str, Any])
-        calibrated, file = _one(path, project, "calibrated-cameras")
-        paths = {
-            each.get("id"): unquote(str(each.get("uri", "")).partition("#")[0])
-            for contents, _ in _all(path, project, "camera-list")
-            for each in _entries(path, contents, "cameras")
-        }
-        sizes, taken = _inputs(path, project)
-        cameras = [each for each in _entries(file, calibrated, "cameras") if each.get("id") in paths]
-        if not cameras:
-            raise BadInput(
-                f"{file}: no camera in it that the list of cameras has; calibrate the project, and export it"
-            )
-        has = {each["id"] for each in cameras}
-        lost = [paths[each] for each in taken if each in paths and each not in has]
-        leave_out(file, photo_names(lost) if lost else [], len(has) + len(lost), "are not calibrated")
-        names = photo_names([paths[each["id"]] for each in cameras])
-        found, shots, lenses, known = photographs(data, names), [], Lenses(file), {}
-        for sensor in _entries(file, calibrated, "sensors"):
-            with leaving_out():
-                where = f"{file}: sensor {sensor.get('id')}"
-                known[sensor.get("id")] = lenses.camera(where, _lens(where, sensor, sizes))
-        lenses.tell()
-        place = _Place.read(path, project)
-        for name, each in zip(names, cameras, strict=True):
-            if name in found and each.get("sensor_id") in known:
-                with leaving_out():
-                    pose = _pose(f"{file}: camera {each['id']}", each, place.shift)
-                    shots.append(Shot(name, pose, known[each["sensor_id"]], found[name]))
-        shift = tuple(place.shift.tolist()) if any(place.shift) else None
-        return Capture(shots, *points(data.path, {}), metres=place.metres, crs=place.crs, shift=shift)
+        return _read(data)[0]
+
+    def tracks(self, data: Data) -> Tracks | None:
+        capture, seen = _read(data)
+        return tracks_of(capture.shots, capture.xyz, seen) if seen else None
 
 
 @dataclass(frozen=True)
@@ -109,6 +87,56 @@ class _Place:
         return cls(shift, system, metres)
 
 
+def _read(data: Data) -> tuple[Capture, Seen]:
+    """What is in a project, and where its sparse points were seen."""
+    path = one_file(data.path, _files(data.path), "project NAME.opf; export the project as OPF")
+    project = read_json(path, dict[str, Any])
+    calibrated, file = _one(path, project, "calibrated-cameras")
+    paths = {
+        each.get("id"): unquote(str(each.get("uri", "")).partition("#")[0])
+        for contents, _ in _all(path, project, "camera-list")
+        for each in _entries(path, contents, "cameras")
+    }
+    sizes, taken = _inputs(path, project)
+    cameras = [each for each in _entries(file, calibrated, "cameras") if each.get("id") in paths]
+    if not cameras:
+        raise BadInput(f"{file}: no camera in it that the list of cameras has; calibrate the project, and export it")
+    has = {each["id"] for each in cameras}
+    lost = [paths[each] for each in taken if each in paths and each not in has]
+    leave_out(file, photo_names(lost) if lost else [], len(has) + len(lost), "are not calibrated")
+    names = photo_names([paths[each["id"]] for each in cameras])
+    found, shots, lenses, known = photographs(data, names), [], Lenses(file), {}
+    for sensor in _entries(file, calibrated, "sensors"):
+        with leaving_out():
+            where = f"{file}: sensor {sensor.get('id')}"
+            known[sensor.get("id")] = lenses.camera(where, _lens(where, sensor, sizes))
+    lenses.tell()
+    place = _Place.read(path, project)
+    for name, each in zip(names, cameras, strict=True):
+        if name in found and each.get("sensor_id") in known:
+            with leaving_out():
+                pose = _pose(f"{file}: camera {each['id']}", each, place.shift)
+                shots.append(Shot(name, pose, known[each["sensor_id"]], found[name]))
+    shift = tuple(place.shift.tolist()) if any(place.shift) else None
+    sparse = None
+    with leaving_out():
+        sparse = _sparse(path, project)
+    xyz, rgb = points(data.path, {}) if sparse is None else (sparse.xyz + place.shift, sparse.rgb)
+    named = {each["id"]: name for name, each in zip(names, cameras, strict=True)}
+    marks = {} if sparse is None else sparse.seen
+    seen = {named[number]: each for number, each in marks.items() if number in named and len(each[0])}
+    groups = groups_of(shots, seen)
+    return Capture(shots, xyz, rgb, metres=place.metres, crs=place.crs, shift=shift, groups=groups), seen
+
+
+def _sparse(path: Path, project: Mapping[str, Any]) -> Points | None:
+    """The sparse points beside the calibration that is used; None where there are none."""
+    items = [_entries(path, item, "resources") for item in _entries(path, project, "items")]
+    used = [resources for resources in items if any(each.get("format") == CALIBRATED for each in resources)][-1]
+    file = next((_file(path, each) for each in used if each.get("format") == GLTF), None)
+    return None if file is None else read_opf_points(file)
+
+
 def _files(root: Path) -> list[Path]:
     return sorted(path for path in root.glob("*.opf") if path.is_file() and not path.name.startswith("."))
 
@@ -118,11 +146,16 @@ def _all(path: Path, project: Mapping[str, Any], kind: str) -> Iterator[tuple[Ma
     for item in _entries(path, project, "items"):
         for resource in _entries(path, item, "resources"):
             if resource.get("format") == FORMAT.format(kind):
-                uri = unquote(str(resource.get("uri", "")))
-                if "://" in uri and not uri.startswith("file:"):
-                    raise BadInput(f"{path}: {shorten(uri)} is not on this machine; save the project whole")
-                file = path.parent / uri.removeprefix("file://").replace("\\", "/")
+                file = _file(path, resource)
                 yield read_json(file, dict[str, Any]), file
+
+
+def _file(path: Path, resource: Mapping[str, Any]) -> Path:
+    """The file of a resource of a project."""
+    uri = unquote(str(resource.get("uri", "")))
+    if "://" in uri and not uri.startswith("file:"):
+        raise BadInput(f"{path}: {shorten(uri)} is not on this machine; save the project whole")
+    return path.parent / uri.removeprefix("file://").replace("\\", "/")
 
 
 def _one(path: Path, project: Mapping[str, Any], kind: str) -> tuple[Mapping[str, Any], Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,12 +20,34 @@ from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture, Shot
 from surfkit.readers.colmap import COLMAP, MODELS
 from surfkit.readers.data import Data
+from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.masks import check_mask, find_masks, with_opacity
+from surfkit.readers.panoramas import (
+    FACES,
+    FOLDER,
+    check_whole,
+    cut,
+    cut_tracks,
+    parts_of,
+    size_to_read,
+    view_names,
+    view_sizes,
+    views_of,
+)
 from surfkit.readers.pixels import Decided, decide
 from surfkit.readers.placed import FILE, Placed, on_the_map, read_placed
 from surfkit.readers.reduced import reduced
-from surfkit.readers.undistort import Picture, check_camera, is_pinhole, lens_of, pinhole_of, undistort
+from surfkit.readers.undistort import (
+    Picture,
+    check_camera,
+    is_panorama,
+    is_pinhole,
+    lens_of,
+    pinhole_of,
+    undistort,
+)
 from surfkit.scene.camera import Camera
+from surfkit.scene.copies import place
 from surfkit.scene.crs import known_axes, refuse_other_unit
 from surfkit.scene.groups import groups_warning, untied_warning
 from surfkit.scene.names import PICTURES, VIDEOS, is_video
@@ -37,7 +60,8 @@ RANDOM_POINTS = 50_000
 
 
 def read(data: Data) -> Scene:
-    """The scene in a data set, in its local frame; photographs of distorted cameras are undistorted on the way.
+    """The scene in a data set, in its local frame; photographs of distorted cameras are undistorted on the way, and
+    panoramas are cut into views.
 
     Raises:
         BadInput: Something is missing, damaged, or of a kind that is not supported; one line says what to do.
@@ -87,31 +111,47 @@ def build_scene(
     Args:
         data: The data set, and how to use it.
         capture: What its reader has found in it.
-        keep: Folder of the undistorted photographs; by default one that later runs find again.
-        only: Names of the photographs to make views of; all by default.
-        pixels: Whether photographs are undistorted; if not, views have the right cameras and nothing is written.
+        keep: Folder of the undistorted photographs and of the views of panoramas; by default one that later runs find
+            again.
+        only: Names of the views to make; all by default.
+        pixels: Whether photographs are undistorted and panoramas cut; if not, views have the right cameras and nothing
+            is written.
     """
     held_out = data.held_out(capture)
     shots = sorted(capture.shots, key=lambda shot: shot.name)
-    if twice := next((a.name for a, b in pairwise(shots) if a.name == b.name), None):
+    if twice := next((a for a, b in pairwise(sorted(view_names(shots))) if a == b), None):
         reject(BadInput(f"{data.path}: the photograph {twice!r} is there twice; leave one out"))
     poses = np.stack([shot.pose for shot in shots if shot.name not in held_out])
     frame = _frame(data, capture, poses)
     data, shots = reduced(data, shots)
     decided = decide({shot.name: shot.path for shot in shots}, data.alpha, data.white)
     masks = with_opacity(find_masks(data.path, data.masks, shots), shots, decided)
-    wanted = [shot for shot in shots if only is None or shot.name in only]
+    wanted = [shot for shot in shots if only is None or not only.isdisjoint(view_names([shot]))]
     views = _views(data, wanted, decided, masks, frame, keep, pixels)
+    train = [shot for shot in shots if shot.name not in held_out]
     scene = Scene(
         name=data.path.resolve().name,
-        train=tuple(view for view in views if view.name not in held_out),
-        held_out=tuple(view for view in views if view.name in held_out),
-        cloud=_cloud(capture, poses, frame),
+        train=tuple(view for shot, view in views if shot not in held_out),
+        held_out=tuple(view for shot, view in views if shot in held_out),
+        cloud=_cloud(capture, np.stack([part.pose for shot in train for part in parts_of(shot)]), frame),
         frame=frame,
     )
     for line in decided.lines:
         emit(Warned(line))
+    if whole := [shot for shot in wanted if is_panorama(shot.camera)]:
+        emit(Warned(_cutting(data, whole, frame)))
     return scene
+
+
+def _cutting(data: Data, whole: Sequence[Shot], frame: Frame) -> str:
+    """What to say of panoramas."""
+    query = DepthQuery(data.path, [shot.name for shot in whole], model_folder(data), frame.metres)
+    maps = 0
+    with suppress(BadInput):  # told where depth maps are used
+        maps = len(find_maps(query, data.depth_layout))
+    unused = f"; depth maps of {maps} of them are not cut with them, and not used" if maps else ""
+    count = "1 panorama is" if len(whole) == 1 else f"{len(whole)} panoramas are"
+    return f"{count} cut into {len(FACES)} views each, which lie in {place(data.path, FOLDER)}{unused}"
 
 
 def _with_tests(capture: Capture, reader: Reader, data: Data) -> Capture:
@@ -208,6 +248,7 @@ def observations(data: Data, scene: Scene) -> Observations:
     tracks, placed, seen = reader.tracks(data), _placed(data, reader), {}
     if tracks is None:
         return Observations(np.zeros((0, 3)), np.zeros(0), {})
+    tracks = cut_tracks(tracks)
     for view in (*scene.train, *scene.held_out):
         if view.name in tracks.seen:
             rows, pixels = tracks.seen[view.name]
@@ -237,13 +278,16 @@ def _views(
     frame: Frame,
     keep: Path | None,
     pixels: bool,
-) -> list[View]:
-    """The photographs at the size to use them at, undistorted."""
+) -> list[tuple[str, View]]:
+    """The photographs at the size to use them at, undistorted, with the name of the one that each view is of."""
 
-    def straight(picture: Picture) -> Picture:
+    def straight(shot: Shot, size: tuple[int, int], picture: Picture) -> list[tuple[Shot, Picture]]:
+        if is_panorama(shot.camera):
+            side = view_sizes(data, shot, size)[0][0]
+            return cut(shot, picture, side, data.path, keep) if pixels else views_of(shot, picture, side)
         if is_pinhole(picture.camera):
-            return picture
-        return undistort(picture, data.path, keep) if pixels else pinhole_of(picture)
+            return [(shot, picture)]
+        return [(shot, undistort(picture, data.path, keep) if pixels else pinhole_of(picture))]
 
     for shot in {id(shot.camera): shot for shot in reversed(shots)}.values():
         check_camera(shot.camera, shot.name)
@@ -252,7 +296,7 @@ def _views(
         turned = list(pool.map(lambda shot: is_turned(shot.path), shots))
         for shot, size in zip(shots, sizes, strict=True):
             check_size(shot, size)
-            refuse_large(shot.path, size, data.size(*size))
+            refuse_large(shot.path, size, size_to_read(data, shot, size))
             if shot.name in masks:
                 check_mask(masks[shot.name].path, size)
         given = [
@@ -260,13 +304,13 @@ def _views(
                 shot.path,
                 masks.get(shot.name),
                 shot.camera,
-                data.size(*size),
+                size_to_read(data, shot, size),
                 data.white,
                 decided.pixels[shot.name],
             )
             for shot, size in zip(shots, sizes, strict=True)
         ]
-        pictures = list(pool.map(straight, given))
+        made = list(pool.map(straight, shots, sizes, given))
     if any(turned):
         first = shots[turned.index(True)].name
         emit(
@@ -275,12 +319,18 @@ def _views(
                 "ignored, as COLMAP and OpenSfM ignore it, and pixels are taken as stored"
             )
         )
-    lenses = [None if is_pinhole(p.camera) else lens_of(p.camera, p.size) for p in given]
-    return [_view(*parts, frame) for parts in zip(shots, pictures, lenses, strict=True)]
+    lenses = [None if is_pinhole(p.camera) or is_panorama(p.camera) else lens_of(p.camera, p.size) for p in given]
+    return [
+        (shot.name, _view(part, picture, lens, frame))
+        for shot, parts, lens in zip(shots, made, lenses, strict=True)
+        for part, picture in parts
+    ]
 
 
 def check_size(shot: Shot, size: tuple[int, int]) -> None:
-    """BadInput unless the photograph is the camera's picture at some size, within a pixel."""
+    """BadInput unless the photograph is the camera's picture at some size, within a pixel; a panorama must be whole."""
+    if is_panorama(shot.camera):
+        check_whole(shot.path, size)
     full = (shot.camera.width, shot.camera.height)
     long = 0 if full[0] >= full[1] else 1
     if abs(full[1 - long] * size[long] / full[long] - size[1 - long]) <= 1:

@@ -20,7 +20,9 @@ from surfkit.readers.data import Data
 from surfkit.readers.depth_cloud import sample_depth_maps
 from surfkit.readers.depth_layout import DepthQuery, find_maps
 from surfkit.readers.depth_layouts import MatrixCityDepths
+from surfkit.readers.panoramas import panorama
 from surfkit.readers.sparse_ply import read_points
+from surfkit.readers.undistort import PANORAMA
 from surfkit.scene.names import name_below, named_file
 from surfkit.scene.photos import photo_size
 
@@ -210,6 +212,8 @@ def _number(where: str, values: Mapping[str, Any], name: str, default: float | N
 def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     """The pycolmap camera that intrinsics describe."""
     width, height = _size(where, values, photo)
+    if values.get("camera_model") == PANORAMA:
+        return panorama(where, (width, height))
     fx, fy = _focal(where, values, width, height)
     centre = [_number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)]
     k = {n: _number(where, values, n, 0) for n in ("k1", "k2", "k3", "k4", "p1", "p2")}
@@ -217,7 +221,7 @@ def _camera(where: str, values: Mapping[str, Any], photo: Path) -> Any:
     if values.get("is_fisheye") is True or model == "OPENCV_FISHEYE":
         model, extra = "OPENCV_FISHEYE", [k["k1"], k["k2"], k["k3"], k["k4"]]
     elif model not in PERSPECTIVE:
-        raise BadInput(f"{where}: camera_model {model}; known: {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE")
+        raise BadInput(f"{where}: camera_model {model}; known: {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, {PANORAMA}")
     elif k["k4"]:
         raise BadInput(f"{where}: k4 of a perspective camera means different things to different programs; drop it")
     elif not any(k.values()):

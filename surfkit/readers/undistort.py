@@ -28,6 +28,8 @@ RECIPE = "1"
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 SHORTEST_PX = 1e-6
 """Shorter focal lengths are a mistake."""
+PANORAMA = "EQUIRECTANGULAR"
+"""COLMAP's model of a panorama."""
 POLYNOMIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Models that are pinholes when all their coefficients are 0."""
 
@@ -60,14 +62,17 @@ def is_pinhole(camera: Any) -> bool:
     return name in PINHOLES or (name in POLYNOMIAL and not any(extra))
 
 
+def is_panorama(camera: Any) -> bool:
+    """Whether a camera is that of an equirectangular panorama."""
+    return bool(camera.model.name == PANORAMA)
+
+
 def check_camera(camera: Any, name: str) -> None:
     """BadInput for a camera that cannot be used; `name` is one of its photographs."""
     where = f"camera {camera.camera_id} of {name}"
     values = [*camera.params, camera.width, camera.height]
     if not (np.isfinite(values).all() and camera.width > 0 and camera.height > 0):
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
-    if not len(camera.focal_length_idxs()):
-        raise BadInput(f"{where} has model {camera.model.name}, a panorama; cut it into perspective photographs")
     if not all(camera.params[i] > SHORTEST_PX for i in camera.focal_length_idxs()):
         raise BadInput(f"{where} has size {camera.width} x {camera.height} and parameters {list(camera.params)}")
 
@@ -89,18 +94,32 @@ def undistort(picture: Picture, root: Path, keep: Path | None = None) -> Picture
     mask = path.with_name(f"{path.stem}-mask.png") if picture.mask is not None or not inside.all() else None
     if not path.exists():
         if mask is not None:
-            _save(mask, _keep(picture, grid, inside).to(torch.uint8).mul(255)[None].expand(3, -1, -1))
-        photo = read_photo(picture.path, picture.size, picture.white, picture.pixels).float()
-        if _is_own_mask(picture):  # colours of transparent pixels are none, and do not spread
-            shown = read_mask(picture.path, picture.size, alpha=True).float()[None]
-            parts = grid_sample(torch.cat([photo * shown, shown])[None], grid, "bicubic", "border", align_corners=False)
-            values = parts[0, :3] / parts[0, 3:].clamp(min=0.1)
-        else:
-            values = grid_sample(photo[None], grid, "bicubic", "border", align_corners=False)[0]
-        _save(path, (values * inside).round().clamp(0, 255).to(torch.uint8))  # last: with it, the mask is there too
+            save_mask(mask, _keep(picture, grid, inside))
+        values = resampled(read_layers(picture, picture.size), grid)
+        save_picture(path, values * inside)  # last: with it, the mask is there too
     size = camera.width, camera.height
     kept = None if mask is None else Mask(mask)
     return replace(picture, path=path, mask=kept, camera=camera, size=size, pixels=PLAIN)
+
+
+def read_layers(picture: Picture, size: tuple[int, int]) -> Tensor:
+    """(3, H, W) uint8 of a picture at a width and height; (4, H, W) where its own opacity is its mask.
+
+    The colours of transparent pixels are none then, and must not spread: they are 0, and the fourth layer is 1 where
+    there are colours.
+    """
+    photo = read_photo(picture.path, size, picture.white, picture.pixels)
+    if not _is_own_mask(picture):
+        return photo
+    shown = read_mask(picture.path, size, alpha=True).to(torch.uint8)[None]
+    return torch.cat([photo * shown, shown])
+
+
+def resampled(layers: Tensor, grid: Tensor) -> Tensor:
+    """(3, h, w) float32 colours of `read_layers` at (1, h, w, 2) places as `grid_sample` has them."""
+    each = [grid_sample(one[None, None].float(), grid, "bicubic", "border", align_corners=False)[0] for one in layers]
+    values = torch.cat(each)  # one by one, as floats take four times the memory
+    return values[:3] / values[3:].clamp(min=0.1) if len(values) > 3 else values
 
 
 def pinhole_of(picture: Picture) -> Picture:
@@ -169,7 +188,13 @@ def cache_folder(root: Path) -> Path:
     return place(root, FOLDER)
 
 
-def _save(path: Path, pixels: Tensor) -> None:
-    """A (3, H, W) picture as PNG; whole or not there."""
+def save_picture(path: Path, values: Tensor) -> None:
+    """A (3, H, W) picture of floats as PNG; whole or not there."""
+    pixels = values.round().clamp(0, 255).to(torch.uint8)
     with replacing(path) as file:
         Image.fromarray(pixels.permute(1, 2, 0).numpy()).save(file, "PNG", compress_level=1)
+
+
+def save_mask(path: Path, kept: Tensor) -> None:
+    """(H, W) bool as a picture that is black where it is False."""
+    save_picture(path, kept.float().mul(255)[None].expand(3, -1, -1))

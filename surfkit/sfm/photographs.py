@@ -20,6 +20,7 @@ from surfkit.scene.names import HEIF, PICTURES
 from surfkit.scene.photos import open_header, photo_size, read_draft, require_heif
 from surfkit.scene.pixels import PLAIN, Alpha, Pixels
 from surfkit.sfm.exif import Exif, read_exif
+from surfkit.sfm.xmp import panorama_kind
 
 PHOTOGRAPHS = "photographs.json"
 """File of what was found."""
@@ -31,8 +32,10 @@ DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MOST_THREADS = 8
 """Photographs that are read at once."""
-EDITION = 1
+EDITION = 2
 """Changes when more is found in a photograph: it is looked at again then."""
+PANORAMA = "a panorama"
+"""Begins the problem of one."""
 DARK, FLAT = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""
 
@@ -133,6 +136,14 @@ def look_at(
         for photo in pool.map(lambda path: _look_unless_known(folder, path, before, decided.pixels), paths):
             found.append(photo)
             emit(Progress("looking at photographs", len(found), len(paths)))
+    if whole := [photo.name for photo in found if (photo.problem or "").startswith(PANORAMA)]:
+        emit(
+            Warned(
+                f"{folder}: {len(whole)} of {len(found)} photographs are panoramas by their XMP, {few(whole)}: no "
+                "cameras are found for them, and they are left out; Metashape, COLMAP and OpenSfM find them, and "
+                "their equirectangular ones are read"
+            )
+        )
     return _mark_copies(found)
 
 
@@ -214,13 +225,15 @@ def _is_text(name: str) -> bool:
 
 def _look(path: Path, photo: Photo) -> Photo:
     size = photo_size(path)
-    exif = open_header(path, lambda image: read_exif(image, size))
+    exif, kind = open_header(path, lambda image: (read_exif(image, size), panorama_kind(image.info.get("xmp"))))
     draft = read_draft(path, DRAFT_PX, photo.reading)
     grey = draft.astype(np.float32).mean(2)
     light, contrast = float(grey.mean()), float(grey.std())
     problem = None
     if contrast < FLAT:
         problem = "black" if light < DARK else "of one colour"
+    if kind is not None:
+        problem = f"{PANORAMA} ({kind})"
     return replace(
         photo,
         digest=hashlib.sha256(path.read_bytes() + _said(photo.reading)).hexdigest()[:32],

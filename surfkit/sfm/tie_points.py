@@ -24,7 +24,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.masks import find_masks
 from surfkit.readers.placed import Placed
 from surfkit.readers.read import check_size, read_capture, reader_of
-from surfkit.readers.undistort import check_camera
+from surfkit.readers.undistort import check_camera, is_panorama
 from surfkit.scene.photos import photo_size
 from surfkit.scene.scene import Frame
 from surfkit.sfm.compare import compare
@@ -66,6 +66,11 @@ class TiePoints:
         """
         load_engine()
         capture = read_capture(self.data, reader_of(self.data))
+        if whole := [shot.name for shot in capture.shots if is_panorama(shot.camera)]:
+            raise BadInput(
+                f"{self.data.path}: {len(whole)} panoramas, {few(whole)}: points are triangulated between perspective "
+                "photographs only; align them with COLMAP or OpenSfM, whose models have points, and are read"
+            )
         root, shots = _by_path(capture)
         self._tell_what_is_lost(capture)
         stages = Stages(self.work)

@@ -1,4 +1,4 @@
-"""Numbers that drones and cameras write into XMP: position, height above the start, how exact they are."""
+"""What drones and cameras write into XMP: position, height above the start, how exact they are; and panoramas."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ NAMES = {
 """By the name in small letters, under any prefix: drone-dji, drone (Autel), drone-parrot, exif and others."""
 PLAIN = {"latitude": LATITUDE, "longitude": LONGITUDE}
 """Names that count under a prefix of a drone only, as Skydio's."""
+PANORAMAS = ("equirectangular", "cylindrical")
+"""Projections of photographs that no lens takes, as GPano:ProjectionType names them."""
 MOST = {LATITUDE: 90.0, LONGITUDE: 180.0, ALTITUDE: 1e5, ABOVE_START: 1e5}
 
 
 def read_xmp(packet: bytes | str | None) -> dict[str, float]:
     """The numbers of an XMP packet that say something of a position, by name; what is damaged counts as not said."""
-    if not packet:
-        return {}
-    text = packet if isinstance(packet, str) else packet.decode("utf-8", "replace")
-    fields = FIELD.findall(text)
+    fields = _fields(packet)
     below = any(name.lower() == "gpsaltituderef" and value in ("1", "3") for _, name, value in fields)
     found: dict[str, float] = {}
     for prefix, name, value in fields:
@@ -48,6 +47,18 @@ def read_xmp(packet: bytes | str | None) -> dict[str, float]:
         if (number := read(value)) is not None and abs(number) <= MOST[what]:
             found[what] = -abs(number) if what == ALTITUDE and small == "gpsaltitude" and below else number
     return found
+
+
+def panorama_kind(packet: bytes | str | None) -> str | None:
+    """The projection of a panorama by its XMP packet, one of `PANORAMAS`; None for a photograph of a lens."""
+    said = [value.lower() for _, name, value in _fields(packet) if name == "ProjectionType"]
+    return said[0] if said and said[0] in PANORAMAS else None
+
+
+def _fields(packet: bytes | str | None) -> list[tuple[str, str, str]]:
+    """Prefix, name and value of each field of a packet."""
+    text = packet or ""
+    return FIELD.findall(text if isinstance(text, str) else text.decode("utf-8", "replace"))
 
 
 def _angle(text: str) -> float | None:

@@ -24,6 +24,7 @@ from surfkit.primitives.surfel2d import Surfel2D
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture
 from surfkit.readers.data import Data
+from surfkit.readers.undistort import is_panorama
 from surfkit.refine.base import Refine
 from surfkit.scene.scene import Cloud, View
 from surfkit.start.base import Start, StartInput
@@ -190,7 +191,7 @@ def _check_sparse(name: str, found: Capture) -> None:
     assert sound, f"{name}: xyz is not (P, 3) finite float64"
     assert rgb.shape == xyz.shape and rgb.dtype == np.uint8, f"{name}: rgb is not (P, 3) uint8"
     for shot in found.shots if len(xyz) else ():
-        before = xyz @ shot.pose[2, :3] + shot.pose[2, 3] > 0
+        before = (xyz @ shot.pose[2, :3] + shot.pose[2, 3] > 0) | is_panorama(shot.camera)
         assert before.any(), (
             f"{name}: no sparse point lies in front of {shot.name}; poses are world_to_camera, z forward"
         )

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from .programs import COLORS, DOTS, HEIGHT, POSES, WIDTH, F, photographs, seen_from
 
@@ -128,6 +129,40 @@ def polycam(folder, kind="corrected_", change=lambda number, values: None, depth
     return project
 
 
+def record3d(folder, own=False, change=lambda values: None):
+    """As nerfstudio reads it: quaternions x, y, z, w and places, camera to world with the axes of OpenGL, of a world
+    with y up; K by columns.
+
+    The world of the dots has z up: its x, y, z are ARKit's x, -z, y.
+    """
+    fx, fy, cx, cy = F, F + 2.0, WIDTH / 2 + 2.5, HEIGHT / 2 - 1.5
+    names = {name: f"rgbd/{at}.jpg" for at, name in enumerate(POSES)}
+    back = {place: name for name, place in names.items()}
+
+    def project(place, points):
+        X, Y, Z = seen_from(back[place], points).T
+        return np.stack([fx * X / Z + cx, fy * Y / Z + cy], 1)
+
+    (folder / "rgbd").mkdir()
+    photographs(folder / "made", lambda name, points: project(names[name], points))
+    poses = []
+    for at, (name, (turn, centre)) in enumerate(POSES.items()):
+        Image.open(folder / "made" / name).save(folder / names[name], quality=100)
+        (folder / "made" / name).unlink()
+        (folder / f"rgbd/{at}.depth").write_bytes(b"bvx2")
+        right, down, ahead = turn
+        x, y, z = np.stack([right, -down, -ahead, centre], 1)  # rows: along the axes of the dots
+        matrix = np.stack([x, z, -y])
+        poses.append([*Rotation.from_matrix(matrix[:, :3]).as_quat().tolist(), *matrix[:, 3].tolist()])
+    (folder / "made").rmdir()
+    values = {"w": WIDTH, "h": HEIGHT, "fps": 60, "poses": poses, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    if own:
+        values |= {"perFrameIntrinsicCoeffs": [[fx, fy, cx, cy]] * len(poses), "K": [9, 0, 0, 0, 9, 0, 1, 1, 1]}
+    change(values)
+    (folder / "metadata").write_text(json.dumps(values))
+    return project
+
+
 def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text: text, **given):
     """RealityCapture XMP camera math: x = R (X - Position); f and shares of the longer side, 36 mm."""
     c = {**dict.fromkeys(("k1", "k2", "k3", "k4", "t1", "t2", "u", "v", "skew"), 0.0), "aspect": 1.0, **given}
@@ -169,6 +204,40 @@ def xmp_sidecars(folder, model="brown3", elements=True, change=lambda name, text
     return project
 
 
+def opf_points(folder, project, ids):
+    """OPF 1.0, point_cloud: a matrix from z up to y up, by columns; matches packed in 40 and 24 bits.
+
+    Before the values of each file are bytes that must not be read.
+    """
+    cameras = [name for _ in DOTS for name in POSES]
+    marks = [project(name, dot[None])[0] for dot in DOTS for name in POSES]
+    packed = [(row * len(POSES)) | (len(POSES) << 40) for row in range(len(DOTS))]
+    arrays = {
+        "position": (np.array(DOTS, "<f4"), 5126, "VEC3"),
+        "colour": (np.column_stack([COLORS, np.full(len(DOTS), 255)]).astype("u1"), 5121, "VEC4"),
+        "camera": (np.array([list(POSES).index(name) for name in cameras], "<u4"), 5125, "SCALAR"),
+        "range": (np.array(packed, "<u8").view("<u4").reshape(-1, 2), 5125, "VEC2"),
+        "pixel": (np.array(marks, "<f4"), 5126, "VEC2"),
+    }
+    accessors, views, buffers = [], [], []
+    for at, (name, (values, kind, shape)) in enumerate(arrays.items()):
+        (folder / f"{name}.bin").write_bytes(bytes(8) + values.tobytes())
+        accessors.append({"bufferView": at, "componentType": kind, "type": shape, "count": len(values)})
+        views.append({"buffer": at, "byteOffset": 8, "byteLength": values.nbytes})
+        buffers.append({"uri": f"{name}.bin", "byteLength": values.nbytes + 8})
+    matches = {"cameraIds": 2, "cameraUids": [ids[name] for name in POSES], "pointIndexRanges": 3}
+    matches |= {"imagePoints": {"pixelCoordinates": 4, "featureIds": 2, "scales": 2}}
+    mesh = {
+        "attributes": {"POSITION": 0, "COLOR_0": 1},
+        "extensions": {"OPF_mesh_primitive_matches": matches},
+        "mode": 0,
+    }
+    matrix = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]
+    whole = {"asset": {"version": "2.0", "extensions": {"OPF_asset_version": {"version": "1.0"}}}, "scene": 0}
+    whole |= {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "matrix": matrix}], "meshes": [{"primitives": [mesh]}]}
+    return whole | {"accessors": accessors, "bufferViews": views, "buffers": buffers}
+
+
 def opf(folder, shift=(0, 0, 0), scale=(1, 1, 1), definition=None, swap=False, change=lambda files: None, **given):
     """OPF: Rx(omega) Ry(phi) Rz(kappa) from a camera (x right, y up, z backward); canonical = map + shift."""
     c = {**dict.fromkeys(("R1", "R2", "R3", "T1", "T2"), 0.0), "cx": WIDTH / 2 + 3.0, "cy": HEIGHT / 2 - 2.0, **given}
@@ -208,9 +277,11 @@ def opf(folder, shift=(0, 0, 0), scale=(1, 1, 1), definition=None, swap=False, c
     }
     kinds = ("camera-list", "input-cameras", "calibrated-cameras", "scene-reference-frame")
     items = [entry(kind, f"parts/{name}") for kind, name in zip(kinds, files, strict=True)]
+    (folder / "parts").mkdir()
+    files["tracks.gltf"] = opf_points(folder / "parts", project, numbers)
+    items[2]["resources"].append({"uri": "parts/tracks.gltf", "format": "model/gltf+json"})
     files["../survey.opf"] = {"format": "application/opf-project+json", "items": items if definition else items[:-1]}
     change(files)
-    (folder / "parts").mkdir()
     for name, contents in files.items():
         (folder / "parts" / name).write_text(json.dumps(contents))
     return photographs(folder / "images", project)

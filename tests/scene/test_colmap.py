@@ -266,7 +266,7 @@ def no_focal(farm):
 @pytest.mark.parametrize(
     ("damage", "text"),
     [
-        (panorama, "camera 7 of view_000.png has model EQUIRECTANGULAR, a panorama"),
+        (panorama, "view_000.png: 40 x 30 px, a panorama that is not twice as wide as high"),
         (strange_model, "a camera model that COLMAP does not know"),
         (no_images, "images: no such folder of photographs"),
         (no_model, "no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse, colmap/sparse/0"),

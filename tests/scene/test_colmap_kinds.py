@@ -217,7 +217,7 @@ def test_distorted_cameras_are_undistorted(farm, lens):
 def test_undistorted_photographs_are_made_once_and_made_anew_when_something_changed(farm, monkeypatch):
     distort(farm, "OPENCV")
     first = read(Data(farm)).train[0]
-    monkeypatch.setattr(undistort, "_save", None)  # making one again would fail
+    monkeypatch.setattr(undistort, "save_picture", None)  # making one again would fail
     assert read(Data(farm)).train[0].path == first.path
     monkeypatch.undo()
     assert read(Data(farm, scale=2)).train[0].path != first.path

@@ -1,5 +1,6 @@
 """Cameras in formats for exchange and of scanning apps show known dots where the formulas of these formats put them."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,11 +10,11 @@ from PIL import Image
 from surfkit.core.check import BadInput, collecting
 from surfkit.readers.data import Data
 from surfkit.readers.depth_layout import DepthQuery, find_maps
-from surfkit.readers.read import read, read_capture, reader_of
+from surfkit.readers.read import observations, read, read_capture, reader_of
 from surfkit.run.notes import collect_notes
 from tests.needs import needs
 
-from .exchange import blocks_exchange, opf, polycam, xmp_sidecars
+from .exchange import blocks_exchange, opf, polycam, record3d, xmp_sidecars
 from .programs import COLORS, DOTS, ORIGIN, POSES, realitycapture
 
 BROWN = {"K1": -0.09, "K2": 0.06, "K3": -0.03, "P1": 0.003, "P2": -0.002}
@@ -27,6 +28,8 @@ CASES = {
     "opf": partial(opf, R1=-0.1, R2=0.07, R3=-0.02, T1=0.003, T2=-0.002),
     "polycam": polycam,
     "polycam without corrections": partial(polycam, kind=""),
+    "record3d": record3d,
+    "record3d with a lens each": partial(record3d, own=True),
     "xmp": partial(xmp_sidecars, k1=-0.09, k2=0.06, k3=-0.03, u=0.02, v=-0.015),
     "xmp with tangential terms": partial(xmp_sidecars, model="brown4t2", k1=-0.09, t1=0.003, t2=-0.002),
     "xmp in attributes": partial(xmp_sidecars, model="perspective", elements=False, u=0.01, aspect=1.004),
@@ -39,7 +42,9 @@ def test_dots_lie_where_the_format_puts_them(tmp_path, case):
     project = CASES[case](tmp_path)
     data = Data(tmp_path, test_every=0)
     shots = read_capture(data, reader_of(data)).shots
-    assert len(shots) == len(POSES) and (case.startswith("polycam") or [shot.name for shot in shots] == list(POSES))
+    assert len(shots) == len(POSES) and (
+        case.startswith(("polycam", "record3d")) or [shot.name for shot in shots] == list(POSES)
+    )
     for shot, (turn, centre) in zip(shots, POSES.values(), strict=True):
         np.testing.assert_allclose(shot.pose[:3, :3], turn, atol=1e-9)
         np.testing.assert_allclose(-shot.pose[:3, :3].T @ shot.pose[:3, 3], centre, atol=1e-9)
@@ -218,6 +223,14 @@ def test_raw_data_of_polycam_without_corrections_is_told(tmp_path):
         (partial(polycam, change=lambda number, values: values.update(t_00=9)), "the pose is not a rotation"),
         (partial(polycam, change=lambda number, values: values.update(fx="wide")), "where 6 finite numbers belong"),
         (partial(polycam, change=lambda number, values: values.update(fx=0)), "no lens has size"),
+        (partial(record3d, change=lambda values: values.pop("K")), "metadata: it lacks K; export"),
+        (partial(record3d, change=lambda values: values.update(K=[1] * 8)), "where 9 finite numbers belong"),
+        (partial(record3d, change=lambda values: values.update(poses=[])), "metadata: no list of poses"),
+        (partial(record3d, own=True, change=lambda values: values["poses"].pop()), "a lens for each of 3 poses"),
+        (
+            partial(record3d, change=lambda values: values["poses"].__setitem__(2, [0] * 7)),
+            "poses.2: its first four numbers are no quaternion",
+        ),
         (partial(xmp_sidecars, model="division", k1=0.1), "distortion model 'division' with 6 coefficients; known: "),
         (partial(xmp_sidecars, change=lambda name, text: f"<!DOCTYPE a>{text}"), "has definitions of its own"),
         (partial(xmp_sidecars, change=lambda name, text: text[:-9]), "not XML"),
@@ -234,6 +247,22 @@ def test_scans_and_sidecars_that_are_refused(tmp_path, write, said):
     with pytest.raises(BadInput) as caught:
         read(Data(tmp_path))
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_packed_file_of_record3d_is_told_to_be_unpacked(tmp_path):
+    (tmp_path / "room.r3d").write_bytes(b"PK")
+    with pytest.raises(BadInput, match="no metadata or metadata.json beside rgbd/; unpack room.r3d there: it is a zip"):
+        read(Data(tmp_path))
+
+
+def test_depth_of_record3d_is_told_and_one_lens_is_one_camera(tmp_path):
+    record3d(tmp_path, own=True)
+    (tmp_path / "rgbd/1.jpg").unlink()
+    with collect_notes() as kept:
+        capture = read_capture(Data(tmp_path, missing="skip"), reader_of(Data(tmp_path)))
+    assert any("depth of Record3D is compressed by LZFSE, and is not read" in text for text in kept.texts)
+    assert [shot.name for shot in capture.shots] == ["rgbd/0.jpg", "rgbd/2.jpg", "rgbd/3.jpg"]
+    assert capture.metres == 1.0 and len({id(shot.camera) for shot in capture.shots}) == 1
 
 
 def test_a_csv_file_of_realitycapture_is_read_before_sidecars(tmp_path):
@@ -298,6 +327,44 @@ def test_opf_on_the_map(tmp_path, given, crs, metres):
     assert any("lengths are 3 times those of the map" in text for text in kept.texts) == ("scale" in given)
 
 
+def test_sparse_points_of_opf_keep_their_tracks(tmp_path):
+    """Pixels and coordinates are stored in 32 bits."""
+    origin = np.array([746308.125, 3714810.5, 268.75])
+    project = opf(tmp_path, shift=-origin, definition=UTM16, R1=-0.1, T1=0.003)
+    data = Data(tmp_path, test_every=0)
+    capture = read_capture(data, reader_of(data))
+    np.testing.assert_allclose(capture.xyz, DOTS + origin, atol=1e-5)
+    np.testing.assert_array_equal(capture.rgb, COLORS)
+    assert [sorted(group) for group in capture.groups] == [sorted(POSES)]
+    tracks = reader_of(data).tracks(data)
+    assert tracks.error_px.max() < 1e-4 and tracks.seen.keys() == POSES.keys()
+    for name, (rows, pixels) in tracks.seen.items():
+        assert sorted(rows) == list(range(len(DOTS)))
+        np.testing.assert_allclose(pixels, project(name, DOTS[rows]), atol=2e-5)
+    assert observations(data, read(data)).seen.keys() == POSES.keys()
+    (tmp_path / "images/IMG 2.png").unlink()
+    some = replace(data, missing="skip")
+    assert reader_of(some).tracks(some).seen.keys() == POSES.keys() - {"IMG 2.png"}
+
+
+def test_opf_without_sparse_points_of_its_own(tmp_path):
+    opf(tmp_path, change=lambda files: files["../survey.opf"]["items"][2]["resources"].pop())
+    data = Data(tmp_path)
+    assert not len(read_capture(data, reader_of(data)).xyz) and reader_of(data).tracks(data) is None
+
+
+@pytest.mark.parametrize("name", ["position", "pixel", "range"])
+def test_sparse_points_of_opf_that_are_cut_off(tmp_path, name):
+    opf(tmp_path)
+    path = tmp_path / f"parts/{name}.bin"
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(BadInput, match=f"{name}.bin: cut off; copy the project whole"):
+        read(Data(tmp_path))
+    path.unlink()
+    with pytest.raises(BadInput, match=f"{name}.bin: cannot be read: No such file"):
+        read(Data(tmp_path))
+
+
 def at(name, *path, value):
     def change(files):
         place = files[name]
@@ -317,6 +384,11 @@ def at(name, *path, value):
         (at("calibrated.json", "cameras", value=3), "cameras is no list of objects"),
         (at("calibrated.json", "cameras", 0, "position", value=[1, 2]), "position: [1, 2], where 3 finite numbers"),
         (at("../survey.opf", "items", 2, "resources", value=[]), "names no file of calibrated-cameras"),
+        (at("tracks.gltf", "accessors", value=[]), "tracks.gltf: damaged, or not as OPF has sparse points: IndexError"),
+        (at("tracks.gltf", "accessors", 4, "count", value=3), "its points have matches that are not there"),
+        (at("tracks.gltf", "bufferViews", 4, "byteStride", value=16), "its buffers are interleaved"),
+        (at("tracks.gltf", "accessors", 0, "byteOffset", value=4), "its buffers are interleaved"),
+        (at("tracks.gltf", "nodes", 0, "matrix", value=[1, 2]), "matrix: [1, 2], where 16 finite numbers belong"),
         (at("../survey.opf", "items", 2, "resources", 0, "uri", value="https://a/b.json"), "is not on this machine"),
         (at("../survey.opf", "items", 2, "resources", 0, "uri", value="parts/lost.json"), "lost.json: no such file"),
     ],

@@ -187,7 +187,7 @@ def damage(key, value):
     [
         (damage("frames", []), "transforms.json: no list of frames in it"),
         (damage("fl_x", "wide"), "frames.0: fl_x is 'wide', not a number"),
-        (damage("camera_model", "EQUIRECTANGULAR"), "frames.0: camera_model EQUIRECTANGULAR; known: PINHOLE"),
+        (damage("camera_model", "ORTHOPHOTO"), "frames.0: camera_model ORTHOPHOTO; known: PINHOLE"),
         (damage("transform_matrix", [[1, 2], [3, 4]]), "frames.2: transform_matrix is not 4 x 4 finite numbers"),
         (damage("transform_matrix", np.zeros((4, 4)).tolist()), "frames.2: transform_matrix is not a rotation"),
         (damage("file_path", "images/gone.png"), "frames.2: no photograph 'images/gone.png'"),

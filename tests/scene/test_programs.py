@@ -367,7 +367,7 @@ def entry(*path, value):
     [
         (partial(metashape, change=words("<chunk", "<chunk<")), "cameras.xml: not XML"),
         (partial(metashape, change=words("<document", "<!DOCTYPE x><document")), "has definitions of its own"),
-        (partial(metashape, kind="spherical"), "sensor 0: of type spherical; known: frame, fisheye"),
+        (partial(metashape, kind="cylindrical"), "sensor 0: of type cylindrical; known: frame, fisheye"),
         (partial(metashape, change=words("<f>190.0</f>", "<fx>190</fx>")), "sensor 0: no f in its calibration"),
         (
             partial(metashape, change=words("<f>190.0</f>", "<f>wide</f>")),

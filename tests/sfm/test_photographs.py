@@ -121,3 +121,15 @@ def test_twelve_bits_are_stretched_for_the_whole_folder(tmp_path):
     after = look(tmp_path, before)
     assert after[0].light == pytest.approx(before[0].light / 4, abs=1) and after[0].digest != before[0].digest
     assert look(tmp_path, after) == after
+
+
+@pytest.mark.parametrize("kind", ["equirectangular", "cylindrical"])
+def test_panoramas_are_told_and_left_out(folder, kind):
+    """The packet is as Google's specification of GPano has it; a photograph of a lens may have one, too."""
+    for name, said in (("a.jpg", kind), ("b.jpg", "perspective")):
+        packet = f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description GPano:ProjectionType="{said}"/></x:xmpmeta>'
+        Image.fromarray(picture(arc(8)[ord(name[0]) - 92])).save(folder / name, xmp=packet.encode())
+    with collect_notes() as notes:
+        found = {photo.name: photo for photo in look(folder)}
+    assert found["a.jpg"].problem == f"a panorama ({kind})" and found["b.jpg"].usable
+    assert any("1 of 8 photographs are panoramas by their XMP, 'a.jpg': no cameras" in text for text in notes.texts)

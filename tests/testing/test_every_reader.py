@@ -14,7 +14,7 @@ from surfkit.testing import check, check_reader
 from surfkit.testing.synthetic import photograph, write_colmap
 
 PROGRAMS = ("bundler", "metashape", "openmvg", "pix4d", "realitycapture")
-EXCHANGE = ("blocks-exchange", "opf", "polycam", "xmp-sidecars")
+EXCHANGE = ("blocks-exchange", "opf", "polycam", "record3d", "xmp-sidecars")
 """Written with a scene of their own: `scene/test_programs.py` and `test_exchange.py` compare cameras with formulas."""
 
 
