@@ -26,6 +26,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.recipe import Recipe, complete, refuse_unused
+from surfkit.run.command import train_command
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
 from surfkit.run.folder import (
@@ -359,7 +360,7 @@ def _loaded(
         return
     if not result_path(run).exists():
         raise BadInput(
-            f"{out}: method:{name_of(run.recipe.method)} has not finished; give its surfkit train command again"
+            f"{out}: method:{name_of(run.recipe.method)} has not finished; `{train_command(run)}` finishes it"
         )
     ctx = RunContext(run, read_data(run), select_rasterizer(device)[0], Intervals(), CacheSettings())
     with method_input(ctx, device) as given:
@@ -381,7 +382,7 @@ def load_run(out: Path, read_data: Callable[[Run], Scene] = read_unchanged) -> t
         if (state := load_state(run, stage, stage_scene(run, stage, scene))) is not None:
             break
         missing = stage
-    step, again = state.index if state else 0, "give its surfkit train command again to finish it"
+    step, again = state.index if state else 0, f"`{train_command(run)}` finishes it"
     if step < stage.stage.steps:
         raise BadInput(f"{out}: the run stopped after step {step} of {stage.stage.steps}; {again}")
     if missing is not None:

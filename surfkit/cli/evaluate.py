@@ -22,6 +22,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
+from surfkit.run.command import train_command
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
 from surfkit.run.lod import load_levels, measure_levels
@@ -197,6 +198,9 @@ class Evaluate:
 
 def refuse_no_mesh(run: Run) -> None:
     """BadInput if a run has no mesh of its model."""
+    is_run = (run.out / "recipe.json").exists()  # and not the compressed model in one
+    if is_run and not run.metrics.exists() and not (run.mesh.exists() and run.mesh_record.exists()):
+        raise BadInput(f"{run.out}: no {run.mesh.name}, as the run is not finished; `{train_command(run)}` finishes it")
     if not run.mesh.exists():
         raise BadInput(f"{run.out}: no {run.mesh.name} in it; make it with surfkit mesh, or name a file")
     if not run.mesh_record.exists():
