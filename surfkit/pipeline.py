@@ -261,7 +261,8 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter)
     meshed = has_mesh(run, made.last_steps, made.mesh is not None)
     has_lod, has_file = has_levels(run, made.last_steps), has_compressed(run, made.last_steps)
     if run.metrics.exists() and has_cloud(run, made) and meshed and has_lod and has_file:
-        say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
+        again = f"; `{run.to_paste('evaluate')}` measures it again" if made.draw is not None else ""
+        say(f"{run.out} is finished, and nothing is left to do{again}")
         return read_metrics(run.out)
     if not has_cloud(run, made):
         export(run, made.splats, scene)
@@ -304,7 +305,7 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
 
     A surface that cannot be had is told, and costs no measurements.
     """
-    mesher, out, budget = ctx.run.recipe.mesh, ctx.run.out, cache_bytes("auto")
+    mesher, budget = ctx.run.recipe.mesh, cache_bytes("auto")
     try:
         if made.mesh is not None:
             what = mesh_input(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
@@ -314,7 +315,7 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
             what = mesh_input(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
             make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
     except BadInput as error:
-        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
+        emit(Warned(f"there is no mesh: {error}; `{ctx.run.to_paste('mesh')}` tries again with other settings"))
 
 
 def opened(out: Path) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from surfkit.cli.result import show, show_geometry, show_levels
+from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
@@ -131,9 +133,19 @@ class Evaluate:
             metrics = note_metrics(run.metrics, {"lod": levels})
         if self.compressed:
             note_compressed(opened(self.target), metrics)
-        show(run, metrics)
+        if scene.held_out:
+            show(run, metrics)
+        else:
+            tell(self._measured_without(run, metrics))
         if tree is not None:
             show_levels(metrics["lod"])
+
+    def _measured_without(self, run: Run, metrics: dict[str, Any]) -> str:
+        """What was measured of a run without held-out photographs, on one line."""
+        fps = f"{metrics['fps']:.1f} frames a second" if metrics.get("fps") else "nothing"
+        command = shlex.join(["surfkit", "evaluate", str(self.target), *["--compressed"] * self.compressed, "--gt"])
+        mesh = f"; `{command} FILE` measures its mesh" if run.mesh.exists() else ""
+        return f"measured: {fps}, and no photographs, as none is held out; written to {run.metrics}{mesh}"
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):

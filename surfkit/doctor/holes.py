@@ -50,7 +50,7 @@ def holes(xyz: np.ndarray, centres: np.ndarray) -> list[Finding]:
     area, largest, where = _enclosed(ground, low, high)
     if largest < SMALLEST:
         return []
-    spot = ", ".join(f"{value:,.4g}" for value in middle + where @ axes[:2])
+    spot = ", ".join(f"{value:.1f}" for value in middle + where @ axes[:2])
     text = (
         f"coverage holes: {area:.0%} of the ground below the cameras has no sparse points, most of it about ({spot}): "
         "water or bare roofs, or photographs that are missing; nothing can be built where nothing was seen"
