@@ -232,7 +232,10 @@ def test_a_record_without_maps_keeps_nobody_from_making_some(farm):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["prepare", "deph"], "prepare has no 'deph'"),
+        (
+            ["prepare", "photo"],
+            "prepare has no 'photo'; did you mean 'photos'? usage: surfkit prepare photos|points|depth",
+        ),
         (["prepare", "depth", "nowhere"], "nowhere: no such folder"),
         (["prepare", "depth", "d", "estimator:plan-sweep"], "did you mean 'plane-sweep'?"),
         (["prepare", "depth", "d", "--estimator.window", "4"], "window is 4; it must be an odd number"),

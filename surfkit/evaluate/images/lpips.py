@@ -243,8 +243,8 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
         return (), "left out, by --lpips-weights none"
     if where == "gpu" and not torch.cuda.is_available():
         return (), (
-            "left out, as it takes most of a minute a photograph without a GPU; `surfkit evaluate RUN` measures it, the "
-            "first time with --lpips-weights download"
+            "left out, as it takes most of a minute a photograph without a GPU; `surfkit evaluate RUN` measures it, "
+            "the first time with --lpips-weights download"
         )
     if smallest_px < SMALLEST_PX:
         return (), f"a photograph has a side of less than {SMALLEST_PX} pixels"
