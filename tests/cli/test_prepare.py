@@ -256,6 +256,6 @@ def test_a_model_without_tracks_is_one_line(tmp_path, capsys):
 
 def test_help_names_what_can_be_prepared(capsys):
     assert main(["prepare"]) == main(["prepare", "--help"]) == 0
-    assert "surfkit prepare depth" in capsys.readouterr().out
+    assert "surfkit prepare photos" in capsys.readouterr().out
     assert main(["prepare", "depth", "estimator:depth-anything-v2", "--help"]) == 0
     assert "CC BY-NC 4.0" in capsys.readouterr().out

@@ -10,8 +10,8 @@ import pytest
 from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.core.files import (
-    delete_with_folders,
     being_written,
+    delete_with_folders,
     refuse_own,
     refuse_special,
     refuse_unwritable,
