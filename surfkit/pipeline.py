@@ -26,6 +26,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.recipe import Recipe, complete, refuse_unused
+from surfkit.run.command import train_command
 from surfkit.run.compress import decompressed, has_compressed, make_wanted_compressed
 from surfkit.run.context import RunContext
 from surfkit.run.folder import (
@@ -260,7 +261,8 @@ def results(ctx: RunContext, made: Reconstruction, device: Device, meter: Meter)
     meshed = has_mesh(run, made.last_steps, made.mesh is not None)
     has_lod, has_file = has_levels(run, made.last_steps), has_compressed(run, made.last_steps)
     if run.metrics.exists() and has_cloud(run, made) and meshed and has_lod and has_file:
-        say(f"{run.out} is finished; delete {run.metrics.name} in it to measure again")
+        again = f"; `{run.to_paste('evaluate')}` measures it again" if made.draw is not None else ""
+        say(f"{run.out} is finished, and nothing is left to do{again}")
         return read_metrics(run.out)
     if not has_cloud(run, made):
         export(run, made.splats, scene)
@@ -303,7 +305,7 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
 
     A surface that cannot be had is told, and costs no measurements.
     """
-    mesher, out, budget = ctx.run.recipe.mesh, ctx.run.out, cache_bytes("auto")
+    mesher, budget = ctx.run.recipe.mesh, cache_bytes("auto")
     try:
         if made.mesh is not None:
             what = mesh_input(ctx.run, made, ctx.scene, ctx.rasterizer, budget)
@@ -313,7 +315,7 @@ def mesh(ctx: RunContext, made: Reconstruction, device: Device) -> None:
             what = mesh_input(run, made, ctx.scene, ctx.rasterizer, budget, mesher)
             make_mesh(run, mesher, MeshOutput(), what, made.last_steps)
     except BadInput as error:
-        emit(Warned(f"there is no mesh: {error}; `surfkit mesh {out}` tries again with other settings"))
+        emit(Warned(f"there is no mesh: {error}; `{ctx.run.to_paste('mesh')}` tries again with other settings"))
 
 
 def opened(out: Path) -> Run:
@@ -359,7 +361,7 @@ def _loaded(
         return
     if not result_path(run).exists():
         raise BadInput(
-            f"{out}: method:{name_of(run.recipe.method)} has not finished; give its surfkit train command again"
+            f"{out}: method:{name_of(run.recipe.method)} has not finished; `{train_command(run)}` finishes it"
         )
     ctx = RunContext(run, read_data(run), select_rasterizer(device)[0], Intervals(), CacheSettings())
     with method_input(ctx, device) as given:
@@ -381,7 +383,7 @@ def load_run(out: Path, read_data: Callable[[Run], Scene] = read_unchanged) -> t
         if (state := load_state(run, stage, stage_scene(run, stage, scene))) is not None:
             break
         missing = stage
-    step, again = state.index if state else 0, "give its surfkit train command again to finish it"
+    step, again = state.index if state else 0, f"`{train_command(run)}` finishes it"
     if step < stage.stage.steps:
         raise BadInput(f"{out}: the run stopped after step {step} of {stage.stage.steps}; {again}")
     if missing is not None:

@@ -30,6 +30,7 @@ from surfkit.partition.base import CoarseModel
 from surfkit.primitives.drawing import drawn_by
 from surfkit.primitives.points import Columns
 from surfkit.readers import extract
+from surfkit.run.command import train_command
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, refuse_file
 from surfkit.run.journal import record_events
@@ -174,7 +175,7 @@ def open_coarse_model(run: Run) -> Stored:
     """The coarse model of a run, left on disk."""
     found = open_last(run.pretrain.checkpoint)
     if found is None:
-        raise BadInput(f"{run.out}: the coarse model is gone; give its surfkit train command again")
+        raise BadInput(f"{run.out}: the coarse model is gone; `{train_command(run)}` makes it again")
     return found[0]
 
 

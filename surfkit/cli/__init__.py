@@ -14,7 +14,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
 from surfkit.cli.help_cache import HELP, keep, kept_help, show_kept
@@ -57,6 +57,11 @@ COMMANDS = {
     "new": "Write the files of a new plugin, with a working part and its tests: `new plugin`.",
 }
 """What there is to run, with the line that `surfkit --help` shows."""
+BEGIN = (
+    "To begin, `surfkit prepare photos FOLDER` makes a data set of photographs or a video, and `surfkit doctor DATA` "
+    "checks one that is there."
+)
+"""What `surfkit --help` says to those who are new."""
 RESUMED = ("train", "tune", "prepare", "ablate", "maps", "texture", "render")
 """Commands that go on with what an interrupted one has done."""
 MEMORY_ADVICE = {
@@ -121,6 +126,8 @@ def overview() -> str:
             "",
             "usage: surfkit COMMAND ...",
             "       surfkit --help | --version",
+            "",
+            textwrap.fill(BEGIN, width),
             "",
             *lines,
             "",
@@ -206,9 +213,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     name, *rest = words
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        raise BadInput(f"no command {name!r}; {hint}commands: {', '.join(COMMANDS)}")
+        raise BadInput(f"no command {name!r}; {_meant(name, COMMANDS)}commands: {', '.join(COMMANDS)}")
     command = importlib.import_module(f"surfkit.cli.{name}").COMMAND
     from surfkit.cli.parse import parse
 
@@ -216,8 +221,14 @@ def _dispatch(words: list[str]) -> int:
         if not rest or rest[0] not in command:
             wanted = f"surfkit {name} {'|'.join(command)} ..."
             if rest and rest[0] not in (*HELP, "help"):
-                raise BadInput(f"{name} has no {rest[0]!r}; usage: {wanted}")
+                raise BadInput(f"{name} has no {rest[0]!r}; {_meant(rest[0], command)}usage: {wanted}")
             print(f"{COMMANDS[name]}\n\nusage: {wanted}\n\n`surfkit {name} {next(iter(command))} --help` tells more.")
             return 0
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
     return parse(command, rest, f"surfkit {name}").run() or 0
+
+
+def _meant(word: str, known: Iterable[str]) -> str:
+    """A question to add to a message, such as "did you mean 'mesh'? "; "" where nothing is near."""
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean {near[0]!r}? " if near else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from surfkit.cli.result import show, show_geometry, show_levels
+from surfkit.cli.table import tell
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
 from surfkit.core.files import refuse_unwritable
@@ -22,6 +24,7 @@ from surfkit.raster.select import Device
 from surfkit.readers.data import Data
 from surfkit.readers.read import read
 from surfkit.report.regions import Distance, Zones, measure_zones, rendered_depths, seams_of, true_depths
+from surfkit.run.command import train_command
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, note_metrics, refuse_no_run
 from surfkit.run.lod import load_levels, measure_levels
@@ -130,9 +133,19 @@ class Evaluate:
             metrics = note_metrics(run.metrics, {"lod": levels})
         if self.compressed:
             note_compressed(opened(self.target), metrics)
-        show(run, metrics)
+        if scene.held_out:
+            show(run, metrics)
+        else:
+            tell(self._measured_without(run, metrics))
         if tree is not None:
             show_levels(metrics["lod"])
+
+    def _measured_without(self, run: Run, metrics: dict[str, Any]) -> str:
+        """What was measured of a run without held-out photographs, on one line."""
+        fps = f"{metrics['fps']:.1f} frames a second" if metrics.get("fps") else "nothing"
+        command = shlex.join(["surfkit", "evaluate", str(self.target), *["--compressed"] * self.compressed, "--gt"])
+        mesh = f"; `{command} FILE` measures its mesh" if run.mesh.exists() else ""
+        return f"measured: {fps}, and no photographs, as none is held out; written to {run.metrics}{mesh}"
 
     def _geometry(self, truth: Path, zones: Zones) -> None:
         if self.lpips_weights != "auto" or (self.device != "auto" and zones == Zones()):
@@ -197,6 +210,9 @@ class Evaluate:
 
 def refuse_no_mesh(run: Run) -> None:
     """BadInput if a run has no mesh of its model."""
+    is_run = (run.out / "recipe.json").exists()  # and not the compressed model in one
+    if is_run and not run.metrics.exists() and not (run.mesh.exists() and run.mesh_record.exists()):
+        raise BadInput(f"{run.out}: no {run.mesh.name}, as the run is not finished; `{train_command(run)}` finishes it")
     if not run.mesh.exists():
         raise BadInput(f"{run.out}: no {run.mesh.name} in it; make it with surfkit mesh, or name a file")
     if not run.mesh_record.exists():

@@ -143,7 +143,7 @@ class Export:
         """The levels of detail of a run; all splats in one tile if it has none."""
         if run.lod_record.exists():
             return load_levels(run, model).tiles(frame)
-        emit(Warned(f"{self.source} has no levels of detail, so all is one tile; surfkit lod {self.source} makes them"))
+        emit(Warned(f"{self.source} has no levels of detail, so all is one tile; `{run.to_paste('lod')}` makes them"))
         return one_tile(table)
 
 

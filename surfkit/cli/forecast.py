@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -47,7 +48,7 @@ def foretell(plan: Plan, left: Sequence[Trial], probe_steps: int) -> None:
             continue
         examined = examine(data, first.recipe, quick=True)
         if not examined.diagnosis.sound:
-            say(f"forecast: none for {data.path}; see surfkit doctor {data.path}")
+            say(f"forecast: none for {data.path}; `{shlex.join(['surfkit', 'doctor', str(data.path)])}` says why")
             continue
         probe = Probe(probe_steps, plan.max_points, device=plan.device, out=plan.out)
         found, findings = forecast(data, first.recipe, examined, probe)

@@ -4,4 +4,4 @@ from surfkit.cli.prepare_depth import Depth
 from surfkit.cli.prepare_photos import Photos
 from surfkit.cli.prepare_points import Points
 
-COMMAND = {"depth": Depth, "photos": Photos, "points": Points}
+COMMAND = {"photos": Photos, "points": Points, "depth": Depth}

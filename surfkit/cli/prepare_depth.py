@@ -68,7 +68,7 @@ class Depth:
         with collect_notes():
             done = self.make()
         show(done)
-        tell(f"depth maps in {self.folder}; look at {self.folder / OVERVIEW}")
+        tell(f"depth maps in {str(self.folder)!r}; picture of some: {str(self.folder / OVERVIEW)!r}")
 
     @property
     def folder(self) -> Path:

@@ -82,7 +82,7 @@ class Photos:
         """Prepare, and print the results and what to do next."""
         self.prepare()
         uses = ", which uses the depth maps if its losses or its mesh look at some" if self.depth is not None else ""
-        tell(f"next: surfkit train recipe:surface --data {shlex.quote(str(self.scene))}{uses}")
+        tell(f"next: `surfkit train recipe:surface --data {shlex.quote(str(self.scene))}`{uses}")
 
     def prepare(self) -> None:
         """Prepare, and print the results."""
@@ -222,12 +222,14 @@ def show(report: dict[str, Any], scene: Path) -> None:
         east, north, up = (place["rms_m"][axis] for axis in "enu")
         rows.append(("on the map", f"{place['crs']}, offset {' '.join(f'{value:.0f}' for value in place['offset'])}"))
         above = f", {up:.2f} up" if up is not None else ""
-        rows.append(("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north{above} of {place['positions']}"))
+        rows.append(
+            ("residuals (RMS)", f"{east:.2f} m east, {north:.2f} north{above}, of {place['positions']} photographs")
+        )
     if ground := first.get("ground_control"):
         rows.append(("on the map", f"{ground['crs']}, offset {' '.join(f'{value:.0f}' for value in ground['offset'])}"))
         for what in ("control", "checkpoints"):
             if rms := ground[f"{what}_rms_m"]:
-                said = f"{rms['e']:.2f} m east, {rms['n']:.2f} north, {rms['u']:.2f} up of {len(ground[what])}"
+                said = f"{rms['e']:.2f} m east, {rms['n']:.2f} north, {rms['u']:.2f} up, of {len(ground[what])} points"
                 rows.append((f"{what} (RMS)", said))
     if len(models) > 1:
         others = ", ".join(f"sparse/{at} of {model['photographs']}" for at, model in enumerate(models[1:], 1))
@@ -241,6 +243,6 @@ def show(report: dict[str, Any], scene: Path) -> None:
         tell(f"no camera for {name!r}: {why}")
     if len(lost) > SHOWN:
         tell(f"and for {len(lost) - SHOWN} more: see {scene / REPORT}")
-    tell(f"data set in {scene}; look at {scene / PICTURE}")
+    tell(f"data set in {str(scene)!r}; picture of its cameras: {str(scene / PICTURE)!r}")
     if report.get("depth_maps"):
-        tell(f"depth maps in {scene / FOLDER}; look at {scene / FOLDER / OVERVIEW}")
+        tell(f"depth maps in {str(scene / FOLDER)!r}; picture of some: {str(scene / FOLDER / OVERVIEW)!r}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +16,8 @@ from surfkit.run.folder import Run
 LPIPS = {
     "lpips_vgg": "LPIPS VGG",
     "lpips_vgg_unscaled": "LPIPS VGG, as 3DGS",
-    "lpips_alex": "LPIPS Alex",
-    "lpips_alex_unscaled": "LPIPS Alex, [0, 1]",
+    "lpips_alex": "LPIPS AlexNet",
+    "lpips_alex_unscaled": "LPIPS AlexNet, [0, 1]",
 }
 """Names in metrics.json, and on the screen."""
 
@@ -61,14 +60,13 @@ def show(run: Run, metrics: dict[str, Any]) -> None:
 
 def what_next(run: Run) -> str:
     """The commands that one would give after training, on one line."""
-    out = shlex.quote(str(run.out))
     mesh = (
-        f"`surfkit maps {out}` draws maps of its mesh"
+        f"`{run.to_paste('maps')}` draws maps of its mesh"
         if run.mesh_record.exists()
-        else f"`surfkit mesh {out} mesh:tsdf` makes its mesh"
+        else f"`{run.to_paste('mesh')} mesh:tsdf` makes its mesh"
     )
-    smaller = f"; `surfkit compress {out}` makes the model smaller" if run.cloud.exists() else ""
-    return f"next: `surfkit view {out}` shows it in a browser; {mesh}{smaller}"
+    smaller = f"; `{run.to_paste('compress')}` makes the model smaller" if run.cloud.exists() else ""
+    return f"next: `{run.to_paste('view')}` shows it in a browser; {mesh}{smaller}"
 
 
 def show_geometry(out: Path, found: dict[str, Any], images: dict[str, Any]) -> None:
@@ -164,9 +162,16 @@ def mesh_rows(record: dict[str, Any]) -> list[tuple[str, str]]:
         ("triangles", f"{cleaning['triangles']:,}"),
         ("vertices", f"{cleaning['vertices']:,}"),
         ("clusters kept", f"{cleaning['clusters_kept']:,} of {cleaning['clusters']:,}"),
-        ("boundaries", f"{cleaning['boundaries']:,}, {cleaning['boundary_share']:.1%} of all edges"),
+        (
+            "edges of holes and rims",
+            f"{cleaning['boundary_share']:.1%} of all edges, in {cleaning['boundaries']:,} loops",
+        ),
         *([("holes filled", f"{cleaning['holes_closed']:,}")] if cleaning["holes_closed"] else []),
-        *((in_words(name.replace("_", " ")), in_words(value)) for name, value in facts.items()),
+        *(
+            (in_words(name.replace("_", " ")), in_words(value))
+            for name, value in facts.items()
+            if facts.get(f"{name}_m") != value  # in metres as well, where the unit is known
+        ),
         ("seconds", f"{record['seconds']:.1f}"),
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,8 @@ from typing import Annotated
 import tyro
 
 from surfkit.blocks.eta import seconds_elapsed, seconds_left
-from surfkit.cli.table import print_table
+from surfkit.cli.table import print_table, tell
+from surfkit.core.check import BadInput
 from surfkit.core.clock import clock
 from surfkit.report.status import Block, Status, as_json, status
 
@@ -21,7 +23,7 @@ SILENT_S = 60.0
 
 @dataclass(frozen=True)
 class StatusOf:
-    """Show the progress of a run: step, speed, time left, memory, measurements, warnings, and its processes.
+    """Show the progress of a run: step, speed, time left, memory, measurements, notes, and its processes.
 
     Exit status: 0 when the run is finished, 3 when it is not, 2 when there is no run.
     """
@@ -39,6 +41,8 @@ class StatusOf:
             print(as_json(found))
         else:
             print_table(("what", "value"), rows(found))
+            if found.state == "stopped":
+                tell_how_to_go_on(self.run_folder)
         return 0 if found.state == "finished" else UNFINISHED
 
 
@@ -70,7 +74,16 @@ def rows(found: Status) -> list[tuple[str, str]]:
         table.append(("blocks", f"{done} of {sum(block.views > 0 for block in found.blocks)} done"))
         table += [(f"block {block.index}", _where(block)) for block in found.blocks]
     table += [("skipped", name) for name in found.skipped]
-    return table + [("warning", text) for text in found.warnings]
+    return table + [("note", text) for text in found.notes]
+
+
+def tell_how_to_go_on(out: Path) -> None:
+    """Print the command that finishes a run; nothing where run.json is of a version that kept less."""
+    from surfkit.pipeline import opened  # loads torch, which takes seconds
+    from surfkit.run.command import train_command
+
+    with suppress(BadInput):
+        tell(f"next: `{train_command(opened(out))}` goes on with the run")
 
 
 def _where(block: Block) -> str:

@@ -219,7 +219,9 @@ class Train:
             raise BadInput(
                 "no --data given, and the bundled example is only part of a source checkout; name a data set"
             )
-        say(f"no --data given: using the bundled example {EXAMPLE}")
+        say(
+            f"no --data given, so this trains on the bundled example {EXAMPLE}; --data FOLDER names a data set of yours"
+        )
         return EXAMPLE
 
 

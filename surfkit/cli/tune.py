@@ -16,6 +16,7 @@ from surfkit.pipeline import opened
 from surfkit.raster.select import Device
 from surfkit.readers import extract
 from surfkit.report.tensorboard import tensorboard
+from surfkit.run.command import train_command
 from surfkit.run.context import RunContext
 from surfkit.run.notes import collect_notes
 from surfkit.run.stage import CHECKPOINT_EVERY, Intervals, select_rasterizer
@@ -67,7 +68,7 @@ class Tune:
         plan, steps = record.plan, run.recipe.pretrain.steps
         if record.coarse_steps != steps:
             what = f"{plan_file(run)} is for a coarse model of {record.coarse_steps} steps, not {steps}"
-            raise BadInput(f"{what}; give the surfkit train command again")
+            raise BadInput(f"{what}; `{train_command(run)}` plans the blocks again")
         if not 0 <= self.block < len(plan.blocks):
             raise BadInput(f"{self.run_folder} has blocks 0 to {len(plan.blocks) - 1}; {self.block} is none of them")
         if not plan.blocks[self.block].views:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import shutil
 import threading
@@ -121,3 +122,13 @@ def sweep(folder: Path, but: Path | None = None, deep: bool = True) -> None:
     for path in list(folder.rglob(UNFINISHED) if deep else folder.glob(UNFINISHED)):
         if but is None or not path.is_relative_to(but):
             remove(path)
+
+
+def delete_with_folders(path: Path, root: Path) -> None:
+    """Delete a file, if it is there, and the folders around it inside of `root` that are empty then."""
+    path.unlink(missing_ok=True)
+    for folder in itertools.takewhile(lambda folder: folder != root, path.parents):
+        try:
+            folder.rmdir()
+        except OSError:  # something else is in it, or it was never there
+            return

@@ -100,10 +100,11 @@ def forecast(
 
 def beyond(recipe: Recipe) -> list[Finding]:
     """What of the run the forecast leaves out."""
-    later = ["the blocks, which are foretold when they are planned,"] if recipe.partition is not None else []
+    later = ["the blocks, which are foretold when they are planned"] if recipe.partition is not None else []
     later += ["what the recipe refines"] if recipe.refine else []
-    later += ["making depth maps, where the data set has none,"] if recipe.depth is not None else []
-    text = f"memory, disk and time are those of pretraining; {' and '.join(later)} come on top"
+    later += ["making depth maps, where the data set has none"] if recipe.depth is not None else []
+    later += ["making the mesh"] if recipe.mesh is not None else []
+    text = f"memory, disk and time are those of pretraining alone; the run needs more for: {'; '.join(later)}"
     return [Finding("note", "forecast", text)] if later else []
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from surfkit.doctor.finding import Finding
@@ -50,7 +52,8 @@ def holes(xyz: np.ndarray, centres: np.ndarray) -> list[Finding]:
     area, largest, where = _enclosed(ground, low, high)
     if largest < SMALLEST:
         return []
-    spot = ", ".join(f"{value:,.4g}" for value in middle + where @ axes[:2])
+    digits = max(1, 2 - math.floor(math.log10((high - low).max())))  # of a large place 0.1, whatever its coordinates
+    spot = ", ".join(f"{value:.{digits}f}" for value in middle + where @ axes[:2])
     text = (
         f"coverage holes: {area:.0%} of the ground below the cameras has no sparse points, most of it about ({spot}): "
         "water or bare roofs, or photographs that are missing; nothing can be built where nothing was seen"

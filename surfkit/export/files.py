@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,7 +83,11 @@ def format_for(path: Path) -> Format:
     known = [cls() for cls in components(Format).values()]
     found = [form for form in known if form.suffix and has_suffix(path, form)]
     if not found:
-        raise BadInput(f"{path}: no format of splats has this suffix; known: {_listed(known)}; or give --format NAME")
+        near = difflib.get_close_matches(path.suffix.lower(), [form.suffix for form in known if form.suffix], n=1)
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise BadInput(
+            f"{path}: no format of splats has this suffix; {meant}known: {_listed(known)}; or give --format NAME"
+        )
     return max(found, key=lambda form: len(form.suffix))  # .compressed.ply ends in .ply too
 
 

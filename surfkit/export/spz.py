@@ -164,8 +164,10 @@ class SPZ(Format):
     def rounding(self, table: SplatTable) -> str:
         """See `Format.rounding`."""
         scales = table.log_scales[:, :2]
-        outside = float(((scales < SMALLEST) | (scales > LARGEST)).any(1).float().mean()) if len(table) else 0.0
-        clipped = f"; {outside:.2%} of the splats are smaller or larger than it has a place for" if outside else ""
+        outside = int(((scales < SMALLEST) | (scales > LARGEST)).any(1).sum())
+        clipped = (
+            f"; splats smaller or larger than it has a place for: {outside:,} of {len(table):,}" if outside else ""
+        )
         harmonics = f", spherical harmonics to {self.sh1_bits} and {self.sh_rest_bits} bits" if table.sh_degree else ""
         return f"scales are rounded to 6 %, colours and opacities to 8 bits{harmonics}{clipped}"
 

@@ -83,10 +83,10 @@ class Status:
         seconds_left: To the end of the stage, or of the blocks that are left, at this speed; None when nothing runs.
         points: After the last step.
         loss: Of the last step.
-        peak_memory_bytes: Most memory held.
-        peak_gpu_bytes: Most memory of the GPU held; None without one.
+        peak_memory_bytes: Most memory held, by all that the run has done; as metrics.json says, once that is there.
+        peak_gpu_bytes: Most memory of the GPU held, likewise; None without one.
         metrics: PSNR and SSIM of held-out photographs, at the end or when they were last looked at.
-        warnings: Notes of the run.
+        notes: Of the run.
         skipped: Photographs that could not be read.
         blocks: Where each block stands, once they are planned.
     """
@@ -104,7 +104,7 @@ class Status:
     peak_memory_bytes: int | None = None
     peak_gpu_bytes: int | None = None
     metrics: dict[str, Any] | None = None
-    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     skipped: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
 
@@ -135,10 +135,9 @@ def status(out: Path) -> Status:
         seconds_left=_left((steps - step) / pace if pace else None, blocks) if process else None,
         points=last["StepDone"].get("points"),
         loss=_total(last["StepDone"].get("losses")),
-        peak_memory_bytes=last["StepDone"].get("peak_memory_bytes") or None,
-        peak_gpu_bytes=last["StepDone"].get("peak_gpu_bytes") or None,
+        **_peaks(out, last["StepDone"], kept),
         metrics=metrics,
-        warnings=_texts(record, kept, "notes"),
+        notes=_texts(record, kept, "notes"),
         skipped=_texts(record, kept, "skipped"),
         blocks=blocks,
     )
@@ -227,6 +226,16 @@ def _saved(lines: list[dict[str, Any]]) -> int | None:
         elif line["event"] == "FileWritten" and line.get("what") == "checkpoint":
             saved = index
     return saved
+
+
+def _peaks(out: Path, step: dict[str, Any], record: dict[str, Any]) -> dict[str, int | None]:
+    """Most memory held, by field of `Status`: by the last step and those before, by what is no step, which run.json
+    knows, and as the end of the run was measured."""
+    measured, found = read_metrics(out) if (out / "metrics.json").exists() else {}, {}
+    for name, parts in (("peak_memory_bytes", "memory_bytes"), ("peak_gpu_bytes", "gpu_memory_bytes")):
+        held = load(dict[str, int], record.get(parts) or {}, f"{out / 'run.json'}: {parts}")
+        found[name] = max(filter(None, (step.get(name), held.get("peak"), measured.get(name))), default=None)
+    return found
 
 
 def _has_points(out: Path) -> bool:

@@ -65,7 +65,7 @@ def make_wanted_compressed(ctx: RunContext, made: Reconstruction) -> None:
     try:
         compress_run(ctx, made, run.recipe.compress)
     except BadInput as error:
-        emit(Warned(f"no compressed model: {error}; `surfkit compress {run.out}` tries again with other settings"))
+        emit(Warned(f"no compressed model: {error}; `{run.to_paste('compress')}` tries again with other settings"))
 
 
 def compress_run(
@@ -148,7 +148,7 @@ def has_compressed(run: Run, steps: int) -> bool:
         return True
     if not run.compressed_record.exists():
         return False
-    remedy = f"delete it, and surfkit compress {run.out} makes it again"
+    remedy = f"delete it, and `{run.to_paste('compress')}` makes it again"
     return read_keys(run.compressed_record, {"steps": int}, remedy)["steps"] == steps and run.compressed_model.exists()
 
 
@@ -160,7 +160,7 @@ def decompressed(ctx: RunContext, made: Reconstruction) -> tuple[RunContext, Rec
     """
     run = ctx.run
     if not run.compressed_record.exists() or not run.compressed_model.exists():
-        raise BadInput(f"{run.out}: there is no compressed model; make one with surfkit compress {run.out}")
+        raise BadInput(f"{run.out}: there is no compressed model; `{run.to_paste('compress')}` makes one")
     model, _ = ModelFile(run.compressed_model).read()
     small = replace(made, splats=model, mesh=None, draw=None, draw_there=None, draw_color=None, draw_of=None)
     return replace(ctx, run=replace(run, out=run.compressed)), with_drawing(small, ctx.rasterizer)

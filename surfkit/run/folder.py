@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -97,6 +98,10 @@ class Run:
     out: Path
     recipe: Recipe
     data: Data
+
+    def to_paste(self, command: str) -> str:
+        """A command about the run, as a shell takes it: `surfkit mesh 'my run'`."""
+        return shlex.join(["surfkit", command, str(self.out)])
 
     @property
     def stages(self) -> tuple[RunStage, ...]:

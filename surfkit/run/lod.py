@@ -53,7 +53,7 @@ def make_wanted_levels(ctx: RunContext, made: Reconstruction) -> None:
     try:
         make_levels(run, run.recipe.lod, made, ctx.scene, ctx.rasterizer, cache_bytes("auto"))
     except BadInput as error:
-        emit(Warned(f"no levels of detail: {error}; `surfkit lod {run.out}` tries again with other settings"))
+        emit(Warned(f"no levels of detail: {error}; `{run.to_paste('lod')}` tries again with other settings"))
 
 
 def make_levels(
@@ -146,7 +146,7 @@ def has_levels(run: Run, steps: int) -> bool:
 
 def _record(run: Run) -> dict[str, Any]:
     hints = {"files": tuple[str, ...], "steps": int, "points": tuple[int, ...]}
-    return read_keys(run.lod_record, hints, f"delete it, and surfkit lod {run.out} makes the levels again")
+    return read_keys(run.lod_record, hints, f"delete it, and `{run.to_paste('lod')}` makes the levels again")
 
 
 def load_levels(run: Run, model: SplatModel) -> LodTree:
@@ -159,7 +159,7 @@ def load_levels(run: Run, model: SplatModel) -> LodTree:
     Raises:
         BadInput: There are none, they are damaged, or of another model.
     """
-    again = f"make them with surfkit lod {run.out}"
+    again = f"`{run.to_paste('lod')}` makes them"
     if not run.lod_record.exists():
         raise BadInput(f"{run.out}: there are no levels of detail; {again}")
     points = _record(run)["points"]

@@ -32,6 +32,7 @@ from surfkit.raster.api import Maps, Rasterizer, Splats
 from surfkit.raster.select import Device, torch_device
 from surfkit.readers.depth_prior import read_priors
 from surfkit.readers.masks import mask_cache
+from surfkit.run.command import train_command
 from surfkit.run.context import RunContext
 from surfkit.run.folder import Run, discard_results
 from surfkit.scene.cache import Cache
@@ -180,8 +181,7 @@ def reopened(run: Run, given: MethodInput) -> Reconstruction:
             splats = SplatModel(kept.primitive, params, kept.sh_degree, kept.near)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, SafetensorError) as error:
         raise BadInput(
-            f"{folder}: damaged ({' '.join(str(error).split())}); delete it, and the surfkit train command of the run "
-            "makes it again"
+            f"{folder}: damaged ({' '.join(str(error).split())}); delete it, and `{train_command(run)}` makes it again"
         ) from error
 
     @cache

@@ -16,7 +16,7 @@ import torch
 from surfkit.core.check import BadInput
 from surfkit.core.codec import dump, load, read_json, write_json
 from surfkit.core.events import Warned, emit
-from surfkit.core.registry import records
+from surfkit.core.registry import offered_once, records
 from surfkit.core.schedule import rescale_like
 from surfkit.core.version import own_version
 from surfkit.readers.depth_prior import prior_files
@@ -37,6 +37,7 @@ def refuse_other_run(run: Run) -> None:
     """BadInput if the folder holds a run that this one does not continue; a warning if this one makes it longer."""
     there = read_recipe_before(run.out / "recipe.json", run.recipe)
     now = dump(run.recipe)
+    before_about = there.get("about") if isinstance(there, dict) else None
     other = [name for name in ("mesh", "lod", "compress") if isinstance(there, dict) and there.get(name) != now[name]]
     if isinstance(there, dict):
         there |= {name: now[name] for name in ("mesh", "lod", "compress", "test_every")}  # training is the same
@@ -58,14 +59,21 @@ def refuse_other_run(run: Run) -> None:
         found = first_difference(before | {"priors": None}, dump(run.data) | {"priors": None}, "data")
     if found:
         at, old, new = found
-        raise BadInput(
-            f"--out {run.out} holds a run with {at} {abbreviate(old)}, and this one has {abbreviate(new)}; "
-            "name another folder, or delete that one"
-        )
+        what = f"holds a run with {at} {abbreviate(old)}, and this one has {abbreviate(new)}"
+        names = [recipe_name(about) for about in (before_about, run.recipe.about)]
+        if not at.startswith("data.") and None not in names and names[0] != names[1]:
+            what = f"holds a run of recipe:{names[0]}, and this one is of recipe:{names[1]}"
+        raise BadInput(f"--out {run.out} {what}; name another folder, or delete that one")
     for name in other:
         {"mesh": run.mesh_record, "lod": run.lod_record, "compress": run.compressed_record}[name].unlink(
             missing_ok=True
         )
+
+
+def recipe_name(about: Any) -> str | None:
+    """Name of the recipe that is offered with this description, which runs keep; None if there is none."""
+    offered = offered_once("surfkit_recipes", "a recipe")
+    return next((name for name, recipe in offered.items() if about and recipe.about == about), None)
 
 
 def read_recipe_before(path: Path, now: Recipe) -> Any:

@@ -70,7 +70,7 @@ def parsed(crs: str) -> Any:
     try:
         return CRS(crs)
     except ProjError as error:
-        said = " ".join(str(error).split())[:200]
+        said = " ".join(str(error).split())[:200].removeprefix(f"Invalid projection: {crs}: ")
         raise BadInput(f"coordinate reference system {crs!r}: pyproj cannot place it on Earth: {said}") from error
 
 

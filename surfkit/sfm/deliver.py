@@ -17,7 +17,7 @@ from PIL import Image
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
 from surfkit.core.events import Progress, emit
-from surfkit.core.files import replacing, replacing_folder
+from surfkit.core.files import delete_with_folders, replacing, replacing_folder
 from surfkit.readers.placed import FILE, Placed
 from surfkit.scene.names import safe_path
 from surfkit.scene.photos import read_photo
@@ -102,7 +102,7 @@ def deliver(
         pinholes.append(_rebuilt(model, images, cameras, sights))
     for name in set(before) - set(kept):
         if str(safe_path(name)) == name:  # the record may be another's
-            (scene / "images" / name).unlink(missing_ok=True)
+            delete_with_folders(scene / "images" / name, scene)
     write_json(work / RECORD, kept)
     with replacing_folder(scene / "sparse") as folder:
         for number, (pinhole, (_, placed)) in enumerate(zip(pinholes, models, strict=True)):

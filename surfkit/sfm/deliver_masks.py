@@ -14,7 +14,7 @@ from PIL import Image
 
 from surfkit.core.check import BadInput
 from surfkit.core.codec import read_json, write_json
-from surfkit.core.files import replacing
+from surfkit.core.files import delete_with_folders, replacing
 from surfkit.readers.masks import FOLDER
 from surfkit.sfm.deliver import MOST_THREADS, file_name
 from surfkit.sfm.engine import load_engine
@@ -64,7 +64,7 @@ def deliver_masks(
     with ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS)) as pool:
         list(pool.map(lambda name: _write(sources, todo[name][1], folder / name, todo[name][2]), todo))
     for name in set(before) - set(wanted):
-        (folder / name).unlink(missing_ok=True)
+        delete_with_folders(folder / name, scene)
     write_json(work / RECORD, {name: key for name, (key, _, _) in wanted.items()})
 
 

@@ -241,7 +241,7 @@ def _by_pyproj(crs: str, positions: np.ndarray) -> np.ndarray:
     try:
         flat = parsed(crs).to_2d()
     except BadInput as error:
-        raise BadInput(f"--crs {crs}: {error}; name one such as EPSG:2180") from error
+        raise BadInput(f"--crs: {error}; name one such as EPSG:2180") from error
     known = exact(DEGREES, flat)
     if known is None:
         raise BadInput(f"--crs {crs}: the shift from WGS 84 to its datum is not known; name another, such as EPSG:2180")

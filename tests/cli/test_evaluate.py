@@ -123,7 +123,7 @@ def test_mistakes_are_one_line(folder, capsys, words, message):
 
 
 def test_a_run_without_a_mesh(folder, capsys, tmp_path):
-    for name in ("recipe.json", "run.json"):
+    for name in ("recipe.json", "run.json", "metrics.json"):
         (tmp_path / name).write_bytes((folder / "run" / name).read_bytes())
     status, _, error = spoken(capsys, tmp_path, "--gt", folder / "truth.ply")
     assert status == 2 and "no mesh.ply in it; make it with surfkit mesh" in error

@@ -93,6 +93,7 @@ def test_survey_coordinates_keep_their_digits(tmp_path, capsys):
     ("words", "message"),
     [
         ("{here}/scene.ply", "this is the file that is read; name another"),
+        ("{here}/scene.ply --out {here}/page.htm", "no format of splats has this suffix; did you mean .html? known:"),
         ("{here}/scene.ply --out {here}/scene.xyz", "no format of splats has this suffix; known: compressed-ply"),
         ("{here}/scene.ply --format sog --out {here}/a.spz", "files of the format sog end in .sog; name it so"),
         ("{here}/scene.ply --format sogs", "no format named 'sogs'; did you mean 'sog'?"),

@@ -232,7 +232,10 @@ def test_a_record_without_maps_keeps_nobody_from_making_some(farm):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["prepare", "deph"], "prepare has no 'deph'"),
+        (
+            ["prepare", "photo"],
+            "prepare has no 'photo'; did you mean 'photos'? usage: surfkit prepare photos|points|depth",
+        ),
         (["prepare", "depth", "nowhere"], "nowhere: no such folder"),
         (["prepare", "depth", "d", "estimator:plan-sweep"], "did you mean 'plane-sweep'?"),
         (["prepare", "depth", "d", "--estimator.window", "4"], "window is 4; it must be an odd number"),
@@ -253,6 +256,6 @@ def test_a_model_without_tracks_is_one_line(tmp_path, capsys):
 
 def test_help_names_what_can_be_prepared(capsys):
     assert main(["prepare"]) == main(["prepare", "--help"]) == 0
-    assert "surfkit prepare depth" in capsys.readouterr().out
+    assert "surfkit prepare photos" in capsys.readouterr().out
     assert main(["prepare", "depth", "estimator:depth-anything-v2", "--help"]) == 0
     assert "CC BY-NC 4.0" in capsys.readouterr().out

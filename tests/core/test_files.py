@@ -11,6 +11,7 @@ from surfkit.core.caches import cache_root
 from surfkit.core.check import BadInput
 from surfkit.core.files import (
     being_written,
+    delete_with_folders,
     refuse_own,
     refuse_special,
     refuse_unwritable,
@@ -82,6 +83,19 @@ def test_what_the_dead_left_is_swept_away(tmp_path):
     left = sorted(p.name for p in tmp_path.rglob("*"))
     assert left == [".a.json.12.part", ".c.part", ".hidden", ".tmpAb1cD2", "a.json", "linked", "mine.part", "x"]
     assert (elsewhere / "folder" / ".surfkit-b.part").exists(), "a link is not followed"
+
+
+def test_folders_that_a_deleted_file_leaves_empty_go_with_it(tmp_path):
+    for name in ("images/orbit.mp4/a/1.png", "images/flight/1.png", "images/flight/2.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    for name in ("images/orbit.mp4/a/1.png", "images/flight/1.png", "images/never/1.png"):
+        delete_with_folders(tmp_path / name, tmp_path)
+    assert sorted(map(str, (path.relative_to(tmp_path) for path in tmp_path.rglob("*")))) == [
+        "images", "images/flight", "images/flight/2.png"
+    ]  # fmt: skip
+    delete_with_folders(tmp_path / "images/flight/2.png", tmp_path)
+    assert tmp_path.is_dir() and not any(tmp_path.iterdir()), "the root stays"
 
 
 def test_a_link_in_the_place_of_what_is_being_written_is_not_followed(tmp_path):

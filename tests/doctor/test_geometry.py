@@ -7,6 +7,7 @@ import pytest
 
 from surfkit.doctor.exposure import exposures, luminance
 from surfkit.doctor.geometry import places
+from surfkit.doctor.holes import holes
 from surfkit.readers.capture import Shot, load_pycolmap
 
 
@@ -50,3 +51,13 @@ def test_exposures_are_recovered_where_contents_differ_and_some_places_are_hidde
     known = np.arange(30) != 7
     assert np.isnan(found[7])
     assert found[known] - np.median(found[known]) == pytest.approx(gains[known] - np.median(gains[known]), abs=0.15)
+
+
+def test_a_hole_is_told_where_it_is_also_far_from_the_origin():
+    ground = np.stack(np.meshgrid(np.arange(0, 200, 2.0), np.arange(0, 200, 2.0), [0.0]), -1).reshape(-1, 3)
+    ground = ground[np.abs(ground[:, :2] - (120, 80)).max(1) > 30]
+    centres = np.stack(np.meshgrid(np.arange(0, 201, 20.0), np.arange(0, 201, 20.0), [50.0]), -1).reshape(-1, 3)
+    for place, size in (((621_400, 5_848_200, 0), 1.0), ((0, 0, 0), 0.001)):
+        (found,) = holes(ground * size + place, centres * size + place)
+        spot = [float(value) for value in found.text.partition("(")[2].partition(")")[0].split(", ")]
+        assert np.abs((np.array(spot) - place) / size - (120, 80, 0)).max() < 5, found.text

@@ -154,7 +154,7 @@ def test_what_is_left_of_other_levels_is_deleted(copy):
 @pytest.mark.parametrize(
     "spoil, text",
     [
-        (lambda lod: shutil.rmtree(lod), "there are no levels of detail; make them with surfkit lod"),
+        (lambda lod: shutil.rmtree(lod), "there are no levels of detail; `surfkit lod"),
         (lambda lod: (lod / "blocks.safetensors").write_bytes(b"x" * 9), "damaged"),
         (lambda lod: (lod / "level2.safetensors").unlink(), "damaged"),
         (lambda lod: (lod / "level1.safetensors").rename(lod / "level2.safetensors"), "damaged"),

@@ -152,10 +152,20 @@ def test_what_is_not_plain_is_refused_in_one_line_and_changes_nothing(finished, 
     assert (folder / "run/mesh.json").read_text() == before and (folder / "run/mesh.ply").exists()
 
 
+COUNTS = ("triangles", "vertices", "clusters_kept", "clusters", "boundaries", "boundary_share", "holes_closed")
+
+
 def test_a_mesh_of_an_older_version_is_shown_too():
-    counts = ("triangles", "vertices", "clusters_kept", "clusters", "boundaries", "boundary_share", "holes_closed")
-    cleaning = dict.fromkeys(counts, 0)
+    cleaning = dict.fromkeys(COUNTS, 0)
     assert ("voxel m", "0.5") in mesh_rows({"cleaning": cleaning, "lengths": {"voxel_m": 0.5}, "seconds": 1.0})
+
+
+def test_a_length_is_shown_once_where_the_unit_is_a_metre():
+    cleaning = dict.fromkeys(COUNTS, 0) | {"boundaries": 6087, "boundary_share": 0.086}
+    for metres, names in ((0.5, ["voxel m"]), (0.2, ["voxel", "voxel m"])):
+        rows = mesh_rows({"cleaning": cleaning, "facts": {"voxel": 0.5, "voxel_m": metres}, "seconds": 1.0})
+        assert [name for name, _ in rows if "voxel" in name] == names
+    assert ("edges of holes and rims", "8.6% of all edges, in 6,087 loops") in rows
 
 
 def test_a_row_of_an_ablation(finished, tmp_path, monkeypatch, capsys):

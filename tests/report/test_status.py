@@ -40,12 +40,12 @@ def test_a_stopped_run(folder, capsys):
         "state": "stopped", "process": None, "stage": "pretrain", "step": 120, "steps": 400, "saved_step": 100,
         "steps_per_second": pytest.approx(4), "seconds_left": None, "points": 170, "loss": 0.75,
         "peak_memory_bytes": 10**9, "peak_gpu_bytes": None, "metrics": {"psnr": 20.5, "views": 2, "step": 80},
-        "warnings": ["the scene is odd"], "skipped": ["c.jpg"], "blocks": [],
+        "notes": ["the scene is odd"], "skipped": ["c.jpg"], "blocks": [],
     }  # fmt: skip
     assert main(["status", str(folder)]) == 3
     lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
     assert ["state", "stopped"] in lines and ["step", "120 of 400 of pretrain"] in lines
-    assert ["speed", "4.0 it/s"] in lines and ["warning", "the scene is odd"] in lines and ["skipped", "c.jpg"] in lines
+    assert ["speed", "4.0 it/s"] in lines and ["note", "the scene is odd"] in lines and ["skipped", "c.jpg"] in lines
 
 
 def test_a_running_run_names_its_process_and_the_time_left(folder, capsys):
@@ -56,6 +56,18 @@ def test_a_running_run_names_its_process_and_the_time_left(folder, capsys):
         assert found["seconds_left"] == pytest.approx(280 / 4, abs=0.2)
         assert main(["status", str(folder)]) == 3
         assert "time left        0:01:10" in capsys.readouterr().out
+
+
+def test_the_peak_of_memory_is_that_of_the_whole_run(folder, capsys):
+    """Steps are not all that takes memory: the mesh and the pictures come after them."""
+    kept = json.loads((folder / "run.json").read_text())
+    write_json(folder / "run.json", kept | {"memory_bytes": {"peak": 2 * 10**9}})
+    main(["status", str(folder)])
+    assert "peak memory      2000 MB" in capsys.readouterr().out
+    images = {"images": {"psnr": None, "ssim": None, "per_image": {}}}
+    write_json(folder / "metrics.json", images | TOTALS | {"peak_memory_bytes": 3 * 10**9})
+    main(["status", str(folder)])
+    assert "peak memory      3000 MB" in capsys.readouterr().out
 
 
 def test_a_finished_run(folder, capsys):

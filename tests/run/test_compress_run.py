@@ -197,7 +197,7 @@ def test_without_the_file_it_cannot_be_read(copy, capsys):
     with loaded(copy, "cpu") as (ctx, _):
         discard_results(ctx.run, ctx.run.pretrain)
     assert main(["evaluate", str(copy), "--compressed"]) == 2
-    assert "there is no compressed model; make one with surfkit compress" in capsys.readouterr().err
+    assert "there is no compressed model; `surfkit compress" in capsys.readouterr().err
 
 
 def test_a_file_becomes_one_without_photographs(copy, tmp_path, capsys):

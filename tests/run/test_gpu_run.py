@@ -113,7 +113,7 @@ def test_where_it_gives_out_for_good_the_last_step_is_kept_and_the_same_command_
     assert fault.value.status == 1 and fault.value.kind == "oom" and "\n" not in str(fault.value)
     found = status(tmp_path / "run")
     assert (found.step, found.saved_step) == (13, 13), "checkpoints are made every 8 steps"
-    assert any("no longer kept" in text for text in found.warnings)
+    assert any("no longer kept" in text for text in found.notes)
     gpu.limit = None
     run(recipe, data, tmp_path / "run", intervals=EVERY)
     assert cloud(tmp_path / "run") == cloud(tmp_path / "whole")

@@ -1,6 +1,7 @@
 """Readers, splits and layouts of depth maps of a package that surfkit knows nothing of."""
 
 import json
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -11,6 +12,7 @@ import pytest
 from surfkit.cli import main
 from surfkit.core.check import BadInput
 from surfkit.core.registry import hookimpl, plugins
+from surfkit.pipeline import opened
 from surfkit.readers.base import Reader
 from surfkit.readers.capture import Capture
 from surfkit.readers.colmap import COLMAP
@@ -21,6 +23,7 @@ from surfkit.readers.depth_prior import prior_files, read_priors
 from surfkit.readers.fingerprint import changed, fingerprint
 from surfkit.readers.read import read
 from surfkit.readers.split import GauUScene, Split
+from surfkit.run.command import train_command
 from surfkit.run.folder import read_data
 from surfkit.run.notes import collect_notes
 from surfkit.testing.synthetic import Flight, photograph, write_colmap
@@ -194,6 +197,8 @@ def test_on_the_command_line(farm, tmp_path, capsys):
     assert record["data"]["depth_layout"] == {"use": "lidar", "unit": 2.0}
     assert sum(camera["held_out"] for camera in json.loads((tmp_path / "run/cameras.json").read_text())) == 1
     assert main([*words, *chosen]) == 0 and "is finished" in capsys.readouterr().err
+    again = shlex.split(train_command(opened(tmp_path / "run")))[1:]
+    assert main(again) == 0 and "is finished" in capsys.readouterr().err
     assert main([*words, *chosen, "--split.count", "2"]) == 2
     assert "holds a run with data.split.count 1, and this one has 2" in capsys.readouterr().err
     assert main([*words, "--split", "loest"]) == 2

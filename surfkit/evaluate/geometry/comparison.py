@@ -256,7 +256,9 @@ def truth_side(truth: Surface, settings: Comparison) -> tuple[Side, float]:
     """What the truth is drawn from, and tau."""
     if truth.faces is not None:
         if settings.tau is None:
-            raise BadInput(f"{truth.path}: a mesh has no spacing of points to take the threshold from; give --tau")
+            raise BadInput(
+                f"{truth.path}: a mesh or a raster has no spacing of points to take the threshold from; give --tau"
+            )
         return make_side(truth, None, settings.samples, settings.tau), settings.tau
     found = cloud_side(truth, settings.voxel)
     if settings.tau is not None:

