@@ -365,7 +365,7 @@ def test_geo_txt_places_it_instead_of_exif(folder, prepared, tmp_path, monkeypat
     (tmp_path / "p/geo.txt").write_text("\n".join(["WGS84 UTM 33n", *rows]))
     assert main(["prepare", "photos", str(tmp_path / "p"), "--out", str(tmp_path / "s"), *QUICK]) == 0
     said = capsys.readouterr()
-    assert "sparse/0 is placed in plan" in said.err and " north of 6" in said.out
+    assert "sparse/0 is placed in plan" in said.err and " north, of 6 photographs" in said.out
     for name, centre in cameras(read(Data(tmp_path / "s"))).items():
         assert np.linalg.norm((centre - CENTRES[name] - ORIGIN - move)[:2]) < 0.5
     place = json.loads((tmp_path / "s/report.json").read_text())["models"][0]["georeference"]
