@@ -89,11 +89,7 @@ class Preparation:
         path = self.work / PHOTOGRAPHS
         before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
-        if before and not {photo.name for photo in before} & {photo.name for photo in photos}:
-            raise BadInput(
-                f"{self.scene} was prepared from other photographs, {few([photo.name for photo in before])}, and none "
-                f"of them is in {self.root}; name another folder with --out, or delete {self.scene}"
-            )
+        _refuse_others(self.scene, self.root, before, photos)
         write_json(path, photos)
         return sources, photos
 
@@ -235,6 +231,21 @@ class Preparation:
         write_json(self.scene / REPORT, report)
         draw(self.scene / PICTURE, read_drawn(self.scene), placed[0][1])
         return report
+
+
+def _refuse_others(scene: Path, root: Path, before: Sequence[Photo], photos: Sequence[Photo]) -> None:
+    """BadInput where a scene was prepared from photographs of which none is there now, by its name and what it shows:
+    drones call those of each flight alike."""
+    now = {photo.name: photo for photo in photos}
+    known = [photo for photo in before if photo.usable]
+    named = [photo for photo in known if photo.name in now]
+    if not known or any(photo.shows_what(now[photo.name]) for photo in named):
+        return
+    why = f"those in {root} have the same names and show something else" if named else f"none of them is in {root}"
+    raise BadInput(
+        f"{scene} was prepared from other photographs, {few([photo.name for photo in known])}, and {why}; name another "
+        f"folder with --out, or delete {scene}"
+    )
 
 
 def _name_wrong(where: Placement | Control) -> None:

@@ -301,16 +301,31 @@ def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path,
 
 
 def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
-    for name in ("a", "b"):
+    flights = {"a": "a{}.jpg", "b": "b{}.jpg", "c": "a{}.jpg", "both/a": "{}.jpg", "both/b": "{}.jpg"}
+    for seed, (folder, name) in enumerate(flights.items()):
         for at in range(3):
-            save(tmp_path / name / f"{name}{at}.jpg", picture(arc(3)[at]))
-    words = ["prepare", "photos", "--out", str(tmp_path / "s")]
-    main([*words, str(tmp_path / "a")])
-    kept = (tmp_path / "s/prepare/photographs.json").read_bytes()
+            save(tmp_path / folder / name.format(at), picture(arc(3)[at], seed))
+    scene = tmp_path / "s"
+    words = ["prepare", "photos", "--out", str(scene), "--no-gps"]
+    assert main([*words, str(tmp_path / "a")]) == 0
+    kept = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file() and path.name != "stages.json"}
     capsys.readouterr()
-    assert main([*words, str(tmp_path / "b")]) == 2
-    assert "was prepared from other photographs, 'a0.jpg'" in capsys.readouterr().err
-    assert (tmp_path / "s/prepare/photographs.json").read_bytes() == kept
+    for folder, said in (("b", "none of them is in"), ("c", "have the same names and show something else")):
+        assert main([*words, str(tmp_path / folder)]) == 2
+        told = capsys.readouterr().err
+        assert "was prepared from other photographs, 'a0.jpg'" in told and said in told and "name another folder" in told
+        assert all(path.read_bytes() == content for path, content in kept.items())
+    for path in (tmp_path / "a").iterdir():  # copied, and EXIF written anew
+        shutil.copyfile(path, tmp_path / "c" / path.name)
+        write_exif(tmp_path / "c" / path.name, (52.3, 15.1, 90.0))
+    (tmp_path / "c/a2.jpg").unlink()
+    save(tmp_path / "c/a3.jpg", picture(arc(4)[3]))
+    assert main([*words, str(tmp_path / "c")]) == 0
+    assert {path.name for path in (scene / "images").iterdir()} == {"a0.jpg", "a1.jpg", "a3.jpg"}
+    assert main(["prepare", "photos", "--out", str(tmp_path / "two"), str(tmp_path / "both")]) == 0
+    looked = json.loads((tmp_path / "two/prepare/photographs.json").read_text())
+    assert [photo["name"] for photo in looked] == [f"{folder}/{at}.jpg" for folder in "ab" for at in range(3)]
+    assert {path.parent.name for path in (tmp_path / "two/images").rglob("*.jpg")} == {"a", "b"}
 
 
 def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):
