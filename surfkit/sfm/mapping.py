@@ -19,8 +19,8 @@ from surfkit.sfm.settings import Settings
 SMALLEST = 3
 """Photographs of a model; fewer determine no surface."""
 GRAIN = 2.0**-26
-"""To which models are rounded, whose cameras spread by some 10 units: less than 1e-3 px. Threads add up in another order
-each time, which changes the last bits, by 1e-14; rounded, the same photographs come to the same bits."""
+"""To which models are rounded, whose cameras spread by some 10 units: less than 1e-3 px. Threads add up in another
+order each time, which changes the last bits, by 1e-14; rounded, the same photographs come to the same bits."""
 
 
 def map_photographs(database: Path, folder: Path, count: int, settings: Settings) -> list[Path]:

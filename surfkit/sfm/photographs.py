@@ -31,7 +31,7 @@ DRAFT_PX = 512
 """At this size light and sharpness are measured."""
 MOST_THREADS = 8
 """Photographs that are read at once."""
-EDITION = 1
+EDITION = 2
 """Changes when more is found in a photograph: it is looked at again then."""
 DARK, FLAT = 8.0, 3.0
 """Mean and standard deviation of grey levels, 0 to 255, below which a photograph shows nothing."""

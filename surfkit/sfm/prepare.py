@@ -31,7 +31,7 @@ from surfkit.sfm.plausible import upside_down
 from surfkit.sfm.positions import Positions, settle
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import REPORT, WORK, Settings
-from surfkit.sfm.site import Reading, decide, locate, readings
+from surfkit.sfm.site import Reading, decide, heights_named, locate, readings
 from surfkit.sfm.sources import Sources, look_at_all
 
 PICTURE = "cameras.png"
@@ -184,6 +184,9 @@ class Preparation:
                 )
             )
             return model, where, None
+        where, said = heights_named(where, list(photos.values()), self.settings.crs)
+        if said:
+            emit(Warned(f"sparse/{number}: {said}"))
         inside, ground = where.fit.inside, height_above_ground(model)
         cameras, onto = (where.onto - where.fit.residuals)[inside], where.onto[inside]
         stretch = height_stretch(cameras, onto, where.sigma[inside, 2], ground)

@@ -71,7 +71,8 @@ def test_cameras_are_found_and_placed(prepared):
     shape = np.linalg.norm(best.points(ours - ORIGIN) - (truth - ORIGIN), axis=1)
     assert shape.max() < 0.1, "of cameras 20 m away"
     assert np.linalg.norm(ours - truth, axis=1).max() < 0.3
-    assert scene.frame.crs == "EPSG:32633" and scene.frame.metres == 1
+    assert scene.frame.crs == "EPSG:32633+5773", "above sea level, as EXIF says"
+    assert scene.frame.metres == 1
     assert scene.frame.shift == (512_000, 5_800_000, 0)
     focal = {view.camera.fx / view.camera.width for view in scene.train}
     assert len(focal) == 1 and focal.pop() == pytest.approx(260 / 240, rel=0.03)
@@ -313,7 +314,9 @@ def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
     for folder, said in (("b", "none of them is in"), ("c", "have the same names and show something else")):
         assert main([*words, str(tmp_path / folder)]) == 2
         told = capsys.readouterr().err
-        assert "was prepared from other photographs, 'a0.jpg'" in told and said in told and "name another folder" in told
+        assert (
+            "was prepared from other photographs, 'a0.jpg'" in told and said in told and "name another folder" in told
+        )
         assert all(path.read_bytes() == content for path, content in kept.items())
     for path in (tmp_path / "a").iterdir():  # copied, and EXIF written anew
         shutil.copyfile(path, tmp_path / "c" / path.name)
