@@ -20,7 +20,7 @@ SMALLEST = 3
 """Photographs of a model; fewer determine no surface."""
 GRAIN = 2.0**-26
 """To which models are rounded, whose cameras spread by some 10 units: less than 1e-3 px. Threads add up in another
-order each time, which changes the last bits, by 1e-14; rounded, the same photographs come to the same bits."""
+order each time, which changes the last bits, by 1e-14; rounded, nearly all come to the same bits."""
 
 
 def map_photographs(database: Path, folder: Path, count: int, settings: Settings) -> list[Path]:

@@ -192,6 +192,32 @@ def test_the_last_bits_of_a_model_are_rounded_away(prepared, tmp_path):
     assert len(written[0]) >= 3 and written[0] == written[1]
 
 
+def test_cameras_found_anew_leave_the_scene_as_it_is(folder, prepared, tmp_path, monkeypatch):
+    def contents(root):
+        return {
+            path.relative_to(root): path.read_bytes()
+            for path in (*root.glob("sparse/*/*"), *root.glob("images/**/*.jpg"))
+        }
+
+    before, plain = contents(prepared), mapping.round_off
+    for noise, same in ((1e-10, True), (1e-3, False)):
+        scene = tmp_path / str(noise)
+        shutil.copytree(prepared, scene)
+        shutil.rmtree(scene / "prepare/models")
+
+        def round_off(engine, model, noise=noise):
+            plain(engine, model)
+            for at, point in model.points3D.items():
+                point.xyz = point.xyz + noise * np.sin(at * np.arange(1, 4))
+
+        monkeypatch.setattr(mapping, "round_off", round_off)
+        assert main(["prepare", "photos", str(folder), "--out", str(scene), *QUICK]) == 0
+        found, after = mapping.read_model(scene / "prepare/models/0"), contents(scene)
+        exact = mapping.read_model(prepared / "prepare/models/0").points3D
+        assert any((found.points3D[at].xyz != exact[at].xyz).any() for at in exact), "they are of other bits"
+        assert (after == before) is same and after.keys() == before.keys()
+
+
 def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkeypatch, capsys):
     for module, name in ((features, "_keep"), (matching, "_compare"), (mapping, "_incremental")):
         plain, calls = getattr(module, name), []
