@@ -20,7 +20,9 @@ from surfkit.core.optional import needed
 
 NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
 TOPOCENTRIC = re.compile(rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={NUMBER} \+lon_0={NUMBER} \+h_0={NUMBER}")
-UTM = re.compile(r"EPSG:32([67])(0[1-9]|[1-5]\d|60)", re.IGNORECASE)
+EGM96 = "+5773"
+"""What the code of a map ends with where heights are above sea level by EGM96, the geoid that receivers of GPS know."""
+UTM = re.compile(rf"EPSG:32([67])(0[1-9]|[1-5]\d|60)({re.escape(EGM96)})?", re.IGNORECASE)
 DEGREES = "EPSG:4326"
 UNITS = {"metre": "m", "foot": "ft", "US survey foot": "US ft", "kilometre": "km"}
 """Short names of units of length, by those of EPSG."""
@@ -82,7 +84,7 @@ def axes_of(crs: str) -> Axes:
             those; or pyproj is needed and not installed, or does not know it.
     """
     if is_plain(crs):
-        return Axes()
+        return Axes(height_metres=1.0, height_unit="metre") if crs.endswith(EGM96) else Axes()
     given = parsed(crs)
     if given.is_geographic:
         raise BadInput(f"{crs}: it is in degrees, where lengths belong; name a projected one, such as EPSG:32633")
@@ -106,7 +108,8 @@ def axes_of(crs: str) -> Axes:
 
 
 def is_plain(crs: str) -> bool:
-    """Whether it is a zone of UTM on WGS 84 or a topocentric frame, in metres, which need no pyproj."""
+    """Whether it is a zone of UTM on WGS 84, with or without heights by EGM96, or a topocentric frame, in metres: they
+    need no pyproj, but for the heights of the geoid."""
     return bool(UTM.fullmatch(crs) or TOPOCENTRIC.fullmatch(crs))
 
 

@@ -17,6 +17,7 @@ from surfkit.core.check import BadInput
 from surfkit.scene.crs import (
     COARSE_M,
     DEGREES,
+    EGM96,
     TOPOCENTRIC,
     UTM,
     axes_of,
@@ -125,7 +126,7 @@ def on_earth(crs: str, origin: np.ndarray, geoid: Geoid | None = None) -> tuple[
         f"{crs} does not say what heights are above: they are taken as above the ellipsoid of its datum; where they "
         "are above sea level, give the geoid with --geoid FILE or METRES",
     )
-    if is_plain(crs):
+    if is_plain(crs) and (geoid is not None or not crs.endswith(EGM96)):
         return lambda xyz: _plainly(crs, np.asarray(xyz, np.float64), geoid), () if geoid else untold
     axes, given = axes_of(crs), parsed(crs)
     notes: tuple[str, ...] = ()

@@ -64,6 +64,7 @@ def adjust(model: Any, placement: Placement | None, photos: Mapping[str, Photo],
     add_marks(new, config, known_focals(model, photos, placement is not None))
     options, trust = engine.BundleAdjustmentOptions(), engine.PosePriorBundleAdjustmentOptions()
     options.print_summary = False
+    options.ceres.solver_options.num_threads = 1  # several add up in another order each time, and come to other bits
     trust.alignment_ransac.random_seed = settings.seed
 
     def solve(_: Any) -> Any:

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from PIL import Image
 
@@ -32,6 +32,10 @@ MOST_ERROR_M = 1e4
 """An accuracy beyond it is no accuracy."""
 ABOVE, BELOW = (0, 2), (1, 3)
 """References of altitudes: sea level, and from EXIF 3.0 on the ellipsoid."""
+ELLIPSOID = (2, 3)
+RTK_FLAG = "RtkFlag"
+"""In XMP of DJI: 0 without RTK; 16, 34 or 50 where the position is of that receiver."""
+Zero = Literal["sea level", "ellipsoid"]
 
 Position = tuple[float, float, float | None]
 """Latitude and longitude, degrees on WGS 84, and altitude, metres; None where it is not known."""
@@ -51,6 +55,7 @@ class Exif:
         unsigned: Which of latitude and longitude have no letter of the hemisphere, so that their sign is not known; the
             position has them as positive.
         no_reference: Whether nothing says if the altitude is above or below its zero; it is taken as above.
+        zero: What the altitude is counted from, by EXIF and XMP; None without one, or where it is from elsewhere.
         xmp_position: Where it was taken, in XMP.
         xmp_altitude: Altitude in XMP, metres, also where XMP has no position.
         above_start: Height above the place of the start in XMP, metres.
@@ -65,6 +70,7 @@ class Exif:
     position: Position | None = None
     unsigned: tuple[str, ...] = ()
     no_reference: bool = False
+    zero: Zero | None = None
     xmp_position: Position | None = None
     xmp_altitude: float | None = None
     above_start: float | None = None
@@ -113,6 +119,7 @@ def facts(
         position=position,
         unsigned=unsigned,
         no_reference=position is not None and position[2] is not None and _reference(gps) is None,
+        zero=_zero(gps, xmp),
         xmp_position=_xmp_position(xmp),
         xmp_altitude=xmp.get(xmp_names.ALTITUDE),
         above_start=xmp.get(xmp_names.ABOVE_START),
@@ -181,6 +188,14 @@ def _reference(tags: Mapping[int, Any]) -> int | None:
     except (TypeError, ValueError, IndexError):
         return None
     return found if found in (*ABOVE, *BELOW) else None
+
+
+def _zero(gps: Mapping[int, Any], xmp: Mapping[str, float]) -> Zero | None:
+    """What altitudes are counted from: sea level by the standard, also where nothing is said. Drones with RTK write
+    heights above the ellipsoid, under the reference of sea level, as older EXIF has no other."""
+    if ALTITUDE not in gps and xmp_names.ALTITUDE not in xmp:
+        return None
+    return "ellipsoid" if _reference(gps) in ELLIPSOID or xmp.get(RTK_FLAG, 0.0) > 0 else "sea level"
 
 
 def _xmp_position(xmp: Mapping[str, float]) -> Position | None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
+
 from surfkit.core.check import BadInput
 from surfkit.core.events import Progress, emit
 from surfkit.core.files import replacing_folder
@@ -16,6 +18,9 @@ from surfkit.sfm.settings import Settings
 
 SMALLEST = 3
 """Photographs of a model; fewer determine no surface."""
+GRAIN = 2.0**-26
+"""To which models are rounded, whose cameras spread by some 10 units: less than 1e-3 px. Threads add up in another
+order each time, which changes the last bits, by 1e-14; rounded, nearly all come to the same bits."""
 
 
 def map_photographs(database: Path, folder: Path, count: int, settings: Settings) -> list[Path]:
@@ -39,11 +44,30 @@ def map_photographs(database: Path, folder: Path, count: int, settings: Settings
             (made / str(number)).mkdir()
             for image in model.images.values():
                 image.name = unquote(image.name)
+            round_off(engine, model)
             model.write_binary(made / str(number))
         for path in sorted(scratch.rglob("*"), reverse=True):
             path.rmdir() if path.is_dir() else path.unlink()
         scratch.rmdir()
     return [folder / str(number) for number in range(len(kept))]
+
+
+def round_off(engine: Any, model: Any) -> None:
+    """Round cameras, poses and points of a pycolmap.Reconstruction to multiples of `GRAIN`."""
+
+    def rounded(values: Any) -> np.ndarray:
+        return np.round(np.asarray(values, np.float64) / GRAIN) * GRAIN
+
+    for camera in model.cameras.values():
+        camera.params = rounded(camera.params)
+    for number in model.reg_frame_ids():
+        frame = model.frames[number]
+        pose = frame.rig_from_world
+        turn = engine.Rotation3d(rounded(pose.rotation.quat))
+        frame.rig_from_world = engine.Rigid3d(turn, rounded(pose.translation))
+    for point in model.points3D.values():
+        point.xyz = rounded(point.xyz)
+    model.update_point_3d_errors()
 
 
 def read_model(folder: Path) -> Any:

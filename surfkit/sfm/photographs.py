@@ -79,6 +79,11 @@ class Photo:
         """Whether it goes into the reconstruction."""
         return self.problem is None
 
+    def shows_what(self, other: Photo) -> bool:
+        """Whether it has the pixels of another, also where only EXIF was written anew, or is the same file, also where
+        transparent pixels are read otherwise now."""
+        return self.pixels == other.pixels or self.stamp == other.stamp
+
 
 def look(
     folder: Path,

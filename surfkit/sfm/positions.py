@@ -125,7 +125,9 @@ def _listed(photo: Photo, found: Listed) -> Photo:
     position = found.positions.get(photo.name)
     if position is None:
         return photo
-    plain = replace(photo.exif, unsigned=(), no_reference=False, xmp_position=None, xmp_altitude=None, above_start=None)
+    plain = replace(
+        photo.exif, unsigned=(), no_reference=False, zero=None, xmp_position=None, xmp_altitude=None, above_start=None
+    )
     return replace(photo, exif=replace(plain, position=position, accuracy_m=found.accuracies.get(photo.name)))
 
 
@@ -253,6 +255,7 @@ def _heights(photos: Sequence[Photo]) -> list[Photo]:
     if given and not heights and all(photo.exif.above_start is not None for photo in given):
         emit(Warned("no position has an altitude: heights are those above the place of the start, by XMP"))
         heights = {photo.name: photo.exif.above_start for photo in given}
+        photos = [replace(photo, exif=replace(photo.exif, zero=None)) for photo in photos]
     elif len(heights) < len(given):
         rest = "; the others place the scene, if they are enough" if heights else ""
         emit(Warned(f"{len(given) - len(heights)} of {len(given)} positions have no altitude{rest}"))

@@ -31,7 +31,7 @@ from surfkit.sfm.plausible import upside_down
 from surfkit.sfm.positions import Positions, settle
 from surfkit.sfm.report import draw, model_facts, reasons
 from surfkit.sfm.settings import REPORT, WORK, Settings
-from surfkit.sfm.site import Reading, decide, locate, readings
+from surfkit.sfm.site import Reading, decide, heights_named, locate, readings
 from surfkit.sfm.sources import Sources, look_at_all
 
 PICTURE = "cameras.png"
@@ -89,11 +89,7 @@ class Preparation:
         path = self.work / PHOTOGRAPHS
         before = known_photographs(path)
         sources, photos = look_at_all(self.root, self.work, path, self.settings)
-        if before and not {photo.name for photo in before} & {photo.name for photo in photos}:
-            raise BadInput(
-                f"{self.scene} was prepared from other photographs, {few([photo.name for photo in before])}, and none "
-                f"of them is in {self.root}; name another folder with --out, or delete {self.scene}"
-            )
+        _refuse_others(self.scene, self.root, before, photos)
         write_json(path, photos)
         return sources, photos
 
@@ -188,6 +184,9 @@ class Preparation:
                 )
             )
             return model, where, None
+        where, said = heights_named(where, list(photos.values()), self.settings.crs)
+        if said:
+            emit(Warned(f"sparse/{number}: {said}"))
         inside, ground = where.fit.inside, height_above_ground(model)
         cameras, onto = (where.onto - where.fit.residuals)[inside], where.onto[inside]
         stretch = height_stretch(cameras, onto, where.sigma[inside, 2], ground)
@@ -235,6 +234,21 @@ class Preparation:
         write_json(self.scene / REPORT, report)
         draw(self.scene / PICTURE, read_drawn(self.scene), placed[0][1])
         return report
+
+
+def _refuse_others(scene: Path, root: Path, before: Sequence[Photo], photos: Sequence[Photo]) -> None:
+    """BadInput where a scene was prepared from photographs of which none is there now, by its name and what it shows:
+    drones call those of each flight alike."""
+    now = {photo.name: photo for photo in photos}
+    known = [photo for photo in before if photo.usable]
+    named = [photo for photo in known if photo.name in now]
+    if not known or any(photo.shows_what(now[photo.name]) for photo in named):
+        return
+    why = f"those in {root} have the same names and show something else" if named else f"none of them is in {root}"
+    raise BadInput(
+        f"{scene} was prepared from other photographs, {few([photo.name for photo in known])}, and {why}; name another "
+        f"folder with --out, or delete {scene}"
+    )
 
 
 def _name_wrong(where: Placement | Control) -> None:

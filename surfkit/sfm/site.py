@@ -4,13 +4,14 @@ several readings, and the cameras of the largest reconstruction decide which of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from surfkit.core.check import BadInput
 from surfkit.core.events import Warned, emit
+from surfkit.scene.crs import EGM96, UTM, known_axes
 from surfkit.sfm.georeference import Chart, Level, Placement, Refused, centres_of, chart_of, place
 from surfkit.sfm.level import points_of, turn_upright, up_of
 from surfkit.sfm.photographs import Photo
@@ -122,3 +123,39 @@ def locate(model: Any, reading: Reading, seed: int) -> Placement | Refused:
     if why := upside_down(model, found.similarity, up, found.chart.metres, found.handed):
         return Refused(f"by their positions {why}; are latitude and longitude, or their signs, exchanged?")
     return found
+
+
+def heights_named(where: Placement, photos: Sequence[Photo], given: str) -> tuple[Placement, str]:
+    """The placement on a map whose system says what heights are above, and what the user is to know of that.
+
+    Args:
+        where: With heights.
+        photos: With positions.
+        given: `--crs`, which is taken as it is, or "auto".
+    """
+    zeros = {photo.exif.zero for photo in photos if photo.name in where.names}
+    crs, axes = where.chart.crs, known_axes(where.chart.crs)
+    says_height = axes is not None and axes.height_metres is not None
+    if zeros == {"sea level"} and given == "auto" and UTM.fullmatch(crs) and not says_height:
+        chart = replace(where.chart, crs=crs + EGM96)
+        return replace(where, chart=chart), (
+            f"heights are above sea level, as is the rule in EXIF, so the scene is in {chart.crs} (EGM96); where the "
+            f"drone counts them from the ellipsoid, give --crs {crs}"
+        )
+    if zeros == {"sea level"} and axes is not None and not says_height:
+        return where, (
+            f"heights are above sea level, as is the rule in EXIF, and --crs {crs} does not say so; a system such as "
+            f"{crs}{EGM96} (EGM96) does"
+        )
+    if zeros == {"ellipsoid"}:
+        above = "heights are above the ellipsoid, as RTK (XMP) or GPSAltitudeRef in EXIF say"
+        return (
+            where,
+            f"{above}, and --crs {crs} says something else; leave its vertical part out" if says_height else above,
+        )
+    if {"sea level", "ellipsoid"} <= zeros:
+        return where, (
+            "heights of some photographs are above the ellipsoid (RTK in XMP, or GPSAltitudeRef in EXIF) and of others "
+            "above sea level, up to 100 m apart; they are taken as they are; give all of one kind with --positions"
+        )
+    return where, ""

@@ -39,6 +39,19 @@ def test_a_photograph_that_says_nothing(photo):
     assert read(photo) == Exif()
 
 
+@pytest.mark.parametrize(
+    ("reference", "flag", "zero"),
+    [(0, None, "sea level"), (1, 0, "sea level"), (None, None, "sea level"), (2, None, "ellipsoid")]
+    + [(3, None, "ellipsoid"), (0, 50, "ellipsoid"), (0, 16, "ellipsoid")],
+)
+def test_where_altitudes_are_0(reference, flag, zero):
+    """Sea level by the standard; drones with RTK write heights above the ellipsoid under its reference."""
+    gps = {exif.ALTITUDE: 120.0} | ({} if reference is None else {exif.ALTITUDE_REF: bytes([reference])})
+    xmp = {} if flag is None else {"RtkFlag": float(flag)}
+    assert facts({}, {}, gps, xmp, (40, 30)).zero == zero
+    assert facts({}, {}, {exif.ALTITUDE_REF: b"\0"}, xmp, (40, 30)).zero is None, "no altitude"
+
+
 def test_camera_time_and_orientation(photo):
     basic = {exif.MAKE: "DJI\0", exif.MODEL: "FC6310", exif.ORIENTATION: 6}
     write_exif(photo, basic=basic, camera={exif.TAKEN: "2024:05:01 12:00:00", exif.SUBSECOND: "25"})

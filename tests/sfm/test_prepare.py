@@ -15,6 +15,7 @@ from surfkit.readers.data import Data
 from surfkit.readers.read import observations, read
 from surfkit.scene.earth import from_utm
 from surfkit.sfm import deliver, features, mapping, matching
+from surfkit.sfm.engine import load_engine
 from surfkit.sfm.similarity import umeyama
 from surfkit.testing.exif import write_exif
 
@@ -70,7 +71,8 @@ def test_cameras_are_found_and_placed(prepared):
     shape = np.linalg.norm(best.points(ours - ORIGIN) - (truth - ORIGIN), axis=1)
     assert shape.max() < 0.1, "of cameras 20 m away"
     assert np.linalg.norm(ours - truth, axis=1).max() < 0.3
-    assert scene.frame.crs == "EPSG:32633" and scene.frame.metres == 1
+    assert scene.frame.crs == "EPSG:32633+5773", "above sea level, as EXIF says"
+    assert scene.frame.metres == 1
     assert scene.frame.shift == (512_000, 5_800_000, 0)
     focal = {view.camera.fx / view.camera.width for view in scene.train}
     assert len(focal) == 1 and focal.pop() == pytest.approx(260 / 240, rel=0.03)
@@ -162,6 +164,58 @@ def test_what_is_complete_is_not_repeated(folder, prepared, monkeypatch):
     before, seen = files(prepared), watched(monkeypatch)
     assert main(["prepare", "photos", str(folder), *QUICK]) == 0
     assert seen == [] and files(prepared) == before
+
+
+def test_the_last_bits_of_a_model_are_rounded_away(prepared, tmp_path):
+    """Threads of the solver change them from call to call."""
+    engine, rng, written = load_engine(), np.random.default_rng(0), []
+
+    def shaken(values):
+        return np.asarray(values) + rng.normal(0, 1e-14, len(values))
+
+    for name in ("one", "other"):
+        model = mapping.read_model(prepared / "prepare/models/0")
+        exact = {number: point.xyz for number, point in model.points3D.items()}
+        for camera in model.cameras.values():
+            camera.params = shaken(camera.params)
+        for frame in model.frames.values():
+            pose = frame.rig_from_world
+            turn = engine.Rotation3d(shaken(pose.rotation.quat))
+            frame.rig_from_world = engine.Rigid3d(turn, shaken(pose.translation))
+        for point in model.points3D.values():
+            point.xyz = shaken(point.xyz)
+        mapping.round_off(engine, model)
+        assert max(np.abs(model.points3D[number].xyz - xyz).max() for number, xyz in exact.items()) < mapping.GRAIN
+        (tmp_path / name).mkdir()
+        model.write_binary(tmp_path / name)
+        written.append({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()})
+    assert len(written[0]) >= 3 and written[0] == written[1]
+
+
+def test_cameras_found_anew_leave_the_scene_as_it_is(folder, prepared, tmp_path, monkeypatch):
+    def contents(root):
+        return {
+            path.relative_to(root): path.read_bytes()
+            for path in (*root.glob("sparse/*/*"), *root.glob("images/**/*.jpg"))
+        }
+
+    before, plain = contents(prepared), mapping.round_off
+    for noise, same in ((1e-10, True), (1e-3, False)):
+        scene = tmp_path / str(noise)
+        shutil.copytree(prepared, scene)
+        shutil.rmtree(scene / "prepare/models")
+
+        def round_off(engine, model, noise=noise):
+            plain(engine, model)
+            for at, point in model.points3D.items():
+                point.xyz = point.xyz + noise * np.sin(at * np.arange(1, 4))
+
+        monkeypatch.setattr(mapping, "round_off", round_off)
+        assert main(["prepare", "photos", str(folder), "--out", str(scene), *QUICK]) == 0
+        found, after = mapping.read_model(scene / "prepare/models/0"), contents(scene)
+        exact = mapping.read_model(prepared / "prepare/models/0").points3D
+        assert any((found.points3D[at].xyz != exact[at].xyz).any() for at in exact), "they are of other bits"
+        assert (after == before) is same and after.keys() == before.keys()
 
 
 def test_interrupted_at_each_stage_it_goes_on(folder, prepared, tmp_path, monkeypatch, capsys):
@@ -274,16 +328,33 @@ def test_a_system_without_positions_is_refused_before_the_work(folder, tmp_path,
 
 
 def test_a_scene_of_other_photographs_is_not_replaced(tmp_path, capsys):
-    for name in ("a", "b"):
+    flights = {"a": "a{}.jpg", "b": "b{}.jpg", "c": "a{}.jpg", "both/a": "{}.jpg", "both/b": "{}.jpg"}
+    for seed, (folder, name) in enumerate(flights.items()):
         for at in range(3):
-            save(tmp_path / name / f"{name}{at}.jpg", picture(arc(3)[at]))
-    words = ["prepare", "photos", "--out", str(tmp_path / "s")]
-    main([*words, str(tmp_path / "a")])
-    kept = (tmp_path / "s/prepare/photographs.json").read_bytes()
+            save(tmp_path / folder / name.format(at), picture(arc(3)[at], seed))
+    scene = tmp_path / "s"
+    words = ["prepare", "photos", "--out", str(scene), "--no-gps"]
+    assert main([*words, str(tmp_path / "a")]) == 0
+    kept = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file() and path.name != "stages.json"}
     capsys.readouterr()
-    assert main([*words, str(tmp_path / "b")]) == 2
-    assert "was prepared from other photographs, 'a0.jpg'" in capsys.readouterr().err
-    assert (tmp_path / "s/prepare/photographs.json").read_bytes() == kept
+    for folder, said in (("b", "none of them is in"), ("c", "have the same names and show something else")):
+        assert main([*words, str(tmp_path / folder)]) == 2
+        told = capsys.readouterr().err
+        assert (
+            "was prepared from other photographs, 'a0.jpg'" in told and said in told and "name another folder" in told
+        )
+        assert all(path.read_bytes() == content for path, content in kept.items())
+    for path in (tmp_path / "a").iterdir():  # copied, and EXIF written anew
+        shutil.copyfile(path, tmp_path / "c" / path.name)
+        write_exif(tmp_path / "c" / path.name, (52.3, 15.1, 90.0))
+    (tmp_path / "c/a2.jpg").unlink()
+    save(tmp_path / "c/a3.jpg", picture(arc(4)[3]))
+    assert main([*words, str(tmp_path / "c")]) == 0
+    assert {path.name for path in (scene / "images").iterdir()} == {"a0.jpg", "a1.jpg", "a3.jpg"}
+    assert main(["prepare", "photos", "--out", str(tmp_path / "two"), str(tmp_path / "both")]) == 0
+    looked = json.loads((tmp_path / "two/prepare/photographs.json").read_text())
+    assert [photo["name"] for photo in looked] == [f"{folder}/{at}.jpg" for folder in "ab" for at in range(3)]
+    assert {path.parent.name for path in (tmp_path / "two/images").rglob("*.jpg")} == {"a", "b"}
 
 
 def test_what_would_be_overwritten_is_refused(folder, tmp_path, capsys):

@@ -1,5 +1,7 @@
 """Which of the readings of positions without signs the cameras allow, and what no survey can be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from needs import needs
@@ -15,7 +17,7 @@ from surfkit.sfm.level import up_of
 from surfkit.sfm.photographs import Photo
 from surfkit.sfm.plausible import Hand, upside_down
 from surfkit.sfm.positions import Positions
-from surfkit.sfm.site import decide, locate, readings
+from surfkit.sfm.site import decide, heights_named, locate, readings
 
 from .models import down, reconstruction
 from .pictures import looking
@@ -156,3 +158,31 @@ def test_heights_that_count_down_are_found_out_where_they_vary():
     assert isinstance(found, Placement) and found.handed
     found, _ = decided(photographs(centres=rough * (1, 1, -1)), given=given)
     assert isinstance(found, Refused) and "positions fit mirrored only, to 0.00 m for" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("zeros", "given", "crs", "said"),
+    [
+        (
+            ["sea level"],
+            "auto",
+            "EPSG:32756+5773",
+            "(EGM96); where the drone counts them from the ellipsoid, give --crs",
+        ),
+        (["sea level"], "EPSG:32756", "EPSG:32756", "does not say so; a system such as EPSG:32756+5773"),
+        (["sea level"], "EPSG:32756+5773", "EPSG:32756+5773", None),
+        (["ellipsoid"], "auto", "EPSG:32756", "heights are above the ellipsoid, as RTK"),
+        (["ellipsoid"], "EPSG:32756+5773", "EPSG:32756+5773", "says something else; leave its vertical part out"),
+        (["ellipsoid", "sea level"], "auto", "EPSG:32756", "up to 100 m apart"),
+        ([None], "auto", "EPSG:32756", None),
+        (["sea level", None], "auto", "EPSG:32756", None),
+    ],
+)
+def test_the_system_says_what_heights_are_above_if_photographs_do(zeros, given, crs, said):
+    photos = photographs()
+    placed = decided(photos)[0]
+    placed = replace(placed, chart=replace(placed.chart, crs="EPSG:32756" if given == "auto" else given))
+    told = [replace(photo, exif=replace(photo.exif, zero=zeros[at % len(zeros)])) for at, photo in enumerate(photos)]
+    found, line = heights_named(placed, told, given)
+    assert found.chart.crs == crs and replace(found, chart=placed.chart) == placed
+    assert (said in line if said else line == "") and "\n" not in line
